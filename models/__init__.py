@@ -1,0 +1,1 @@
+"""What vehicle and water are: pure JAX."""

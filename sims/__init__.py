@@ -1,0 +1,1 @@
+"""Scenarios, studies, reports and the command line."""

@@ -1,0 +1,1 @@
+"""Drake systems and the diagram they form."""

@@ -1,0 +1,1 @@
+"""MAVLink: the boundary where NED/FRD, PWM and message units live."""

@@ -1,0 +1,1 @@
+"""Data windows, losses, fitting, evaluation: pure JAX."""

@@ -1,0 +1,43 @@
+"""What several test files need: where data lies, how to run code in a fresh interpreter."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+ROOMS = ("models", "training", "systems", "sims")
+
+
+def shared_data(*parts: str) -> Path:
+    """Return a path under the `shared` folder beside the checkout, or skip the test without it."""
+    path = Path(os.environ.get("SPINNDRIFT_SHARED", ROOT.parent / "shared")).joinpath(*parts)
+    if not path.exists():
+        pytest.skip(f"needs {Path('shared', *parts)} beside the checkout")
+    return path
+
+
+def module_files(*rooms: str) -> dict[str, Path]:
+    """Return every module of the named rooms (all by default): dotted name to source file."""
+    found = {}
+    for room in rooms or ROOMS:
+        for path in sorted((ROOT / room).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(("spinndrift", *parts)).removesuffix(".__init__")] = path
+    return found
+
+
+def run_python(code: str, *arguments: str, timeout: float = 300) -> str:
+    """Run `code` in a fresh interpreter and return its standard output; fail with its errors."""
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+    )
+    if done.returncode != 0:
+        pytest.fail(f"exit code {done.returncode}:\n{done.stdout}\n{done.stderr}", pytrace=False)
+    return done.stdout

@@ -1,0 +1,179 @@
+"""Integration of stochastic Euler–Poincaré dynamics on SE(3) × R⁶ in the Stratonovich sense.
+
+The scheme is the partitioned Lie-group integrator of Palmer et al. (appendix, Algorithm 1): a
+Lie-Euler step for the pose (Iserles et al. 2000) and an Euler-Heun step for the velocity (Roberts
+2012), in two forms that take the same steps: a fused `lax.scan` (`rollout`) and a Diffrax solver
+(`LieEulerHeun`).
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from diffrax import RESULTS
+from jaxtyping import Array, Float
+
+from . import se3
+from .dynamics import Dynamics, Flow
+
+
+def step(
+    dynamics: Dynamics,
+    X_WB: Float[Array, "7 *batch"],
+    V_WB_B: Float[Array, "6 *batch"],
+    F_Bo_B: Float[Array, "6 *batch"],
+    dt: float | Float[Array, ""],
+    dW: Float[Array, "6 *batch"] | None = None,
+    flow: Flow | None = None,
+) -> tuple[Float[Array, "7 *batch"], Float[Array, "6 *batch"]]:
+    """One step of Algorithm 1 over `dt` (s) with the Brownian increment `dW` (√s, variance dt).
+
+    Without `dW` the step is the deterministic Lie-Euler step. `flow` is the water's motion at Bo.
+    """
+    h = jnp.asarray(dt, V_WB_B.dtype)
+    c = None if flow is not None else dynamics.coefficients(V_WB_B)
+    dV = h * dynamics.acceleration(X_WB, V_WB_B, F_Bo_B, flow, c)
+    if dW is not None:
+        stage = None if c is None else (c.mass, c.diffusion)
+        first = dynamics.noise_acceleration(V_WB_B, dW, stage)
+        second = dynamics.noise_acceleration(V_WB_B + first, dW)
+        dV = dV + (first + second) / 2
+    return se3.retract(X_WB, V_WB_B * h), V_WB_B + dV
+
+
+def rollout(
+    dynamics: Dynamics,
+    X_WB: Float[Array, "7 *batch"],
+    V_WB_B: Float[Array, "6 *batch"],
+    F_Bo_B: Float[Array, "T 6 *command"],
+    dt: float,
+    dW: Float[Array, "T S 6 *batch"] | None = None,
+    *,
+    substeps: int = 1,
+    remat: bool = True,
+) -> tuple[Float[Array, "T 7 *batch"], Float[Array, "T 6 *batch"]]:
+    """States at dt, 2 dt, …, T dt (the start is left out) under zero-order-held wrenches.
+
+    `dW` holds the Brownian increments of S substeps of length dt / S each and must then have
+    variance dt / S; without it `substeps` deterministic ones are taken. `remat` recomputes each
+    step in the backward pass: memory then grows with the states alone, not with the networks'
+    activations.
+    """
+    count = substeps if dW is None else dW.shape[1]
+    h = dt / count
+
+    def advance(carry: tuple[Array, Array], inputs: tuple[Array, Array | None]) -> Any:
+        X, V = carry
+        F, dW_step = inputs
+        (F,) = (F.reshape(F.shape + (1,) * (V.ndim - F.ndim)),)
+        for s in range(count):
+            X, V = step(dynamics, X, V, F, h, None if dW_step is None else dW_step[s])
+        return (X, V), (X, V)
+
+    body = jax.checkpoint(advance) if remat else advance
+    _, (Xs, Vs) = jax.lax.scan(body, (X_WB, V_WB_B), (F_Bo_B, dW))
+    return Xs, Vs
+
+
+State = tuple[Array, Array]
+"""(X_WB, V_WB_B)"""
+
+
+class DriftTerm(diffrax.AbstractTerm):
+    """dt times (ξ, ξ's drift): an element of se(3) × R⁶, which `LieEulerHeun` maps to the group."""
+
+    dynamics: Dynamics
+    wrench: Callable[[Any], Array]
+
+    def vf(self, t: Any, y: State, args: Any) -> State:
+        X, V = y
+        return V, self.dynamics.acceleration(X, V, self.wrench(t))
+
+    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+        return t1 - t0
+
+    def prod(self, vf: State, control: Any) -> State:
+        return jax.tree.map(lambda v: v * jnp.asarray(control, v.dtype), vf)
+
+
+class NoiseTerm(diffrax.AbstractTerm):
+    """M⁻¹ b dW; it moves the velocity only (the diffusion is hypoelliptic)."""
+
+    dynamics: Dynamics
+    brownian: diffrax.AbstractBrownianPath
+
+    def vf(self, t: Any, y: State, args: Any) -> Array:
+        return y[1]
+
+    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+        return self.brownian.evaluate(t0, t1)
+
+    def prod(self, vf: Array, control: Any) -> Array:
+        return self.dynamics.noise_acceleration(vf, control)
+
+
+class LieEulerHeun(diffrax.AbstractStratonovichSolver):
+    """Algorithm 1 as a Diffrax solver; solve `sde_terms(...)` from y0 = (X_WB, V_WB_B)."""
+
+    term_structure: ClassVar = diffrax.MultiTerm[tuple[DriftTerm, NoiseTerm]]
+    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+    def order(self, terms: Any) -> int:
+        return 1
+
+    def strong_order(self, terms: Any) -> float:
+        return 0.5
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: State, args: Any) -> None:
+        return None
+
+    def step(
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: State,
+        args: Any,
+        solver_state: None,
+        made_jump: Any,
+    ) -> Any:
+        """One step; see `models.integrate.step`."""
+        drift, noise = terms.terms
+        X, V = y0
+        twist, dV = drift.vf_prod(t0, y0, args, drift.contr(t0, t1))
+        dW = noise.contr(t0, t1)
+        first = noise.prod(V, dW)
+        second = noise.prod(V + first, dW)
+        y1 = (se3.retract(X, twist), V + dV + (first + second) / 2)
+        return y1, None, {"y0": y0, "y1": y1}, None, RESULTS.successful
+
+    def func(self, terms: Any, t0: Any, y0: State, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+
+def sde_terms(
+    dynamics: Dynamics,
+    wrench: Callable[[Any], Float[Array, "6 *batch"]],
+    brownian: diffrax.AbstractBrownianPath,
+) -> diffrax.MultiTerm:
+    """The terms of `LieEulerHeun` for a wrench as a function of time and a Brownian path in R⁶."""
+    return diffrax.MultiTerm(DriftTerm(dynamics, wrench), NoiseTerm(dynamics, brownian))
+
+
+def brownian_increments(
+    key: Array, shape: tuple[int, ...], dt: float, dtype: jnp.dtype | type = float
+) -> Array:
+    """Independent normal increments of variance `dt` (s)."""
+    return jax.random.normal(key, shape, dtype) * jnp.asarray(dt**0.5, dtype)
+
+
+def cast(tree: Any, dtype: jnp.dtype | type) -> Any:
+    """The same module with its floating-point arrays in another precision."""
+
+    def convert(leaf: Any) -> Any:
+        return leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf
+
+    return jax.tree.map(convert, tree)

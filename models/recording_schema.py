@@ -1,0 +1,178 @@
+"""What a recording has to look like: names, dimensions, units, and the check of all of them.
+
+`docs/recording.md` is the page for people who write such files; this module is the same for code.
+"""
+
+from collections.abc import Hashable, Mapping
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Bool, Float
+
+FORMAT = "spinndrift recording 1"
+FRAMES = "W: ENU z-up; B: FLU"
+HOLD = "zero-order: the command at index n acts from t_n to t_(n+1)"
+
+LEADING = ("scenario", "trajectory", "time")
+POSE = ("qw", "qx", "qy", "qz", "x", "y", "z")
+TWIST = ("u", "v", "w", "p", "q", "r")
+WRENCH = ("X", "Y", "Z", "K", "M", "N")
+AXES = ("x", "y", "z")
+
+STATES = {
+    "X_WB": ("pose_component", "1, m"),
+    "V_WB_B": ("twist_component", "m/s, rad/s"),
+}
+COMMANDS = {
+    "F_Bo_B": ("wrench_component", "N, N m"),
+    "thruster_force": ("thruster", "N"),
+    "pwm": ("thruster", "us"),
+}
+SENSORS: dict[str, tuple[str | None, str]] = {
+    "voltage": (None, "V"),
+    "imu_specific_force": ("axis", "m/s^2"),
+    "imu_angular_rate": ("axis", "rad/s"),
+    "pressure_depth": (None, "m"),
+    "vertical_velocity": (None, "m/s"),
+    "rc": ("channel", "us"),
+}
+LABELS: dict[str, tuple[str, ...]] = {
+    "pose_component": POSE,
+    "twist_component": TWIST,
+    "wrench_component": WRENCH,
+    "axis": AXES,
+}
+# Channels that a log may simply not have; they are then NaN throughout a trajectory.
+MAY_LACK = {"X_WB": ("x", "y", "z"), "V_WB_B": TWIST}
+_NORM_TOLERANCE = 1e-4
+
+
+def variable_dims(name: str) -> tuple[str, ...]:
+    """Return the dimensions of a known variable."""
+    last = (STATES | COMMANDS | SENSORS)[name][0]
+    return LEADING if last is None else (*LEADING, last)
+
+
+def variable_units(name: str) -> str:
+    """Return the units of a known variable."""
+    return (STATES | COMMANDS | SENSORS)[name][1]
+
+
+def present(dataset: xr.Dataset, kinds: Mapping[str, tuple[str | None, str]]) -> tuple[str, ...]:
+    """Return the names of `kinds` that the dataset holds, in canonical order."""
+    return tuple(name for name in kinds if name in dataset)
+
+
+def observed(
+    values: Float[np.ndarray, "J K N C"], mask: Bool[np.ndarray, "J K N"]
+) -> Bool[np.ndarray, "J K C"]:
+    """Tell which channels of which trajectories hold numbers."""
+    return np.any(np.isfinite(values) & mask[..., None], axis=2)
+
+
+def check(dataset: xr.Dataset) -> None:
+    """Refuse a dataset that is no recording.
+
+    Raises:
+        ValueError: with one sentence naming the variable, the place and the remedy.
+    """
+    _check_layout(dataset)
+    _check_time(dataset)
+    mask = dataset["mask"].to_numpy()
+    if not mask.any():
+        raise ValueError("mask: the recording holds no sample at all")
+    if (mask[..., 1:] & ~mask[..., :-1]).any():
+        raise ValueError(
+            "mask: a trajectory must run from index 0 without holes; cut at gaps into trajectories"
+        )
+    for name in present(dataset, STATES) + present(dataset, COMMANDS):
+        _check_values(dataset, name, mask)
+    _check_quaternions(dataset, mask)
+
+
+def _check_layout(dataset: xr.Dataset) -> None:
+    for name in ("X_WB", "V_WB_B", "mask"):
+        if name not in dataset:
+            raise ValueError(f"{name}: missing; a recording needs X_WB, V_WB_B, mask and a command")
+    if not present(dataset, COMMANDS):
+        raise ValueError(
+            f"no command: give at least one of {', '.join(COMMANDS)} so that there is an input"
+        )
+    for name in dataset.data_vars:
+        _check_variable(dataset, name)
+    if dataset["mask"].dtype != np.bool_ or dataset["mask"].dims != LEADING:
+        raise ValueError(f"mask: must be bool over {LEADING}")
+    names = [str(s) for s in dataset["scenario"].to_numpy()]
+    if "scenario" not in dataset.coords or len(set(names)) != len(names):
+        raise ValueError(f"scenario: needs one distinct name each, got {names}")
+    for dim, labels in LABELS.items():
+        if dim in dataset.dims and dataset.sizes[dim] != len(labels):
+            raise ValueError(f"{dim}: must have {len(labels)} entries {labels}")
+
+
+def _check_variable(dataset: xr.Dataset, name: Hashable) -> None:
+    known = STATES | COMMANDS | SENSORS
+    if name not in known:
+        return
+    variable = dataset[name]
+    if variable.dims != variable_dims(str(name)):
+        raise ValueError(
+            f"{name}: dimensions must be {variable_dims(str(name))}, got {variable.dims}"
+        )
+    if not np.issubdtype(variable.dtype, np.floating):
+        raise ValueError(f"{name}: must be floating point, got {variable.dtype}")
+    units = variable.attrs.get("units", variable_units(str(name)))
+    if units != variable_units(str(name)):
+        raise ValueError(
+            f"{name}: units must be '{variable_units(str(name))}', got '{units}'; convert first"
+        )
+
+
+def _check_time(dataset: xr.Dataset) -> None:
+    if "time" not in dataset.coords or "dt" not in dataset.attrs:
+        raise ValueError("time: needs the coordinate `time` (s) and the attribute `dt` (s)")
+    time, dt = dataset["time"].to_numpy(), float(dataset.attrs["dt"])
+    if not (np.isfinite(dt) and dt > 0):
+        raise ValueError(f"dt: must be a positive number of seconds, got {dt}")
+    expected = dt * np.arange(time.size)
+    if not np.allclose(time, expected, rtol=0, atol=1e-6 * dt * max(1, time.size)):
+        raise ValueError(
+            f"time: must be 0, {dt:g}, {2 * dt:g}, … s; resample uneven data to one step first"
+        )
+
+
+def _check_values(dataset: xr.Dataset, name: str, mask: np.ndarray) -> None:
+    values = dataset[name].to_numpy()
+    if np.isfinite(values[~mask]).any():
+        raise ValueError(f"{name}: numbers outside the mask; padding must be NaN")
+    missing = ~np.isfinite(values) & mask[..., None]
+    partly = missing.any(axis=2) & (
+        observed(values, mask) | ~_may_lack(dataset, name)[None, None, :]
+    )
+    if partly.any():
+        j, k, c = np.argwhere(partly)[0]
+        n = int(np.argmax(missing[j, k, :, c]))
+        label = LABELS.get(str(dataset[name].dims[-1]), tuple(range(1, values.shape[-1] + 1)))[c]
+        scenario = str(dataset["scenario"].to_numpy()[j])
+        raise ValueError(
+            f"{name}[{label}]: not a finite number at scenario '{scenario}', trajectory {k}, "
+            f"index {n}; cut the trajectory there or fill the value"
+        )
+
+
+def _may_lack(dataset: xr.Dataset, name: str) -> np.ndarray:
+    labels = LABELS.get(str(dataset[name].dims[-1]), ())
+    allowed = MAY_LACK.get(name, ())
+    count = dataset[name].shape[-1]
+    return np.array([bool(labels) and labels[i] in allowed for i in range(count)])
+
+
+def _check_quaternions(dataset: xr.Dataset, mask: np.ndarray) -> None:
+    norm = np.linalg.norm(dataset["X_WB"].to_numpy()[..., :4], axis=-1)
+    off = mask & (np.abs(norm - 1) > _NORM_TOLERANCE)
+    if off.any():
+        j, k, n = np.argwhere(off)[0]
+        raise ValueError(
+            f"X_WB: quaternion of length {norm[j, k, n]:.4g} at scenario "
+            f"'{dataset['scenario'].to_numpy()[j]}', trajectory {k}, index {n}; normalise it"
+        )

@@ -12,21 +12,39 @@ from jaxtyping import Array, Float
 
 N = 6
 PACKED = N * (N + 1) // 2
+"""Numbers of a packed symmetric or triangular matrix: the diagonal, then below it by rows."""
 
 
-def _index(i: int, j: int) -> int:
-    return i * (i + 1) // 2 + j
+def packed_index(i: int, j: int) -> int:
+    """Where entry (i, j), i ≥ j, of a packed matrix stands."""
+    return i if i == j else N + i * (i - 1) // 2 + j
+
+
+def pack(matrix: Float[Array, "6 6 *batch"]) -> Float[Array, "21 *batch"]:
+    """The lower triangle of a matrix: the diagonal, then what is below it by rows."""
+    rows = [*range(N), *(i for i in range(N) for _ in range(i))]
+    columns = [*range(N), *(j for i in range(N) for j in range(i))]
+    return matrix[jnp.asarray(rows), jnp.asarray(columns)]
+
+
+def squareplus(x: Array) -> Array:
+    """The smooth positive function (x + √(x² + 4)) / 2, which is 1 at 0 (Barron 2021).
+
+    The branch below zero is its reciprocal form, which loses no digit to cancellation.
+    """
+    root = jnp.sqrt(x * x + 4)
+    return jnp.where(x < 0, 2 / (root - x), (x + root) / 2)
 
 
 class Operator(eqx.Module):
     """A linear operator A on R⁶, one for each batch entry."""
 
     @abc.abstractmethod
-    def matvec(self, x: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+    def matvec(self, x: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
         """A x."""
 
     @abc.abstractmethod
-    def matrix(self) -> Float[Array, "6 6 *batch"]:
+    def matrix(self) -> Float[Array, "6 6 *#batch"]:
         """The dense matrices."""
 
 
@@ -34,7 +52,7 @@ class Spd(Operator):
     """A symmetric positive definite operator, which can be inverted."""
 
     @abc.abstractmethod
-    def solve(self, y: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+    def solve(self, y: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
         """A⁻¹ y."""
 
 
@@ -43,7 +61,7 @@ class ConstantOperator(Operator):
 
     dense: Float[Array, "6 6"]
 
-    def matvec(self, x: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+    def matvec(self, x: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
         return jnp.tensordot(self.dense, x, 1)
 
     def matrix(self) -> Float[Array, "6 6"]:
@@ -60,10 +78,10 @@ class ConstantSpd(Spd):
         self.dense = dense
         self.inverse = jnp.linalg.inv(dense) if inverse is None else inverse
 
-    def matvec(self, x: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+    def matvec(self, x: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
         return jnp.tensordot(self.dense, x, 1)
 
-    def solve(self, y: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+    def solve(self, y: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
         return jnp.tensordot(self.inverse, y, 1)
 
     def matrix(self) -> Float[Array, "6 6"]:
@@ -71,22 +89,28 @@ class ConstantSpd(Spd):
 
 
 class CholeskySpd(Spd):
-    """A = S L Lᵀ S with L lower triangular (positive diagonal, packed by rows) and S = diag(scale)."""
+    """A = S L Lᵀ S with L lower triangular (positive diagonal) and S = diag(scale)."""
 
-    lower: Float[Array, "21 *batch"]
+    diagonal: Float[Array, "6 *batch"]
+    below: Float[Array, "15 *batch"]
     scale: Float[Array, "6"]
 
-    def _L(self, i: int, j: int) -> Array:
-        return self.lower[_index(i, j)]
+    @classmethod
+    def from_raw(cls, raw: Float[Array, "21 *batch"], scale: Float[Array, "6"]) -> "CholeskySpd":
+        """The operator of 21 unconstrained numbers (packed L); zeros give S²."""
+        return cls(squareplus(raw[:N]), raw[N:], scale)
 
-    def matvec(self, x: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+    def _L(self, i: int, j: int) -> Array:
+        return self.diagonal[i] if i == j else self.below[packed_index(i, j) - N]
+
+    def matvec(self, x: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
         s = self.scale
         z = [s[i] * x[i] for i in range(N)]
         t = [sum(self._L(i, j) * z[i] for i in range(j, N)) for j in range(N)]
         y = [s[i] * sum(self._L(i, j) * t[j] for j in range(i + 1)) for i in range(N)]
         return jnp.stack([jnp.asarray(c) for c in y])
 
-    def solve(self, y: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+    def solve(self, y: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
         s = self.scale
         pivot = [1 / self._L(i, i) for i in range(N)]
         t: list[Array] = []
@@ -103,7 +127,7 @@ class CholeskySpd(Spd):
             x[i] = rest * pivot[i]
         return jnp.stack([x[i] / s[i] for i in range(N)])
 
-    def matrix(self) -> Float[Array, "6 6 *batch"]:
+    def matrix(self) -> Float[Array, "6 6 *#batch"]:
         s = self.scale
         rows = [
             [
@@ -116,5 +140,5 @@ class CholeskySpd(Spd):
 
 
 def unpack_symmetric(packed: Float[Array, "21 *batch"]) -> list[list[Array]]:
-    """The 6 x 6 nested list of a symmetric matrix whose lower triangle is packed by rows."""
-    return [[packed[_index(max(i, j), min(i, j))] for j in range(N)] for i in range(N)]
+    """The 6 x 6 nested list of a packed symmetric matrix."""
+    return [[packed[packed_index(max(i, j), min(i, j))] for j in range(N)] for i in range(N)]

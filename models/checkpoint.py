@@ -1,0 +1,182 @@
+"""Models in one file: a JSON header and the arrays in an npz archive, without pickle.
+
+The header names format, version, kind of `Dynamics`, its configuration and free metadata; a kind is
+loadable if it is registered here (`register`), so that reading a file never runs what it says.
+"""
+
+import dataclasses
+import json
+import zipfile
+from collections.abc import Callable
+from os import PathLike
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .dynamics import Dynamics
+from .errors import UserError
+from .files import atomic_path
+from .integrate import cast
+from .rigid_body import FossenDynamics
+from .spinn import Spinn, SpinnConfig
+
+FORMAT = "spinndrift model"
+VERSION = 1
+
+
+class Kind(NamedTuple):
+    """How one class of `Dynamics` is described in JSON and made again, its numbers left open."""
+
+    cls: type[Dynamics]
+    describe: Callable[[Any], dict[str, Any]]
+    template: Callable[[dict[str, Any]], Dynamics]
+    """A model of the described structure with arrays of the right shapes and any values."""
+
+
+_KINDS: dict[str, Kind] = {}
+
+
+def register(
+    cls: type[Dynamics],
+    describe: Callable[[Any], dict[str, Any]],
+    template: Callable[[dict[str, Any]], Dynamics],
+) -> None:
+    """Make a class of `Dynamics` storable under its name."""
+    _KINDS[cls.__name__] = Kind(cls, describe, template)
+
+
+def describe(dynamics: Dynamics) -> dict[str, Any]:
+    """The structure of a model: its kind and configuration (for kinds that wrap another model too).
+
+    Raises:
+        ValueError: the class is not registered.
+    """
+    kind = _KINDS.get(type(dynamics).__name__)
+    if kind is None or kind.cls is not type(dynamics):
+        raise ValueError(f"{type(dynamics).__name__} can't be stored: register it in checkpoint")
+    return {"kind": type(dynamics).__name__, "config": kind.describe(dynamics)}
+
+
+def template(description: dict[str, Any]) -> Dynamics:
+    """A model of the structure that `describe` told, with arbitrary numbers.
+
+    Raises:
+        ValueError: the kind is unknown or its configuration is wrong.
+    """
+    name = description["kind"]
+    if name not in _KINDS:
+        raise ValueError(f"kind {name!r} is none of {', '.join(sorted(_KINDS))}")
+    return _KINDS[name].template(description["config"])
+
+
+def save_model(
+    path: str | PathLike[str], dynamics: Dynamics, metadata: dict[str, Any] | None = None
+) -> None:
+    """Write a model and JSON-like metadata; the file appears whole or not at all.
+
+    Raises:
+        ValueError: the class is not registered, or the metadata is not JSON.
+    """
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(dynamics, eqx.is_array))]
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        **describe(dynamics),
+        "arrays": [[list(leaf.shape), str(leaf.dtype)] for leaf in leaves],
+        "metadata": metadata or {},
+    }
+    try:
+        text = json.dumps(header, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"metadata must be plain JSON with finite numbers: {error}") from error
+    arrays = {f"array_{i:04d}": leaf for i, leaf in enumerate(leaves)}
+    with atomic_path(path) as partial, partial.open("wb") as handle:
+        np.savez_compressed(handle, header=np.frombuffer(text.encode(), np.uint8), **arrays)
+
+
+def load_model(
+    path: str | PathLike[str], dtype: jnp.dtype | type | None = None
+) -> tuple[Dynamics, dict[str, Any]]:
+    """Read a model and its metadata; `dtype` converts its numbers, None keeps them as stored.
+
+    Raises:
+        UserError: the file is missing, foreign, cut short, damaged or of a later version, or holds
+            float64 while JAX runs in float32 and no `dtype` is given.
+    """
+    header, leaves = _read(path)
+    try:
+        model = template(header)
+        arrays, static = eqx.partition(model, eqx.is_array)
+        old, treedef = jax.tree.flatten(arrays)
+        if [leaf.shape for leaf in old] != [leaf.shape for leaf in leaves]:
+            raise ValueError("the arrays don't have the shapes of the described model")
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path}: not a model this version can make ({error}).") from error
+    wide = any(leaf.dtype == np.float64 for leaf in leaves)
+    if dtype is None and wide and not jax.config.jax_enable_x64:
+        raise UserError(
+            f"{path}: holds float64 numbers; enable jax_enable_x64 or pass dtype=jnp.float32."
+        )
+    if dtype is not None:
+        leaves = [
+            leaf.astype(dtype) if np.issubdtype(leaf.dtype, np.floating) else leaf
+            for leaf in leaves
+        ]
+    filled = jax.tree.unflatten(treedef, [jnp.asarray(leaf) for leaf in leaves])
+    return eqx.combine(filled, static), header["metadata"]
+
+
+def _read(path: str | PathLike[str]) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """Header and arrays of a file whose format, version and completeness have been checked."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            header = json.loads(archive["header"].tobytes())
+            if not isinstance(header, dict) or header.get("format") != FORMAT:
+                raise ValueError("no spinndrift header")
+            version = header.get("version")
+            if isinstance(version, int) and version > VERSION:
+                raise UserError(
+                    f"{path}: model format version {version} is newer than {VERSION}; "
+                    "update spinndrift."
+                )
+            leaves = [archive[f"array_{i:04d}"] for i in range(len(header["arrays"]))]
+            told = [[list(leaf.shape), str(leaf.dtype)] for leaf in leaves]
+            if told != header["arrays"] or not isinstance(header["metadata"], dict):
+                raise ValueError("header and arrays don't agree")
+    except UserError:
+        raise
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such model file; check the path.") from None
+    except OSError as error:
+        raise UserError(f"{path}: can't be read ({error.strerror or error}).") from error
+    except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+        raise UserError(
+            f"{path}: not a whole spinndrift model file ({error}); save or copy it again."
+        ) from error
+    return header, leaves
+
+
+def _unit_body() -> FossenDynamics:
+    eye, zero = np.eye(6), np.zeros((6, 6))
+    return FossenDynamics(
+        rigid_inertia=eye,
+        added_mass=zero,
+        linear_drag=zero,
+        quadratic_drag=zero,
+        weight=1.0,
+        buoyancy=1.0,
+        p_BoBcm_B=np.zeros(3),
+        p_BoCb_B=np.zeros(3),
+    )
+
+
+def _spinn(config: dict[str, Any]) -> Spinn:
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in config.items()}
+    return Spinn.create(SpinnConfig(**values), _unit_body(), jax.random.key(0), jnp.float32)
+
+
+register(FossenDynamics, lambda _: {}, lambda _: cast(_unit_body(), jnp.float32))
+register(Spinn, lambda model: dataclasses.asdict(model.config), _spinn)

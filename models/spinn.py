@@ -1,0 +1,234 @@
+"""Stochastic physics-informed neural network of a vehicle: networks for M, D, D^f, V and b.
+
+Palmer et al., "Stochastic physics-informed neural networks on Lie groups": the stochastic
+Euler–Poincaré equation of `models.dynamics` with M_θ(ξ), D_θ(ξ), D^f_θ(ξ) symmetric positive
+definite, b_θ(ξ) diagonal and positive, and V_θ(g) bounded by a learned λ.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .checks import Vector6, check_numbers, require
+from .dynamics import Coefficients, Dynamics
+from .networks import ACTIVATIONS, Activation, Heads, MlpStack
+from .potential import BoundedScalar, GravityPotential, PosePotential, Potential, PotentialKind
+from .rigid_body import FossenDynamics
+from .spd import CholeskySpd, Spd, pack, squareplus
+
+SpdKind = Literal["cholesky"]
+
+
+@dataclass(frozen=True)
+class SpinnConfig:
+    """The architecture: five perceptrons of `depth` hidden layers with `width` units."""
+
+    width: int = 32
+    depth: int = 3
+    activation: Activation = "tanh"
+    spd: SpdKind = "cholesky"
+    """How M, D and D^f are made positive definite."""
+    potential: PotentialKind = "gravity"
+    """`gravity` keeps the symmetry in x, y, yaw (whole dives); `pose` is the paper's."""
+    constant_mass: bool = False
+    """M does not depend on velocity, as physics has it."""
+    stochastic: bool = True
+    """Without it b = 0 (a geometric PINN)."""
+    start: Literal["reference", "scale"] = "reference"
+    """Networks start at the reference's matrices, or at the diagonal matrices of their scales."""
+    velocity_scale: Vector6 = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+    """m/s and rad/s that count as one at the networks' input."""
+    length_scale: float = 1.0
+    """Metres that count as one at the input of a `pose` potential."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+        require(self.width >= 1, self, "width", "give at least 1 unit")
+        require(self.depth >= 1, self, "depth", "give at least 1 hidden layer")
+        require(self.activation in ACTIVATIONS, self, "activation", f"use one of {ACTIVATIONS}")
+        require(self.spd in ("cholesky",), self, "spd", "use cholesky")
+        require(self.potential in ("gravity", "pose"), self, "potential", "use gravity or pose")
+        require(self.start in ("reference", "scale"), self, "start", "use reference or scale")
+        require(min(self.velocity_scale) > 0, self, "velocity_scale", "give positive numbers")
+        require(self.length_scale > 0, self, "length_scale", "give a positive length in m")
+
+
+class Scales(eqx.Module):
+    """Magnitudes (not trained) that make the networks' inputs and outputs of order one."""
+
+    velocity: Float[Array, "6"]
+    matrices: Float[Array, "3 6"]
+    """Square roots of the diagonals of M, D, D^f."""
+    diffusion: Float[Array, "6"]
+
+
+class Spinn(Dynamics):
+    """Learned drift and diffusion; make one with `Spinn.create`.
+
+    The networks stand in the order (b, M, D, D^f), less b if not `stochastic` and less M if
+    `constant_mass`: the second stage of a Heun step evaluates a prefix of them.
+    """
+
+    config: SpinnConfig = eqx.field(static=True)
+    rigid_inertia: Float[Array, "6 6"]
+    displaced_mass: Float[Array, ""]
+    p_BoCb_B: Float[Array, "3"]
+    scales: Scales
+    hidden: MlpStack
+    matrix_heads: Heads
+    diffusion_head: Heads | None
+    constant_mass: Float[Array, "21"] | None
+    learned_potential: Potential
+
+    @classmethod
+    def create(
+        cls,
+        config: SpinnConfig,
+        reference: FossenDynamics,
+        key: Array,
+        dtype: jnp.dtype | type | None = None,
+    ) -> "Spinn":
+        """A model that starts at `reference`: its matrices, and its potential up to 6 %.
+
+        Diffusion that is zero in the reference starts at 5 % of the drag at `velocity_scale`, and a
+        drag of zero at 1 % of what stops the vehicle in a second.
+        """
+        dtype = reference.rigid_inertia.dtype if dtype is None else dtype
+        v = np.asarray(config.velocity_scale)
+        M, D, Df = (
+            np.asarray(a, float)
+            for a in (
+                reference.mass.matrix(),
+                reference.linear_drag.matrix(),
+                reference.quadratic_drag.matrix(),
+            )
+        )
+        floor = 0.01 * np.diag(M)
+        matrices = [M, _floored(D, floor), _floored(Df, floor / v)]
+        diagonals = np.stack([np.diag(a) for a in matrices])
+        drag = diagonals[1] * v + diagonals[2] * v**2
+        b = np.asarray(reference.diffusion, float)
+        scales = Scales(
+            velocity=jnp.asarray(v, dtype),
+            matrices=jnp.asarray(np.sqrt(diagonals), dtype),
+            diffusion=jnp.asarray(np.where(b > 0, b, 0.05 * drag), dtype),
+        )
+        packed = np.stack(
+            [
+                _raw(a / np.sqrt(np.outer(d, d)) if config.start == "reference" else np.eye(6))
+                for a, d in zip(matrices, diagonals, strict=True)
+            ]
+        )
+        raw = jnp.asarray(packed, dtype)
+        variable = raw[1:] if config.constant_mass else raw
+        network_key, potential_key = jax.random.split(key)
+        count = variable.shape[0] + config.stochastic
+        return cls(
+            config=config,
+            rigid_inertia=reference.rigid_inertia.astype(dtype),
+            displaced_mass=reference.displaced_mass.astype(dtype),
+            p_BoCb_B=reference.p_BoCb_B.astype(dtype),
+            scales=scales,
+            hidden=MlpStack.create(
+                count, 6, config.width, config.depth, config.activation, network_key, dtype
+            ),
+            matrix_heads=Heads.constant(variable, config.width),
+            diffusion_head=Heads.constant(jnp.zeros((1, 6), dtype), config.width)
+            if config.stochastic
+            else None,
+            constant_mass=raw[0] if config.constant_mass else None,
+            learned_potential=_potential(config, reference, potential_key, dtype),
+        )
+
+    @property
+    def stochastic(self) -> bool:
+        return self.config.stochastic
+
+    def _features(self, V_WB_B: Array, count: int) -> Array:
+        scale = jax.lax.stop_gradient(self.scales.velocity)
+        return self.hidden(V_WB_B / scale.reshape((6,) + (1,) * (V_WB_B.ndim - 1)), count)
+
+    def _diffusion(self, features: Array) -> Array:
+        if self.diffusion_head is None:
+            return jnp.zeros_like(self.scales.diffusion)
+        raw = self.diffusion_head(features[:1], 1)[0]
+        scale = jax.lax.stop_gradient(self.scales.diffusion)
+        return scale.reshape((6,) + (1,) * (raw.ndim - 1)) * squareplus(raw)
+
+    def _spd(self, raw: Array, index: int) -> Spd:
+        scale = jax.lax.stop_gradient(self.scales.matrices[index])
+        return CholeskySpd.from_raw(raw, scale)
+
+    def coefficients(self, V_WB_B: Float[Array, "6 *batch"]) -> Coefficients:
+        features = self._features(V_WB_B, self.hidden.weights[0].shape[0])
+        first = int(self.config.stochastic)
+        raw = self.matrix_heads(features[first:], features.shape[0] - first)
+        mass = raw[0] if self.constant_mass is None else self.constant_mass
+        return Coefficients(
+            self._spd(mass, 0),
+            self._spd(raw[-2], 1),
+            self._spd(raw[-1], 2),
+            self._diffusion(features),
+        )
+
+    def mass_and_diffusion(self, V_WB_B: Float[Array, "6 *batch"]) -> tuple[Spd, Array]:
+        mass = self.constant_mass
+        count = int(self.config.stochastic) + int(mass is None)
+        if count == 0:
+            assert mass is not None
+            return self._spd(mass, 0), self._diffusion(V_WB_B)
+        features = self._features(V_WB_B, count)
+        if mass is None:
+            mass = self.matrix_heads(features[count - 1 :], 1)[0]
+        return self._spd(mass, 0), self._diffusion(features)
+
+    def potential(self, X_WB: Float[Array, "7 *batch"]) -> Float[Array, "*batch"]:
+        return self.learned_potential.energy(X_WB)
+
+    def potential_wrench(self, X_WB: Float[Array, "7 *batch"]) -> Float[Array, "6 *batch"]:
+        return self.learned_potential.wrench(X_WB)
+
+
+def _floored(a: np.ndarray, floor: np.ndarray) -> np.ndarray:
+    """The symmetric part of `a`, shifted until no scaled eigenvalue is below that of `floor`."""
+    s = np.sqrt(floor)
+    w, Q = np.linalg.eigh((a + a.T) / 2 / np.outer(s, s))
+    return np.outer(s, s) * ((Q * np.maximum(w, 1.0)) @ Q.T)
+
+
+def _raw(a: np.ndarray) -> np.ndarray:
+    """The 21 outputs of which `CholeskySpd.from_raw` makes `a`."""
+    L = np.linalg.cholesky(a)
+    np.fill_diagonal(L, np.diag(L) - 1 / np.diag(L))
+    return np.asarray(pack(jnp.asarray(L)))
+
+
+def _potential(config: SpinnConfig, reference: FossenDynamics, key: Array, dtype: Any) -> Potential:
+    buoyancy, weight = float(reference.buoyancy), float(reference.weight)
+    lever = buoyancy * np.asarray(reference.p_BoCb_B) - weight * np.asarray(reference.p_BoBcm_B)
+    moment = max(float(np.linalg.norm(lever)), 1e-3 * weight * config.length_scale)
+    heave = (buoyancy - weight) * config.length_scale
+    bound = 4 * (moment + (abs(heave) if config.potential == "pose" else 0.0))
+    slope = -lever / bound
+    if config.start == "scale":
+        slope, heave = 0 * slope, 0.0
+    if config.potential == "gravity":
+        skip = slope
+    else:
+        skip = np.concatenate([np.zeros(6), slope, [0.0, 0.0, -heave / bound]])
+    scalar = BoundedScalar.create(
+        config.width,
+        config.depth,
+        config.activation,
+        jnp.asarray(skip, dtype),
+        jnp.asarray(bound, dtype),
+        key,
+    )
+    if config.potential == "gravity":
+        return GravityPotential(scalar, jnp.asarray(buoyancy - weight, dtype))
+    return PosePotential(scalar, jnp.asarray(config.length_scale, dtype))

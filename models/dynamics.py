@@ -26,14 +26,14 @@ class Coefficients(NamedTuple):
     mass: Spd
     linear_drag: Operator
     quadratic_drag: Operator
-    diffusion: Float[Array, "6 *batch"]
+    diffusion: Float[Array, "6 *#batch"]
 
 
 class Flow(NamedTuple):
     """Velocity (m/s) and acceleration (m/s²) of the undisturbed water at Bo, expressed in W."""
 
-    v_WC_W: Float[Array, "3 *batch"]
-    a_WC_W: Float[Array, "3 *batch"]
+    v_WC_W: Float[Array, "3 *#batch"]
+    a_WC_W: Float[Array, "3 *#batch"]
 
 
 class Dynamics(eqx.Module):
@@ -48,38 +48,38 @@ class Dynamics(eqx.Module):
     p_BoCb_B: eqx.AbstractVar[Float[Array, "3"]]
 
     @abc.abstractmethod
-    def coefficients(self, V_WB_B: Float[Array, "6 *batch"]) -> Coefficients:
+    def coefficients(self, V_WB_B: Float[Array, "6 *#batch"]) -> Coefficients:
         """M, D, D^f and b at a body velocity."""
 
     @abc.abstractmethod
     def mass_and_diffusion(
-        self, V_WB_B: Float[Array, "6 *batch"]
-    ) -> tuple[Spd, Float[Array, "6 *batch"]]:
+        self, V_WB_B: Float[Array, "6 *#batch"]
+    ) -> tuple[Spd, Float[Array, "6 *#batch"]]:
         """M and b alone, for the second stage of the Heun step."""
 
     @abc.abstractmethod
-    def potential(self, X_WB: Float[Array, "7 *batch"]) -> Float[Array, "*batch"]:
+    def potential(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "*#batch"]:
         """Potential energy V(g) in J, up to a constant."""
 
     @abc.abstractmethod
-    def potential_wrench(self, X_WB: Float[Array, "7 *batch"]) -> Float[Array, "6 *batch"]:
+    def potential_wrench(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "6 *#batch"]:
         """F_V: minus the derivative of V along g exp(s e_i), a wrench about Bo in B."""
 
     def drag_wrench(
-        self, V_CB_B: Float[Array, "6 *batch"], coefficients: Coefficients | None = None
-    ) -> Float[Array, "6 *batch"]:
-        """-D ξ - D^f (|ξ| ∘ ξ) for the velocity ξ = `V_CB_B` of the vehicle relative to the water."""
+        self, V_CB_B: Float[Array, "6 *#batch"], coefficients: Coefficients | None = None
+    ) -> Float[Array, "6 *#batch"]:
+        """-D ξ - D^f (|ξ| ∘ ξ) for the velocity ξ = `V_CB_B` relative to the water."""
         c = self.coefficients(V_CB_B) if coefficients is None else coefficients
         return -c.linear_drag.matvec(V_CB_B) - c.quadratic_drag.matvec(jnp.abs(V_CB_B) * V_CB_B)
 
     def acceleration(
         self,
-        X_WB: Float[Array, "7 *batch"],
-        V_WB_B: Float[Array, "6 *batch"],
-        F_Bo_B: Float[Array, "6 *batch"],
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        F_Bo_B: Float[Array, "6 *#batch"],
         flow: Flow | None = None,
         coefficients: Coefficients | None = None,
-    ) -> Float[Array, "6 *batch"]:
+    ) -> Float[Array, "6 *#batch"]:
         """The drift of ξ: the time derivative of the components of `V_WB_B`, without noise.
 
         In moving water drag and added mass act through ξ_r = ξ - ξ_c and its rate, and the water's
@@ -112,10 +112,10 @@ class Dynamics(eqx.Module):
 
     def noise_acceleration(
         self,
-        V_WB_B: Float[Array, "6 *batch"],
-        dW: Float[Array, "6 *batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        dW: Float[Array, "6 *#batch"],
         coefficients: tuple[Spd, Array] | None = None,
-    ) -> Float[Array, "6 *batch"]:
+    ) -> Float[Array, "6 *#batch"]:
         """M(ξ)⁻¹ b(ξ) dW: the velocity increment of a Brownian increment dW (√s)."""
         if coefficients is None:
             coefficients = self.mass_and_diffusion(V_WB_B)
@@ -123,6 +123,6 @@ class Dynamics(eqx.Module):
         b, dW = se3.align(b, dW)
         return mass.solve(b * dW)
 
-    def kinetic_energy(self, V_WB_B: Float[Array, "6 *batch"]) -> Float[Array, "*batch"]:
+    def kinetic_energy(self, V_WB_B: Float[Array, "6 *#batch"]) -> Float[Array, "*#batch"]:
         """½ ξᵀ M ξ in J."""
         return jnp.sum(V_WB_B * self.coefficients(V_WB_B).mass.matvec(V_WB_B), axis=0) / 2

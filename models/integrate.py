@@ -22,13 +22,13 @@ from .dynamics import Dynamics, Flow
 
 def step(
     dynamics: Dynamics,
-    X_WB: Float[Array, "7 *batch"],
-    V_WB_B: Float[Array, "6 *batch"],
-    F_Bo_B: Float[Array, "6 *batch"],
+    X_WB: Float[Array, "7 *#batch"],
+    V_WB_B: Float[Array, "6 *#batch"],
+    F_Bo_B: Float[Array, "6 *#batch"],
     dt: float | Float[Array, ""],
-    dW: Float[Array, "6 *batch"] | None = None,
+    dW: Float[Array, "6 *#batch"] | None = None,
     flow: Flow | None = None,
-) -> tuple[Float[Array, "7 *batch"], Float[Array, "6 *batch"]]:
+) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
     """One step of Algorithm 1 over `dt` (s) with the Brownian increment `dW` (√s, variance dt).
 
     Without `dW` the step is the deterministic Lie-Euler step. `flow` is the water's motion at Bo.
@@ -46,15 +46,15 @@ def step(
 
 def rollout(
     dynamics: Dynamics,
-    X_WB: Float[Array, "7 *batch"],
-    V_WB_B: Float[Array, "6 *batch"],
+    X_WB: Float[Array, "7 *#batch"],
+    V_WB_B: Float[Array, "6 *#batch"],
     F_Bo_B: Float[Array, "T 6 *command"],
     dt: float,
-    dW: Float[Array, "T S 6 *batch"] | None = None,
+    dW: Float[Array, "T S 6 *#batch"] | None = None,
     *,
     substeps: int = 1,
     remat: bool = True,
-) -> tuple[Float[Array, "T 7 *batch"], Float[Array, "T 6 *batch"]]:
+) -> tuple[Float[Array, "T 7 *#batch"], Float[Array, "T 6 *#batch"]]:
     """States at dt, 2 dt, …, T dt (the start is left out) under zero-order-held wrenches.
 
     `dW` holds the Brownian increments of S substeps of length dt / S each and must then have
@@ -156,7 +156,7 @@ class LieEulerHeun(diffrax.AbstractStratonovichSolver):
 
 def sde_terms(
     dynamics: Dynamics,
-    wrench: Callable[[Any], Float[Array, "6 *batch"]],
+    wrench: Callable[[Any], Float[Array, "6 *#batch"]],
     brownian: diffrax.AbstractBrownianPath,
 ) -> diffrax.MultiTerm:
     """The terms of `LieEulerHeun` for a wrench as a function of time and a Brownian path in R⁶."""

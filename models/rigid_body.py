@@ -82,19 +82,19 @@ class FossenDynamics(Dynamics):
         self.weight = jnp.asarray(weight, dtype)
         self.buoyancy = jnp.asarray(buoyancy, dtype)
 
-    def coefficients(self, V_WB_B: Float[Array, "6 *batch"]) -> Coefficients:
+    def coefficients(self, V_WB_B: Float[Array, "6 *#batch"]) -> Coefficients:
         return Coefficients(self.mass, self.linear_drag, self.quadratic_drag, self.diffusion)
 
-    def mass_and_diffusion(self, V_WB_B: Float[Array, "6 *batch"]) -> tuple[Spd, Array]:
+    def mass_and_diffusion(self, V_WB_B: Float[Array, "6 *#batch"]) -> tuple[Spd, Array]:
         return self.mass, self.diffusion
 
-    def potential(self, X_WB: Float[Array, "7 *batch"]) -> Float[Array, "*batch"]:
+    def potential(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "*#batch"]:
         """Weight × height of the centre of mass - buoyancy × height of the centre of buoyancy."""
         z_cm = se3.act(X_WB, self.p_BoBcm_B)[2]
         z_cb = se3.act(X_WB, self.p_BoCb_B)[2]
         return self.weight * z_cm - self.buoyancy * z_cb
 
-    def potential_wrench(self, X_WB: Float[Array, "7 *batch"]) -> Float[Array, "6 *batch"]:
+    def potential_wrench(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "6 *#batch"]:
         """-g(η) of Fossen (2011, eq. 4.6), z up."""
         up_W = jnp.zeros(3, X_WB.dtype).at[2].set(1)
         up_B = se3.rotate_inverse(X_WB, up_W)

@@ -57,7 +57,7 @@ def _dot(a: Array, b: Array) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def cross(a: Float[Array, "3 *batch"], b: Float[Array, "3 *batch"]) -> Float[Array, "3 *batch"]:
+def cross(a: Float[Array, "3 *#batch"], b: Float[Array, "3 *#batch"]) -> Float[Array, "3 *#batch"]:
     """Cross product a × b, component first."""
     return jnp.stack(
         [
@@ -157,7 +157,7 @@ def exp(xi: Float[Array, "6 *batch"]) -> Float[Array, "7 *batch"]:
 
 
 def log(X: Float[Array, "7 *batch"]) -> Float[Array, "6 *batch"]:
-    """The twist [v, ω] with |ω| ≤ π whose `exp` is X; finite with its gradient up to the cut locus."""
+    """The twist [v, ω], |ω| ≤ π, whose `exp` is X; finite with its gradient at the cut locus."""
     sign = jnp.where(X[:1] < 0, -1, 1).astype(X.dtype)
     q = sign * X[:4]
     w, u, p = q[0], q[1:], X[4:]
@@ -234,14 +234,18 @@ def ad(xi: Float[Array, "6 *batch"]) -> Float[Array, "6 6 *batch"]:
     return _blocks(omega, v, jnp.zeros_like(v), omega)
 
 
-def ad_apply(xi: Float[Array, "6 *batch"], eta: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+def ad_apply(
+    xi: Float[Array, "6 *#batch"], eta: Float[Array, "6 *#batch"]
+) -> Float[Array, "6 *#batch"]:
     """The Lie bracket [ξ, η] = ad_ξ η without forming the matrix."""
     linear = cross(xi[3:], eta[:3]) + cross(xi[:3], eta[3:])
     return jnp.concatenate([linear, cross(xi[3:], eta[3:])])
 
 
-def coad_apply(xi: Float[Array, "6 *batch"], mu: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
-    """ad*_ξ μ = ad_ξᵀ μ: how a constant spatial momentum μ = [p, π] seems to change in B (Kirchhoff).
+def coad_apply(
+    xi: Float[Array, "6 *#batch"], mu: Float[Array, "6 *#batch"]
+) -> Float[Array, "6 *#batch"]:
+    """ad*_ξ μ = ad_ξᵀ μ: how a constant spatial momentum μ = [p, π] seems to change in B.
 
     Linear part p × ω, angular part π × ω + p × v (Marsden and Ratiu 1994, section 14.2).
     """
@@ -297,7 +301,7 @@ def as_matrix(X: Float[Array, "7 *batch"]) -> Float[Array, "4 4 *batch"]:
 
 
 def from_matrix(T: Float[Array, "4 4 *batch"]) -> Float[Array, "7 *batch"]:
-    """Pose of a homogeneous matrix; the largest quaternion component is the pivot (Shepperd 1978)."""
+    """Pose of a homogeneous matrix, by its largest quaternion component (Shepperd 1978)."""
     m = T[:3, :3]
     one = jnp.ones_like(m[0, 0])
     squares = jnp.stack(

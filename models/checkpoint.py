@@ -92,9 +92,10 @@ def save_model(
         text = json.dumps(header, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise ValueError(f"metadata must be plain JSON with finite numbers: {error}") from error
-    arrays = {f"array_{i:04d}": leaf for i, leaf in enumerate(leaves)}
+    arrays: dict[str, Any] = {f"array_{i:04d}": leaf for i, leaf in enumerate(leaves)}
+    arrays["header"] = np.frombuffer(text.encode(), np.uint8)
     with atomic_path(path) as partial, partial.open("wb") as handle:
-        np.savez_compressed(handle, header=np.frombuffer(text.encode(), np.uint8), **arrays)
+        np.savez_compressed(handle, **arrays)
 
 
 def load_model(
@@ -116,7 +117,7 @@ def load_model(
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path}: not a model this version can make ({error}).") from error
     wide = any(leaf.dtype == np.float64 for leaf in leaves)
-    if dtype is None and wide and not jax.config.jax_enable_x64:
+    if dtype is None and wide and jnp.asarray(0.0).dtype != jnp.float64:
         raise UserError(
             f"{path}: holds float64 numbers; enable jax_enable_x64 or pass dtype=jnp.float32."
         )

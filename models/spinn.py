@@ -93,7 +93,7 @@ class Spinn(Dynamics):
         key: Array,
         dtype: jnp.dtype | type | None = None,
     ) -> "Spinn":
-        """A model that starts at `reference`: its matrices, and its potential up to 6 %.
+        """A model that starts at `reference`: its matrices, and V to a few percent.
 
         Diffusion that is zero in the reference starts at 5 % of the drag at `velocity_scale`, and a
         drag of zero at 1 % of what stops the vehicle in a second.
@@ -214,7 +214,7 @@ def _potential(config: SpinnConfig, reference: FossenDynamics, key: Array, dtype
     moment = max(float(np.linalg.norm(lever)), 1e-3 * weight * config.length_scale)
     heave = (buoyancy - weight) * config.length_scale
     bound = 4 * (moment + (abs(heave) if config.potential == "pose" else 0.0))
-    slope = -lever / bound
+    slope = -1.075 * lever / bound  # 0.2687 (1 - tanh² 0.2687) = 1/4: exact when upright
     if config.start == "scale":
         slope, heave = 0 * slope, 0.0
     if config.potential == "gravity":

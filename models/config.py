@@ -1,0 +1,346 @@
+"""Typed YAML: the one loader for vehicles, training settings, scenarios and data folders.
+
+A configuration is a dataclass: its annotations are the schema, its defaults the defaults.
+Understood are dataclasses within one another, bool, int, float, str, Path, Literal, Optional, list,
+tuple, dict, NumPy arrays (`Float[np.ndarray, "3"]` also checks the shape) and unions. Where one of
+several dataclasses may stand, the file names it by a tag, as Drake's typed YAML does:
+
+    disturbances:
+      - !OrnsteinUhlenbeckWrench {time_constant: 3.0}
+
+Unknown, missing and duplicate keys are refused, every float must be finite, and an int may stand
+for a float but not the reverse. What one field's type can't express belongs in the dataclass'
+`__post_init__` as a ValueError; the loader adds file, line and field to its message.
+"""
+
+import dataclasses
+import difflib
+import math
+import sys
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+
+import numpy as np
+from cattrs import Converter, ForbiddenExtraKeysError
+from cattrs.cols import (
+    homogenous_tuple_structure_factory,
+    list_structure_factory,
+    mapping_structure_factory,
+)
+from cattrs.errors import (
+    AttributeValidationNote,
+    BaseValidationError,
+    IterableValidationError,
+    IterableValidationNote,
+)
+from cattrs.gen import make_dict_structure_fn
+
+from .errors import UserError
+from .yaml_text import Tagged, emit, line_of, parse
+
+T = TypeVar("T")
+FieldPath = tuple[str | int, ...]
+
+
+def load(cls: type[T], path: str | PathLike[str]) -> T:
+    """Read a `cls` from a YAML file.
+
+    Raises:
+        UserError: the file can't be read, or its text is no `cls` (see `loads`).
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: there is no such file; check the path") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: can't be read as UTF-8 text: {error}") from error
+    return loads(cls, text, str(path))
+
+
+def loads(cls: type[T], text: str, source: str = "text") -> T:
+    """Read a `cls` from YAML text; `source` is how messages call the text.
+
+    Raises:
+        UserError: one line a fault, each `source:line: field: what was found; what to write`.
+    """
+    data, node = parse(text, source)
+    try:
+        return _CONVERTER.structure({} if data is None else data, cls)
+    except (BaseValidationError, ValueError, TypeError) as error:
+        lines = []
+        for path, message in _faults(error, (), cls):
+            line = line_of(node, path)
+            where = source if line is None else f"{source}:{line}"
+            lines.append(": ".join(part for part in (where, _dotted(path), message) if part))
+        raise UserError("\n".join(lines)) from error
+
+
+def dump(obj: Any) -> str:
+    """YAML text of a configuration, defaults written out; `loads(type(obj), …)` returns its equal.
+
+    Raises:
+        ValueError: a float is not finite.
+    """
+    return emit(_CONVERTER.unstructure(obj, type(obj)))
+
+
+# ---------------------------------------------------------------- one hook for each kind of field
+
+
+def _show(value: Any) -> str:
+    match value:
+        case None:
+            return "nothing"
+        case bool():
+            return f"`{str(value).lower()}` (a boolean)"
+        case str():
+            return f"`{value}` (text)"
+        case int() | float():
+            return f"`{value}` (a number)"
+        case list():
+            return f"a list of {len(value)}"
+        case dict():
+            return "a mapping" + (f" with {', '.join(map(str, value))}" if value else "")
+        case Tagged():
+            return f"`!{value.tag}`"
+    return repr(value)
+
+
+def _fault(value: Any, remedy: str) -> ValueError:
+    return ValueError(f"found {_show(value)}; write {remedy}")
+
+
+def _bool(value: Any, _: Any) -> bool:
+    if not isinstance(value, bool):
+        raise _fault(value, "true or false")
+    return value
+
+
+def _int(value: Any, _: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise _fault(value, "a whole number")
+    return value
+
+
+def _float(value: Any, _: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise _fault(value, "a number")
+    if abs(value) > sys.float_info.max or math.isnan(value):
+        raise _fault(value, "a finite number")
+    return float(value)
+
+
+def _str(value: Any, _: Any) -> str:
+    if not isinstance(value, str):
+        raise _fault(value, "text (in quotes if it looks like a number)")
+    return value
+
+
+def _path(value: Any, _: Any) -> Path:
+    if not isinstance(value, str) or not value:
+        raise _fault(value, "a path")
+    return Path(value)
+
+
+def _literal(value: Any, cls: Any) -> Any:
+    for choice in get_args(cls):
+        if type(value) is type(choice) and value == choice:
+            return value
+    raise _fault(value, "one of " + ", ".join(map(str, get_args(cls))))
+
+
+def _is_array(cls: Any) -> bool:
+    return cls is np.ndarray or getattr(cls, "array_type", None) is np.ndarray
+
+
+def _array(value: Any, cls: Any) -> np.ndarray:
+    shape = "" if cls is np.ndarray else f" of shape ({', '.join(cls.dim_str.split())})"
+
+    def convert(item: Any) -> Any:
+        return [convert(x) for x in item] if isinstance(item, list) else _float(item, float)
+
+    if not isinstance(value, list):
+        raise _fault(value, f"a list of numbers{shape}")
+    try:
+        array = np.asarray(convert(value), dtype=float)
+    except ValueError as error:
+        if str(error).startswith("found"):
+            raise
+        raise ValueError(f"found rows of unequal length; write numbers{shape}") from error
+    if cls is not np.ndarray and not isinstance(array, cls):
+        raise ValueError(f"found numbers of shape {array.shape}; write numbers{shape}")
+    return array
+
+
+def _list(cls: Any, converter: Converter) -> Any:
+    inner = list_structure_factory(cls, converter)
+
+    def structure(value: Any, _: Any) -> list:
+        if not isinstance(value, list):
+            raise _fault(value, "a list: [first, second]")
+        return inner(value, cls)
+
+    return structure
+
+
+def _tuple(cls: Any, converter: Converter) -> Any:
+    args = get_args(cls)
+    if len(args) == 2 and args[1] is Ellipsis:
+        inner = homogenous_tuple_structure_factory(cls, converter)
+        size = None
+    else:
+        inner, size = None, len(args)
+
+    def structure(value: Any, _: Any) -> tuple:
+        if not isinstance(value, list) or (size is not None and len(value) != size):
+            raise _fault(value, "a list" + ("" if size is None else f" of {size}"))
+        if inner is not None:
+            return inner(value, cls)
+        items, errors = [], []
+        for index, (item, arg) in enumerate(zip(value, args, strict=True)):
+            try:
+                items.append(converter.structure(item, arg))
+            except (ValueError, TypeError, BaseValidationError) as error:
+                error.add_note(IterableValidationNote(f"@ index {index}", index, arg))
+                errors.append(error)
+        if errors:
+            note = f"While structuring {cls!r}"
+            raise IterableValidationError(note, errors, cls)  # pyright: ignore[reportCallIssue]
+        return tuple(items)
+
+    return structure
+
+
+def _dict(cls: Any, converter: Converter) -> Any:
+    inner = mapping_structure_factory(cls, converter)
+
+    def structure(value: Any, _: Any) -> dict:
+        if not isinstance(value, dict):
+            raise _fault(value, "a mapping {key: value}")
+        return inner(value, cls)
+
+    return structure
+
+
+def _fields(cls: Any) -> list[str]:
+    return [field.name for field in dataclasses.fields(cls) if field.init]
+
+
+def _dataclass(cls: Any, converter: Converter) -> Any:
+    inner = make_dict_structure_fn(cls, converter, _cattrs_forbid_extra_keys=True)
+
+    def structure(value: Any, _: Any) -> Any:
+        if isinstance(value, Tagged) and value.tag == cls.__name__:
+            value = value.value
+        if not isinstance(value, Mapping):
+            raise _fault(value, f"a mapping with {', '.join(_fields(cls)) or 'nothing in it'}")
+        return inner(value, cls)
+
+    return structure
+
+
+def _is_union(cls: Any) -> bool:
+    return get_origin(cls) in (Union, UnionType)
+
+
+def _union(cls: Any, converter: Converter) -> Any:
+    members = [member for member in get_args(cls) if member is not NoneType]
+    optional = len(members) < len(get_args(cls))
+    kinds: list[Any] = [member for member in members if dataclasses.is_dataclass(member)]
+    classes = {kind.__name__: kind for kind in kinds}
+    others = [member for member in members if not dataclasses.is_dataclass(member)]
+    choices = [f"!{name} {{…}}" for name in classes] + [
+        getattr(member, "__name__", str(member)) for member in others
+    ]
+    remedy = "one of " + ", ".join(choices + (["null"] if optional else []))
+
+    def structure(value: Any, _: Any) -> Any:
+        if value is None and optional:
+            return None
+        if len(members) == 1:
+            return converter.structure(value, members[0])
+        if isinstance(value, Tagged):
+            if value.tag not in classes:
+                raise _fault(value, remedy)
+            return converter.structure(value, classes[value.tag])
+        for member in others:
+            try:
+                return converter.structure(value, member)
+            except (ValueError, TypeError, BaseValidationError):
+                continue
+        raise _fault(value, remedy)
+
+    return structure
+
+
+def _untagged(cls: Any, converter: Converter) -> Any:
+    classes = [member for member in get_args(cls) if dataclasses.is_dataclass(member)]
+
+    def unstructure(value: Any) -> Any:
+        plain = converter.unstructure(value, type(value))
+        if len(classes) > 1 and type(value) in classes:
+            return Tagged(type(value).__name__, plain)
+        return plain
+
+    return unstructure
+
+
+def _converter() -> Converter:
+    converter = Converter(forbid_extra_keys=True, detailed_validation=True)
+    scalars = {bool: _bool, int: _int, float: _float, str: _str, Path: _path}
+    for cls, hook in scalars.items():
+        converter.register_structure_hook(cls, hook)
+    converter.register_structure_hook_func(lambda t: get_origin(t) is Literal, _literal)
+    converter.register_structure_hook_func(_is_array, _array)
+    for predicate, factory in (
+        (lambda t: get_origin(t) is list, _list),
+        (lambda t: get_origin(t) is tuple, _tuple),
+        (lambda t: get_origin(t) is dict, _dict),
+        (lambda t: isinstance(t, type) and dataclasses.is_dataclass(t), _dataclass),
+        (_is_union, _union),
+    ):
+        converter.register_structure_hook_factory(predicate, factory)
+    converter.register_unstructure_hook_factory(_is_union, _untagged)
+    converter.register_unstructure_hook_func(_is_array, lambda value: np.asarray(value).tolist())
+    converter.register_unstructure_hook(Path, str)
+    return converter
+
+
+_CONVERTER = _converter()
+
+
+# ------------------------------------------------------------------------------- faults in words
+
+
+def _faults(error: BaseException, path: FieldPath, cls: Any) -> list[tuple[FieldPath, str]]:
+    """Every leaf of the exception tree as (path of the field, sentence)."""
+    names = [
+        note.name if isinstance(note, AttributeValidationNote) else note.index
+        for note in getattr(error, "__notes__", ())
+        if isinstance(note, AttributeValidationNote | IterableValidationNote)
+    ]
+    path = path + tuple(names)
+    if isinstance(error, BaseValidationError):
+        return [fault for part in error.exceptions for fault in _faults(part, path, error.cl)]
+    if isinstance(error, ForbiddenExtraKeysError):
+        known = _fields(error.cl)
+        return [((*path, key), _unknown(key, known)) for key in sorted(error.extra_fields, key=str)]
+    if isinstance(error, KeyError) and names:
+        kind = next((f.type for f in dataclasses.fields(cls) if f.name == names[-1]), "value")
+        kind = str(getattr(kind, "__name__", kind))
+        return [(path, f"is missing; add `{names[-1]}: <{kind}>`")]
+    return [(path, str(error))]
+
+
+def _unknown(key: Any, known: list[str]) -> str:
+    close = difflib.get_close_matches(str(key), known, 1)
+    hint = f"did you mean `{close[0]}`?" if close else f"known are {', '.join(known)}"
+    return f"is no key of this part; {hint}"
+
+
+def _dotted(path: FieldPath) -> str:
+    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
+    return text.removeprefix(".")

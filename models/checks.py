@@ -1,0 +1,38 @@
+"""Checks that configuration dataclasses make of themselves when they are constructed."""
+
+import dataclasses
+import math
+from typing import Any, get_args, get_origin
+
+from .errors import UserError
+
+Vector3 = tuple[float, float, float]
+Vector6 = tuple[float, float, float, float, float, float]
+
+
+def require(condition: bool, config: Any, field: str, remedy: str) -> None:
+    """Raise `UserError` with kind, field, value and remedy unless `condition` holds."""
+    if not condition:
+        value = getattr(config, field)
+        raise UserError(f"{type(config).__name__}.{field} is {value!r}: {remedy}.")
+
+
+def check_numbers(config: Any) -> None:
+    """Check that every number of a dataclass is finite and every fixed-size tuple has its size.
+
+    Raises:
+        UserError: naming kind, field, value and remedy.
+    """
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        sizes = get_args(field.type) if get_origin(field.type) is tuple else ()
+        if sizes and Ellipsis not in sizes:
+            require(
+                isinstance(value, tuple) and len(value) == len(sizes),
+                config,
+                field.name,
+                f"give {len(sizes)} numbers",
+            )
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float | int):
+                require(math.isfinite(number), config, field.name, "give finite numbers")

@@ -1,0 +1,125 @@
+"""Inertial measurement unit: specific force and angular rate."""
+
+import math
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .. import se3
+from ..checks import require
+from ..randomness import Scalar, column
+from .base import Sensor
+
+_DEGREE = math.pi / 180
+
+
+@dataclass(frozen=True)
+class Imu(Sensor):
+    """Accelerometers and gyroscopes with white noise, wandering biases and saturation.
+
+    Reading: specific force (m/s²), then angular rate (rad/s), in the sensor's axes. White noise of
+    one measurement has the deviation density · √(rate / 2), the biases walk by
+    walk · √(1 / rate). State: six biases in the reading's order, then the reading.
+
+    Defaults are those of the ICM-20602 on a Navigator board (data sheet: 100 µg/√Hz, 4 mdps/√Hz;
+    bench logs agree within a factor of two); the initial biases are what is left after a
+    calibration at rest, an estimate.
+
+    Attributes:
+        accelerometer_density: noise density (m/s²/√Hz).
+        gyroscope_density: noise density (rad/s/√Hz).
+        accelerometer_walk: bias random walk (m/s²/√s).
+        gyroscope_walk: bias random walk (rad/s/√s).
+        accelerometer_bias: standard deviation of the initial bias (m/s²).
+        gyroscope_bias: standard deviation of the initial bias (rad/s).
+        accelerometer_range: readings saturate at ± this (m/s²).
+        gyroscope_range: readings saturate at ± this (rad/s).
+        gravity: (m/s²).
+    """
+
+    rate: float = 100.0
+    accelerometer_density: float = 9.8e-4
+    gyroscope_density: float = 7.0e-5
+    accelerometer_walk: float = 1.0e-4
+    gyroscope_walk: float = 1.0e-5
+    accelerometer_bias: float = 0.05
+    gyroscope_bias: float = 0.1 * _DEGREE
+    accelerometer_range: float = 16 * 9.80665
+    gyroscope_range: float = 2000 * _DEGREE
+    gravity: float = 9.80665
+
+    def __post_init__(self) -> None:
+        """Check signs."""
+        super().__post_init__()
+        for kind in ("accelerometer", "gyroscope"):
+            self._require_not_negative(*(f"{kind}_{x}" for x in ("density", "walk", "bias")))
+            require(getattr(self, f"{kind}_range") > 0, self, f"{kind}_range", "give above zero")
+
+    @property
+    def state_size(self) -> int:
+        """Six biases and the reading."""
+        return 12
+
+    @property
+    def noise_size(self) -> int:
+        """White noise and the walk of the biases."""
+        return 12
+
+    @property
+    def initial_noise_size(self) -> int:
+        """The biases."""
+        return 6
+
+    @property
+    def reading_size(self) -> int:
+        """Specific force and angular rate."""
+        return 6
+
+    def expected(
+        self,
+        X_WB: Float[Array, "7 *batch"],
+        V_WB_B: Float[Array, "6 *batch"],
+        dV_WB_B: Float[Array, "6 *batch"],
+    ) -> Float[Array, "6 *batch"]:
+        """Noise-free reading: v̇ + ω × v + ω̇ × r + ω × (ω × r) − Rᵀ g, and ω, in sensor axes."""
+        X_BS = self.mount(X_WB.dtype)
+        v, omega, alpha = V_WB_B[:3], V_WB_B[3:], dV_WB_B[3:]
+        r = column(self.position, v) + jnp.zeros_like(v)
+        f = dV_WB_B[:3] + se3.cross(omega, v)
+        f = f + se3.cross(alpha, r) + se3.cross(omega, se3.cross(omega, r))
+        f = f + se3.rotate_inverse(X_WB, column((0.0, 0.0, self.gravity), v))
+        return jnp.concatenate([se3.rotate_inverse(X_BS, f), se3.rotate_inverse(X_BS, omega)])
+
+    def noise_std(self) -> tuple[float, float]:
+        """Standard deviation of one measurement's white noise: (m/s², rad/s)."""
+        scale = math.sqrt(self.rate / 2)
+        return self.accelerometer_density * scale, self.gyroscope_density * scale
+
+    def initial(self, w: Float[Array, "6 *batch"]) -> Float[Array, "12 *batch"]:
+        """Draw the initial biases."""
+        return jnp.concatenate(
+            [_six(self.accelerometer_bias, self.gyroscope_bias, w) * w, jnp.zeros_like(w)]
+        )
+
+    def measure(
+        self,
+        state: Float[Array, "12 *batch"],
+        X_WB: Float[Array, "7 *batch"],
+        V_WB_B: Float[Array, "6 *batch"],
+        dV_WB_B: Float[Array, "6 *batch"],
+        t: Scalar,
+        w: Float[Array, "12 *batch"],
+    ) -> Float[Array, "12 *batch"]:
+        """Measure, then let the biases walk on."""
+        del t
+        bias = state[:6]
+        z = self.expected(X_WB, V_WB_B, dV_WB_B) + bias + _six(*self.noise_std(), state) * w[:6]
+        limit = _six(self.accelerometer_range, self.gyroscope_range, state)
+        step = 1 / math.sqrt(self.rate)
+        walk = _six(self.accelerometer_walk * step, self.gyroscope_walk * step, state)
+        return jnp.concatenate([bias + walk * w[6:], jnp.clip(z, -limit, limit)])
+
+
+def _six(accelerometer: float, gyroscope: float, like: Float[Array, "n *batch"]) -> Array:
+    return column((accelerometer,) * 3 + (gyroscope,) * 3, like)

@@ -10,7 +10,6 @@ SHELL := /bin/bash
 INSTALLED := .venv/.installed-$(shell printf %s "$(CURDIR)" | cksum | cut -d' ' -f1)
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
-ROOMS := models training systems sims
 
 # One thread a test worker: pytest runs one worker a core.
 ONE_THREAD := NPROC=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
@@ -91,4 +90,4 @@ lock: ## write requirements.txt anew with the newest versions that pyproject.tom
 .PHONY: clean
 clean: ## remove what was built and cached (.venv stays; remove it by hand)
 	rm -rf build dist src/*.egg-info .pytest_cache .ruff_cache .hypothesis .benchmarks .jax_cache
-	find $(ROOMS) src tests examples benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+	find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Hashable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import yaml
 
@@ -38,8 +38,6 @@ class Tagged:
 
 
 class _Loader(yaml.SafeLoader):
-    yaml_implicit_resolvers: ClassVar[dict] = {}
-
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         lines: dict[Any, int] = {}
         for key_node, _ in node.value:
@@ -89,6 +87,7 @@ class _Dumper(yaml.SafeDumper):
         return self.represent_float(value)
 
 
+_Loader.yaml_implicit_resolvers = {}  # none of YAML 1.1
 for _name, _pattern, _first in _CORE:
     for _cls in (_Loader, _Dumper):
         _cls.add_implicit_resolver(

@@ -1,0 +1,284 @@
+"""The eight thrusters: geometry, PWM to force and back, allocation of a wrench, and lag.
+
+Order and signs are ArduSub's (frame VECTORED_6DOF): thrusters 1–4 horizontal, front right, front
+left, rear right, rear left; 5–8 vertical in the same order. `directions` is the force in B
+(forward, left, up) for one newton at PWM above 1500, so the front horizontals push back and the
+verticals push down. Arrays are component first: forces (8, *batch).
+"""
+
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from .thruster_curves import NEUTRAL, ThrusterCurve
+
+REST = 0.1
+"""Below this force, N, a thruster counts as standing still for the start delay."""
+
+
+def allocation_matrix(
+    positions: Float[np.ndarray, "3 n"], directions: Float[np.ndarray, "3 n"]
+) -> Float[np.ndarray, "6 n"]:
+    """B with F_Bo_B = B f: columns [d; p × d] (Fossen 2011, ch. 12.3)."""
+    return np.concatenate([directions, np.cross(positions, directions, axis=0)])
+
+
+class Thrusters(eqx.Module):
+    """Thrusters fixed to the body, all of one kind.
+
+    `motor_directions` are ArduSub's MOT_n_DIRECTION: -1 where PWM above 1500 turns the propeller
+    backwards, so that the thruster gives its reverse thrust; the autopilot's mixer mirrors its
+    output about 1500 there and `pwm` does so too.
+    """
+
+    positions: Float[Array, "3 n"]
+    directions: Float[Array, "3 n"]
+    motor_directions: Float[Array, "n"]
+    curve: ThrusterCurve
+    time_constant: Float[Array, ""]
+    start_delay: Float[Array, ""]
+    nominal_voltage: Float[Array, ""]
+    resistance: Float[Array, ""]
+    allocation: Float[Array, "6 n"]
+    inverse: Float[Array, "n 6"]
+    bias: Float[Array, "n"]
+    groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        positions: Float[np.ndarray, "3 n"],
+        directions: Float[np.ndarray, "3 n"],
+        curve: ThrusterCurve,
+        *,
+        motor_directions: Float[np.ndarray, "n"] | None = None,
+        effort: Float[np.ndarray, "n"] | None = None,
+        time_constant: float = 0.0,
+        start_delay: float = 0.0,
+        nominal_voltage: float = 16.0,
+        resistance: float = 0.0,
+        dtype: jnp.dtype | type = float,
+    ):
+        """Positions in m from Bo; times in s; battery's open-circuit voltage in V, resistance in Ω.
+
+        `effort` (positive) weighs the squares of the forces that `allocate` keeps small.
+
+        Raises:
+            ValueError: an array has the wrong size, the allocation has not rank 6, or a value is
+                out of range.
+        """
+        p, d = np.asarray(positions, float), np.asarray(directions, float)
+        n = p.shape[-1]
+        s = np.ones(n) if motor_directions is None else np.asarray(motor_directions, float)
+        w = np.ones(n) if effort is None else np.asarray(effort, float)
+        if p.shape != (3, n) or d.shape != (3, n) or s.shape != (n,) or w.shape != (n,):
+            raise ValueError(
+                "positions and directions must be (3, n), motor_directions and effort (n,); got "
+                f"{p.shape}, {d.shape}, {s.shape}, {w.shape}"
+            )
+        if not np.all(np.abs(s) == 1):
+            raise ValueError(f"motor_directions must be 1 or -1 each, not {s.tolist()}")
+        if not np.all(w > 0):
+            raise ValueError(f"effort must be positive, not {w.tolist()}")
+        if not (time_constant >= 0 and start_delay >= 0):
+            raise ValueError(
+                f"time_constant {time_constant} and start_delay {start_delay} must be ≥ 0 s"
+            )
+        if not (resistance >= 0 and nominal_voltage > 0):
+            raise ValueError(
+                f"battery: resistance {resistance} Ω must be ≥ 0 and voltage {nominal_voltage} V "
+                "positive"
+            )
+        B = allocation_matrix(p, d)
+        if np.linalg.matrix_rank(B, tol=1e-6 * float(np.abs(B).max(initial=0.0))) < 6:
+            raise ValueError(
+                "the thrusters can't push along and turn about every axis (allocation has no rank "
+                "6); check thruster positions and directions"
+            )
+        upright = np.abs(d[2]) > np.hypot(d[0], d[1])
+        groups = [np.flatnonzero(~upright), np.flatnonzero(upright)]
+        if min(len(group) for group in groups) == 0:
+            raise ValueError("give horizontal thrusters and vertical ones; check directions")
+        self.groups = tuple(tuple(int(i) for i in group) for group in groups)
+        bias = np.zeros(n)
+        for group in self.groups:
+            bias[list(group)] = _null_vector(B[:, list(group)])
+        self.positions, self.directions = jnp.asarray(p, dtype), jnp.asarray(d, dtype)
+        self.motor_directions = jnp.asarray(s, dtype)
+        self.curve = curve
+        self.time_constant = jnp.asarray(time_constant, dtype)
+        self.start_delay = jnp.asarray(start_delay, dtype)
+        self.nominal_voltage = jnp.asarray(nominal_voltage, dtype)
+        self.resistance = jnp.asarray(resistance, dtype)
+        self.allocation = jnp.asarray(B, dtype)
+        self.inverse = jnp.asarray((B / w).T @ np.linalg.inv((B / w) @ B.T), dtype)
+        self.bias = jnp.asarray(bias, dtype)
+
+    # ------------------------------------------------------------------------------ PWM and force
+
+    def _voltage(self, voltage: ArrayLike | None, rank: int) -> Array:
+        """The nominal voltage for None; a batch gets the thrusters' axis in front."""
+        if voltage is None:
+            return self.nominal_voltage
+        V = jnp.asarray(voltage, self.nominal_voltage.dtype)
+        return V[None] if V.ndim == rank - 1 and V.ndim > 0 else V
+
+    def force(
+        self, pwm: Float[Array, "n *batch"], voltage: ArrayLike | None = None
+    ) -> Float[Array, "n *batch"]:
+        """Steady forces in N at `pwm` µs; `voltage` in V, a number or one for each batch entry."""
+        return self.curve.force(self._mirror(pwm), self._voltage(voltage, pwm.ndim))
+
+    def pwm(
+        self, force: Float[Array, "n *batch"], voltage: ArrayLike | None = None
+    ) -> Float[Array, "n *batch"]:
+        """PWM in µs whose steady force is `force`, held within 1100–1900 µs."""
+        return self._mirror(self.curve.pwm(force, self._voltage(voltage, force.ndim)))
+
+    def _mirror(self, pwm: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:
+        return NEUTRAL + _column(self.motor_directions, pwm) * (pwm - NEUTRAL)
+
+    def force_limits(
+        self, voltage: ArrayLike | None = None
+    ) -> tuple[Float[Array, "n *batch"], Float[Array, "n *batch"]]:
+        """Largest reverse (negative) and forward force in N of each thruster."""
+        V = self._voltage(voltage, 0)
+        shape = (len(self.motor_directions), *V.shape)
+        low, high = self.curve.limits(V)
+        return jnp.broadcast_to(low[None], shape), jnp.broadcast_to(high[None], shape)
+
+    def loaded_voltage(
+        self, pwm: Float[Array, "n *batch"], open_circuit: ArrayLike | None = None
+    ) -> Float[Array, "*batch"]:
+        """Battery voltage V = Voc - R ΣI(PWM, V) under the thrusters' current.
+
+        `open_circuit` is the nominal voltage unless given: a number or one for each batch entry.
+        """
+        V = self._voltage(open_circuit, 0)
+        return self.curve.loaded_voltage(self._mirror(pwm), V, self.resistance)
+
+    # -------------------------------------------------------------------------- wrench and forces
+
+    def wrench(self, forces: Float[Array, "n *batch"]) -> Float[Array, "6 *batch"]:
+        """F_Bo_B = B f in N and N·m."""
+        return jnp.tensordot(self.allocation, forces, 1)
+
+    def allocate(
+        self,
+        F_Bo_B: Float[Array, "6 *batch"],
+        voltage: ArrayLike | None = None,
+        scale: Literal["common", "groups"] = "common",
+    ) -> Float[Array, "n *batch"]:
+        """Forces in N within the limits that give `F_Bo_B`, or as much of it as they can.
+
+        The least forces in the sense of `effort` (weighted pseudo-inverse; Fossen 2011, ch. 12.3),
+        then, where a limit binds, the smallest inner bias, horizontals against each other and
+        verticals against each other, that leaves the wrench as it is: forward thrust exceeds
+        reverse thrust, and the bias moves load to the thrusters that run forward. What still
+        doesn't fit is scaled down: `common` by one factor, so that the wrench keeps its direction,
+        `groups` horizontals and verticals each by their own, as ArduSub's mixer does: heave, roll
+        and pitch then keep their authority while the vehicle races, and the direction turns.
+        """
+        force = jnp.tensordot(self.inverse, F_Bo_B, 1)
+        low, high = self.curve.limits(self._voltage(voltage, force.ndim))
+        low, high = jnp.broadcast_to(low, force.shape), jnp.broadcast_to(high, force.shape)
+        if scale == "common":
+            factors = [self._fitting_scale(force, low, high, group) for group in self.groups]
+            force = force * jnp.min(jnp.stack(factors), axis=0)[None]
+        else:
+            planar, upright = self.groups
+            in_plane = _column(np.array([1, 1, 0, 0, 0, 1], bool), force)
+            factor = self._fitting_scale(force, low, high, planar)[None]
+            # the verticals balance the moments of what the horizontals really give
+            force = jnp.tensordot(self.inverse, F_Bo_B * jnp.where(in_plane, factor, 1), 1)
+            factor = self._fitting_scale(force, low, high, upright)[None]
+            vertical = np.isin(np.arange(len(force)), upright)
+            force = force * jnp.where(_column(vertical, force), factor, 1)
+        for group in self.groups:
+            index = np.array(group)
+            n = _column(self.bias[index], force)
+            some = n != 0
+            n, part = jnp.where(some, n, 1), force[index]
+            ends = (low[index] - part) / n, (high[index] - part) / n
+            least = jnp.max(jnp.where(some, jnp.minimum(*ends), -jnp.inf), axis=0)
+            most = jnp.min(jnp.where(some, jnp.maximum(*ends), jnp.inf), axis=0)
+            inner = jnp.where(some, n * jnp.clip(0, least, most)[None], 0)
+            force = force.at[index].set(jnp.clip(part + inner, low[index], high[index]))
+        return force
+
+    def _fitting_scale(
+        self, force: Array, low: Array, high: Array, group: tuple[int, ...]
+    ) -> Array:
+        """Largest s ≤ 1 for which some bias c puts s f + c n within the limits.
+
+        With g = f/n and limits l, h divided likewise, s g_i + c ≤ h_i and s g_j + c ≥ l_j for all
+        pairs: s (g_i - g_j) ≤ h_i - l_j. A thruster without bias (n = 0) bounds s alone.
+        """
+        index = np.array(group)
+        n = _column(self.bias[index], force)
+        some = n != 0
+        safe = jnp.where(some, n, 1)
+        g, a, b = force[index] / safe, low[index] / safe, high[index] / safe
+        a, b = jnp.minimum(a, b), jnp.maximum(a, b)
+        gap, room = g[:, None] - g[None], b[:, None] - a[None]
+        binds = (gap > 0) & some[:, None] & some[None]
+        pairs = jnp.where(binds, room / jnp.where(binds, gap, 1), 1)
+        bound = jnp.where(g > 0, b, a)
+        binds = (g != 0) & ~some
+        alone = jnp.where(binds, bound / jnp.where(binds, g, 1), 1)
+        return jnp.minimum(jnp.minimum(jnp.min(pairs, axis=(0, 1)), jnp.min(alone, axis=0)), 1)
+
+    # ---------------------------------------------------------------------------------------- lag
+
+    def lag(
+        self, force: Float[Array, "n *batch"], command: Float[Array, "n *batch"], dt: ArrayLike
+    ) -> Float[Array, "n *batch"]:
+        """Force after `dt` s of τ df/dt = command - force, exact while the command is held."""
+        dt = jnp.asarray(dt, force.dtype)
+        at_once = self.time_constant <= 0
+        decay = jnp.exp(-dt / jnp.where(at_once, 1, self.time_constant))
+        return command + (force - command) * jnp.where(at_once, 0, decay)
+
+    def lag_from_rest(
+        self,
+        force: Float[Array, "n *batch"],
+        waited: Float[Array, "n *batch"],
+        command: Float[Array, "n *batch"],
+        dt: ArrayLike,
+    ) -> tuple[Float[Array, "n *batch"], Float[Array, "n *batch"]]:
+        """`lag` with the pause in which a sensorless motor drive starts a propeller from rest.
+
+        `waited` (s, start with zeros) counts the time since a stopped thruster was told to turn;
+        nothing happens until it reaches `start_delay`. A thruster that turns, also one that passes
+        through zero on its way to the other side, waits no more until it has stood still without
+        command. Returns the new force and the new `waited`.
+        """
+        dt = jnp.asarray(dt, force.dtype)
+        rests = jnp.abs(force) < REST
+        waited = jnp.where(rests & (command == 0), 0, jnp.where(rests, waited, self.start_delay))
+        starts = rests & (command != 0)
+        left = jnp.where(starts, jnp.clip(self.start_delay - waited, 0, dt), 0)
+        waited = jnp.where(starts, jnp.minimum(waited + dt, self.start_delay), waited)
+        at_once = self.time_constant <= 0
+        decay = jnp.exp(-(dt - left) / jnp.where(at_once, 1, self.time_constant))
+        decay = jnp.where(at_once, jnp.where(left < dt, 0, 1), decay)
+        return command + (force - command) * decay, waited
+
+
+def _column(values: Array | np.ndarray, x: Array) -> Array:
+    """One value for each entry of the first axis of `x`."""
+    return jnp.asarray(values).reshape((-1,) + (1,) * (x.ndim - 1))
+
+
+def _null_vector(B: Float[np.ndarray, "6 k"]) -> Float[np.ndarray, "k"]:
+    """Forces without wrench, largest entry 1, if they form a line; else zeros."""
+    _, values, rows = np.linalg.svd(B)
+    values = np.concatenate([values, np.zeros(B.shape[1])])[: B.shape[1]]
+    if np.sum(values < 1e-9 * values[0]) != 1:
+        return np.zeros(B.shape[1])
+    vector = rows[-1]
+    vector = np.where(np.abs(vector) < 1e-9 * np.abs(vector).max(), 0, vector)
+    return vector / vector[np.argmax(np.abs(vector))]

@@ -103,7 +103,7 @@ class PosePotential(Potential):
         The derivative along R exp(s ω̂) is tr(Gᵀ R ω̂) = Σ_j G_j · (r_j × ω) over the rows of G and
         R, so the moment is Σ_j r_j × G_j.
         """
-        R, p = se3.rotation_matrix(X_WB), X_WB[4:]
+        R, p = se3.rotation_matrix(X_WB), jnp.split(X_WB, [4])[1]
         G, dp = jax.grad(lambda R, p: jnp.sum(self._of(R, p)), argnums=(0, 1))(R, p)
         moment = se3.cross(R[0], G[0]) + se3.cross(R[1], G[1]) + se3.cross(R[2], G[2])
         return jnp.concatenate([-se3.rotate_inverse(X_WB, dp), moment])
@@ -111,5 +111,5 @@ class PosePotential(Potential):
 
 def _up(X_WB: Array) -> Array:
     """W's z axis in B: the last row of R_WB."""
-    w, x, y, z = X_WB[0], X_WB[1], X_WB[2], X_WB[3]
+    w, x, y, z, *_ = jnp.unstack(X_WB)
     return jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])

@@ -53,19 +53,21 @@ def _polynomial(coefficients: list[float], x: Array) -> Array:
     return result
 
 
+# Components are taken apart by `unstack` and `split`, whose transposes join in one operation; an
+# index or slice would leave the backward pass a padded array of every component to add up.
+
+
 def _dot(a: Array, b: Array) -> Array:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    a0, a1, a2 = jnp.unstack(a)
+    b0, b1, b2 = jnp.unstack(b)
+    return a0 * b0 + a1 * b1 + a2 * b2
 
 
 def cross(a: Float[Array, "3 *#batch"], b: Float[Array, "3 *#batch"]) -> Float[Array, "3 *#batch"]:
     """Cross product a × b, component first."""
-    return jnp.stack(
-        [
-            a[1] * b[2] - a[2] * b[1],
-            a[2] * b[0] - a[0] * b[2],
-            a[0] * b[1] - a[1] * b[0],
-        ]
-    )
+    a0, a1, a2 = jnp.unstack(a)
+    b0, b1, b2 = jnp.unstack(b)
+    return jnp.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
 
 
 def align(*arrays: Array) -> tuple[Array, ...]:
@@ -82,49 +84,55 @@ def identity(dtype: jnp.dtype | type = float) -> Float[Array, "7"]:
 def compose(X_AB: Float[Array, "7 *a"], X_BC: Float[Array, "7 *b"]) -> Float[Array, "7 *c"]:
     """X_AC = X_AB X_BC."""
     X_AB, X_BC = align(X_AB, X_BC)
-    w, x, y, z = X_AB[0], X_AB[1], X_AB[2], X_AB[3]
-    s, i, j, k = X_BC[0], X_BC[1], X_BC[2], X_BC[3]
+    q_AB, p_AB = jnp.split(X_AB, [4])
+    q_BC, p_BC = jnp.split(X_BC, [4])
+    w, x, y, z = jnp.unstack(q_AB)
+    s, i, j, k = jnp.unstack(q_BC)
     q = [
         w * s - x * i - y * j - z * k,
         w * i + x * s + y * k - z * j,
         w * j - x * k + y * s + z * i,
         w * k + x * j - y * i + z * s,
     ]
-    p = act(X_AB, X_BC[4:])
-    return jnp.concatenate([jnp.stack(q), p])
+    return jnp.concatenate([jnp.stack(q), _rotate(q_AB, p_BC) + p_AB])
 
 
 def inverse(X_AB: Float[Array, "7 *batch"]) -> Float[Array, "7 *batch"]:
     """X_BA."""
-    q = jnp.concatenate([X_AB[:1], -X_AB[1:4]])
-    return jnp.concatenate([q, -rotate_inverse(X_AB, X_AB[4:])])
+    w, u, p = jnp.split(X_AB, [1, 4])
+    q = jnp.concatenate([w, -u])
+    return jnp.concatenate([q, -_rotate(q, p)])
+
+
+def _rotate(q: Array, v: Array) -> Array:
+    w, u = jnp.split(q, [1])
+    t = 2 * cross(u, v)
+    return v + w * t + cross(u, t)
 
 
 def rotate(X_AB: Float[Array, "7 *a"], v_B: Float[Array, "3 *b"]) -> Float[Array, "3 *c"]:
     """v_A = R_AB v_B."""
     X_AB, v_B = align(X_AB, v_B)
-    w, u = X_AB[:1], X_AB[1:4]
-    t = 2 * cross(u, v_B)
-    return v_B + w * t + cross(u, t)
+    return _rotate(jnp.split(X_AB, [4])[0], v_B)
 
 
 def rotate_inverse(X_AB: Float[Array, "7 *a"], v_A: Float[Array, "3 *b"]) -> Float[Array, "3 *c"]:
     """v_B = R_ABᵀ v_A."""
     X_AB, v_A = align(X_AB, v_A)
-    w, u = X_AB[:1], -X_AB[1:4]
-    t = 2 * cross(u, v_A)
-    return v_A + w * t + cross(u, t)
+    w, u, _ = jnp.split(X_AB, [1, 4])
+    return _rotate(jnp.concatenate([w, -u]), v_A)
 
 
 def act(X_AB: Float[Array, "7 *a"], p_B: Float[Array, "3 *b"]) -> Float[Array, "3 *c"]:
     """Position of a point known in B, expressed in A: p_A = R_AB p_B + p_AB."""
     X_AB, p_B = align(X_AB, p_B)
-    return rotate(X_AB, p_B) + X_AB[4:]
+    q, p = jnp.split(X_AB, [4])
+    return _rotate(q, p_B) + p
 
 
 def rotation_matrix(X_AB: Float[Array, "7 *batch"]) -> Float[Array, "3 3 *batch"]:
     """R_AB of the pose's quaternion."""
-    w, x, y, z = X_AB[0], X_AB[1], X_AB[2], X_AB[3]
+    w, x, y, z, *_ = jnp.unstack(X_AB)
     one = jnp.ones_like(w)
     rows = [
         [one - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -136,7 +144,7 @@ def rotation_matrix(X_AB: Float[Array, "7 *batch"]) -> Float[Array, "3 3 *batch"
 
 def exp(xi: Float[Array, "6 *batch"]) -> Float[Array, "7 *batch"]:
     """The pose reached by flowing for unit time with the constant twist xi = [v, ω]."""
-    v, omega = xi[:3], xi[3:]
+    v, omega = jnp.split(xi, 2)
     t2 = _dot(omega, omega)
     series = t2 < _SERIES_BELOW
     small = jnp.where(series, t2, 0)
@@ -159,8 +167,8 @@ def exp(xi: Float[Array, "6 *batch"]) -> Float[Array, "7 *batch"]:
 def log(X: Float[Array, "7 *batch"]) -> Float[Array, "6 *batch"]:
     """The twist [v, ω], |ω| ≤ π, whose `exp` is X; finite with its gradient at the cut locus."""
     sign = jnp.where(X[:1] < 0, -1, 1).astype(X.dtype)
-    q = sign * X[:4]
-    w, u, p = q[0], q[1:], X[4:]
+    w, u, p = jnp.split(X, [1, 4])
+    w, u = jnp.squeeze(sign * w, 0), sign * u
     n2 = _dot(u, u)
     series = n2 < _ATAN_SERIES_BELOW * w * w
     w_safe = jnp.where(series, w, 1)
@@ -200,9 +208,10 @@ def interpolate(
 
 def normalize(X: Float[Array, "7 *batch"]) -> Float[Array, "7 *batch"]:
     """The same pose with a unit quaternion."""
-    q = X[:4]
-    scale = 1 / jnp.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    return jnp.concatenate([q * scale[None], X[4:]])
+    q, p = jnp.split(X, [4])
+    w, x, y, z = jnp.unstack(q)
+    scale = 1 / jnp.sqrt(w * w + x * x + y * y + z * z)
+    return jnp.concatenate([q * scale[None], p])
 
 
 def _hat(v: Array) -> Array:
@@ -238,8 +247,10 @@ def ad_apply(
     xi: Float[Array, "6 *#batch"], eta: Float[Array, "6 *#batch"]
 ) -> Float[Array, "6 *#batch"]:
     """The Lie bracket [ξ, η] = ad_ξ η without forming the matrix."""
-    linear = cross(xi[3:], eta[:3]) + cross(xi[:3], eta[3:])
-    return jnp.concatenate([linear, cross(xi[3:], eta[3:])])
+    v, omega = jnp.split(xi, 2)
+    eta_v, eta_omega = jnp.split(eta, 2)
+    linear = cross(omega, eta_v) + cross(v, eta_omega)
+    return jnp.concatenate([linear, cross(omega, eta_omega)])
 
 
 def coad_apply(
@@ -249,8 +260,8 @@ def coad_apply(
 
     Linear part p × ω, angular part π × ω + p × v (Marsden and Ratiu 1994, section 14.2).
     """
-    v, omega = xi[:3], xi[3:]
-    p, pi = mu[:3], mu[3:]
+    v, omega = jnp.split(xi, 2)
+    p, pi = jnp.split(mu, 2)
     return jnp.concatenate([cross(p, omega), cross(pi, omega) + cross(p, v)])
 
 

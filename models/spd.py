@@ -5,6 +5,9 @@ there; every operation below is unrolled elementwise arithmetic instead.
 """
 
 import abc
+import functools
+import operator
+from collections.abc import Iterable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -98,45 +101,45 @@ class CholeskySpd(Spd):
     @classmethod
     def from_raw(cls, raw: Float[Array, "21 *batch"], scale: Float[Array, "6"]) -> "CholeskySpd":
         """The operator of 21 unconstrained numbers (packed L); zeros give S²."""
-        return cls(squareplus(raw[:N]), raw[N:], scale)
+        diagonal, below = jnp.split(raw, [N])
+        return cls(squareplus(diagonal), below, scale)
 
-    def _L(self, i: int, j: int) -> Array:
-        return self.diagonal[i] if i == j else self.below[packed_index(i, j) - N]
+    def _rows(self) -> list[list[Array]]:
+        """L as rows of entries, each an array over the batch."""
+        diagonal, below = jnp.unstack(self.diagonal), jnp.unstack(self.below)
+        return [[*below[i * (i - 1) // 2 : i * (i + 1) // 2], diagonal[i]] for i in range(N)]
 
-    def matvec(self, x: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
-        s = self.scale
-        z = [s[i] * x[i] for i in range(N)]
-        t = [sum(self._L(i, j) * z[i] for i in range(j, N)) for j in range(N)]
-        y = [s[i] * sum(self._L(i, j) * t[j] for j in range(i + 1)) for i in range(N)]
-        return jnp.stack([jnp.asarray(c) for c in y])
+    def matvec(self, x: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+        L, s = self._rows(), jnp.unstack(self.scale)
+        z = [a * b for a, b in zip(s, jnp.unstack(x), strict=True)]
+        t = [_sum(L[i][j] * z[i] for i in range(j, N)) for j in range(N)]
+        return jnp.stack([s[i] * _sum(L[i][j] * t[j] for j in range(i + 1)) for i in range(N)])
 
-    def solve(self, y: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
-        s = self.scale
-        pivot = [1 / self._L(i, i) for i in range(N)]
-        t: list[Array] = []
+    def solve(self, y: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+        L, s = self._rows(), jnp.unstack(self.scale)
+        pivot = [1 / L[i][i] for i in range(N)]
+        rest = [a / b for a, b in zip(jnp.unstack(y), s, strict=True)]
         for i in range(N):
-            rest = y[i] / s[i]
-            for j in range(i):
-                rest = rest - self._L(i, j) * t[j]
-            t.append(rest * pivot[i])
-        x: list[Array] = [t[0]] * N
-        for i in reversed(range(N)):
-            rest = t[i]
+            rest[i] = rest[i] * pivot[i]
             for j in range(i + 1, N):
-                rest = rest - self._L(j, i) * x[j]
-            x[i] = rest * pivot[i]
-        return jnp.stack([x[i] / s[i] for i in range(N)])
+                rest[j] = rest[j] - L[j][i] * rest[i]
+        for i in reversed(range(N)):
+            rest[i] = rest[i] * pivot[i]
+            for j in range(i):
+                rest[j] = rest[j] - L[i][j] * rest[i]
+        return jnp.stack([a / b for a, b in zip(rest, s, strict=True)])
 
-    def matrix(self) -> Float[Array, "6 6 *#batch"]:
-        s = self.scale
+    def matrix(self) -> Float[Array, "6 6 *batch"]:
+        L, s = self._rows(), jnp.unstack(self.scale)
         rows = [
-            [
-                s[i] * s[j] * sum(self._L(i, k) * self._L(j, k) for k in range(min(i, j) + 1))
-                for j in range(N)
-            ]
+            [s[i] * s[j] * _sum(L[i][k] * L[j][k] for k in range(min(i, j) + 1)) for j in range(N)]
             for i in range(N)
         ]
-        return jnp.stack([jnp.stack([jnp.asarray(c) for c in row]) for row in rows])
+        return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def _sum(terms: Iterable[Array]) -> Array:
+    return functools.reduce(operator.add, terms)
 
 
 def unpack_symmetric(packed: Float[Array, "21 *batch"]) -> list[list[Array]]:

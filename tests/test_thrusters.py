@@ -200,6 +200,19 @@ def test_groups_keep_the_depth_while_the_vehicle_races(heavy, allocate):
     np.testing.assert_allclose(groups, [129.26, 0, 30, 0, 0, 0], atol=0.01)
 
 
+def test_groups_keep_the_direction_in_the_plane(heavy, allocate):
+    F = np.asarray(wrenches(30, 3.0, seed=5))
+    forces = allocate(heavy, jnp.asarray(F), "groups")
+    low, high = heavy.force_limits()
+    assert jnp.all((low[:, None] <= forces) & (forces <= high[:, None]))
+    plane = np.array([0, 1, 5])
+    reached = np.asarray(heavy.wrench(forces))[plane]
+    factor = np.sum(reached * F[plane], axis=0) / np.sum(F[plane] ** 2, axis=0)
+    np.testing.assert_allclose(reached, factor * F[plane], atol=1e-9)
+    assert np.all((factor > 0) & (factor < 1 + 1e-9))
+    assert np.any(factor < 0.9)
+
+
 def test_effort_relieves_a_weak_thruster(heavy):
     effort = np.ones(8)
     effort[0] = 100

@@ -47,6 +47,11 @@ class Dynamics(eqx.Module):
     displaced_mass: eqx.AbstractVar[Float[Array, ""]]
     p_BoCb_B: eqx.AbstractVar[Float[Array, "3"]]
 
+    @property
+    def stochastic(self) -> bool:
+        """Whether b may differ from zero; integrators skip the noise of a model that says no."""
+        return True
+
     @abc.abstractmethod
     def coefficients(self, V_WB_B: Float[Array, "6 *#batch"]) -> Coefficients:
         """M, D, D^f and b at a body velocity."""

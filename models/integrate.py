@@ -31,12 +31,13 @@ def step(
 ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
     """One step of Algorithm 1 over `dt` (s) with the Brownian increment `dW` (√s, variance dt).
 
-    Without `dW` the step is the deterministic Lie-Euler step. `flow` is the water's motion at Bo.
+    Without `dW`, or for a model without noise, it is the deterministic Lie-Euler step. `flow` is
+    the water's motion at Bo.
     """
     h = jnp.asarray(dt, V_WB_B.dtype)
     c = None if flow is not None else dynamics.coefficients(V_WB_B)
     dV = h * dynamics.acceleration(X_WB, V_WB_B, F_Bo_B, flow, c)
-    if dW is not None:
+    if dW is not None and dynamics.stochastic:
         stage = None if c is None else (c.mass, c.diffusion)
         first = dynamics.noise_acceleration(V_WB_B, dW, stage)
         second = dynamics.noise_acceleration(V_WB_B + first, dW)

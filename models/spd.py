@@ -1,7 +1,7 @@
 """Symmetric positive definite 6 x 6 operators, in plain arithmetic that batches with samples last.
 
 Library factorisations of many small matrices are slow on a CPU and batched `eigh` can hang XLA
-there; every operation below is unrolled elementwise arithmetic instead.
+there; every operation below is elementwise arithmetic instead.
 """
 
 import abc
@@ -12,6 +12,8 @@ from collections.abc import Iterable
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from . import se3, symmetric
 
 N = 6
 PACKED = N * (N + 1) // 2
@@ -138,10 +140,43 @@ class CholeskySpd(Spd):
         return jnp.stack([jnp.stack(row) for row in rows])
 
 
+class EigenSpd(Spd):
+    """A = S f(P) S with P symmetric, f positive on its eigenvalues and S = diag(scale)."""
+
+    value: Float[Array, "6 6 *batch"]
+    inverse: Float[Array, "6 6 *batch"]
+    scale: Float[Array, "6"]
+
+    @classmethod
+    def from_raw(cls, raw: Float[Array, "21 *batch"], scale: Float[Array, "6"]) -> "EigenSpd":
+        """The operator of 21 unconstrained numbers (packed P); zeros give S²."""
+        rows = unpack_symmetric(raw)
+        value, inverse = symmetric.positive(jnp.stack([jnp.stack(row) for row in rows]))
+        return cls(value, inverse, scale)
+
+    def matvec(self, x: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+        s, x = se3.align(self.scale, x)
+        return s * _apply(self.value, s * x)
+
+    def solve(self, y: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+        s, y = se3.align(self.scale, y)
+        return _apply(self.inverse, y / s) / s
+
+    def matrix(self) -> Float[Array, "6 6 *batch"]:
+        s = self.scale.reshape((N,) + (1,) * (self.value.ndim - 2))
+        return s[:, None] * s[None] * self.value
+
+
+def _apply(A: Array, x: Array) -> Array:
+    columns = zip(jnp.unstack(A, axis=1), jnp.unstack(x), strict=True)
+    return _sum(column * entry[None] for column, entry in columns)
+
+
 def _sum(terms: Iterable[Array]) -> Array:
     return functools.reduce(operator.add, terms)
 
 
 def unpack_symmetric(packed: Float[Array, "21 *batch"]) -> list[list[Array]]:
     """The 6 x 6 nested list of a packed symmetric matrix."""
-    return [[packed[packed_index(max(i, j), min(i, j))] for j in range(N)] for i in range(N)]
+    entries = jnp.unstack(packed)
+    return [[entries[packed_index(max(i, j), min(i, j))] for j in range(N)] for i in range(N)]

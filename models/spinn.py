@@ -19,9 +19,14 @@ from .dynamics import Coefficients, Dynamics
 from .networks import ACTIVATIONS, Activation, Heads, MlpStack
 from .potential import BoundedScalar, GravityPotential, PosePotential, Potential, PotentialKind
 from .rigid_body import FossenDynamics
-from .spd import CholeskySpd, Spd, pack, squareplus
+from .spd import CholeskySpd, EigenSpd, Spd, pack, squareplus
 
-SpdKind = Literal["cholesky"]
+SpdKind = Literal["cholesky", "eigenvalues"]
+
+_OPERATORS: dict[str, type[CholeskySpd] | type[EigenSpd]] = {
+    "cholesky": CholeskySpd,
+    "eigenvalues": EigenSpd,
+}
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,7 @@ class SpinnConfig:
     depth: int = 3
     activation: Activation = "tanh"
     spd: SpdKind = "cholesky"
-    """How M, D and D^f are made positive definite."""
+    """How M, D and D^f are made positive definite: Cholesky factors, or positive eigenvalues."""
     potential: PotentialKind = "gravity"
     """`gravity` keeps the symmetry in x, y, yaw (whole dives); `pose` is the paper's."""
     constant_mass: bool = False
@@ -51,7 +56,7 @@ class SpinnConfig:
         require(self.width >= 1, self, "width", "give at least 1 unit")
         require(self.depth >= 1, self, "depth", "give at least 1 hidden layer")
         require(self.activation in ACTIVATIONS, self, "activation", f"use one of {ACTIVATIONS}")
-        require(self.spd in ("cholesky",), self, "spd", "use cholesky")
+        require(self.spd in _OPERATORS, self, "spd", f"use one of {tuple(_OPERATORS)}")
         require(self.potential in ("gravity", "pose"), self, "potential", "use gravity or pose")
         require(self.start in ("reference", "scale"), self, "start", "use reference or scale")
         require(min(self.velocity_scale) > 0, self, "velocity_scale", "give positive numbers")
@@ -120,7 +125,9 @@ class Spinn(Dynamics):
         )
         packed = np.stack(
             [
-                _raw(a / np.sqrt(np.outer(d, d)) if config.start == "reference" else np.eye(6))
+                _raw(a / np.sqrt(np.outer(d, d)), config.spd)
+                if config.start == "reference"
+                else np.zeros(21)
                 for a, d in zip(matrices, diagonals, strict=True)
             ]
         )
@@ -149,6 +156,38 @@ class Spinn(Dynamics):
     def stochastic(self) -> bool:
         return self.config.stochastic
 
+    def trainable(self) -> "Spinn":
+        """The same tree with True at the parameters θ and False at inertia and scales."""
+        spec = jax.tree.map(eqx.is_inexact_array, self)
+        no_scales = jax.tree.map(lambda _: False, spec.scales)
+        fixed = (False, False, False, no_scales)
+        spec = eqx.tree_at(
+            lambda m: (m.rigid_inertia, m.displaced_mass, m.p_BoCb_B, m.scales), spec, fixed
+        )
+        if isinstance(self.learned_potential, PosePotential):
+            spec = eqx.tree_at(lambda m: m.learned_potential.length, spec, False)
+        return spec
+
+    def mass_variation(
+        self, V_WB_B: Float[Array, "6 *batch"], direction: Float[Array, "6 *batch"]
+    ) -> Float[Array, ""]:
+        """Mean over the batch of |∂P(ξ)·v|², P the raw outputs for M in units of their scale.
+
+        With directions v drawn from unit Gaussians it is an unbiased estimate of ‖∂P/∂ξ‖² (in
+        units of `velocity_scale`), a penalty that keeps M_θ constant (Hutchinson 1990). Zero if
+        `constant_mass`.
+        """
+        if self.constant_mass is not None:
+            return jnp.zeros((), V_WB_B.dtype)
+        count = int(self.config.stochastic) + 1
+
+        def raw(V: Array) -> Array:
+            return self.matrix_heads(self._features(V, count)[count - 1 :], 1)[0]
+
+        scale = self.scales.velocity.reshape((6,) + (1,) * (V_WB_B.ndim - 1))
+        _, change = jax.jvp(raw, (V_WB_B,), (direction * jax.lax.stop_gradient(scale),))
+        return jnp.mean(jnp.sum(change**2, axis=0))
+
     def _features(self, V_WB_B: Array, count: int) -> Array:
         scale = jax.lax.stop_gradient(self.scales.velocity)
         return self.hidden(V_WB_B / scale.reshape((6,) + (1,) * (V_WB_B.ndim - 1)), count)
@@ -162,7 +201,7 @@ class Spinn(Dynamics):
 
     def _spd(self, raw: Array, index: int) -> Spd:
         scale = jax.lax.stop_gradient(self.scales.matrices[index])
-        return CholeskySpd.from_raw(raw, scale)
+        return _OPERATORS[self.config.spd].from_raw(raw, scale)
 
     def coefficients(self, V_WB_B: Float[Array, "6 *batch"]) -> Coefficients:
         features = self._features(V_WB_B, self.hidden.weights[0].shape[0])
@@ -201,10 +240,14 @@ def _floored(a: np.ndarray, floor: np.ndarray) -> np.ndarray:
     return np.outer(s, s) * ((Q * np.maximum(w, 1.0)) @ Q.T)
 
 
-def _raw(a: np.ndarray) -> np.ndarray:
-    """The 21 outputs of which `CholeskySpd.from_raw` makes `a`."""
-    L = np.linalg.cholesky(a)
-    np.fill_diagonal(L, np.diag(L) - 1 / np.diag(L))
+def _raw(a: np.ndarray, kind: SpdKind) -> np.ndarray:
+    """The 21 outputs that are made into `a`; x - 1/x undoes squareplus."""
+    if kind == "cholesky":
+        L = np.linalg.cholesky(a)
+        np.fill_diagonal(L, np.diag(L) - 1 / np.diag(L))
+    else:
+        w, Q = np.linalg.eigh(a)
+        L = (Q * (w - 1 / w)) @ Q.T
     return np.asarray(pack(jnp.asarray(L)))
 
 

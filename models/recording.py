@@ -174,7 +174,7 @@ class Recording:
         rest = 1500.0 if name == "pwm" else 0.0
         command = jnp.asarray(np.moveaxis(np.where(self.mask[..., None], values, rest), -1, 0))
         if name == "pwm":
-            command = thrusters.force(command, jnp.asarray(self._voltage(vehicle)))
+            command = thrusters.force(command, jnp.asarray(self._voltage(thrusters)))
         F = np.moveaxis(np.asarray(thrusters.wrench(command)), 0, -1)
         return xr.DataArray(
             np.where(self.mask[..., None], F, np.nan),
@@ -196,11 +196,11 @@ class Recording:
         if vehicle is None or isinstance(vehicle, str | os.PathLike):
             from .vehicle import load_vehicle
 
-            return load_vehicle(self.vehicle if vehicle is None else vehicle)
+            return load_vehicle(self.vehicle if vehicle is None else os.fspath(vehicle))
         return vehicle
 
-    def _voltage(self, vehicle: Any) -> np.ndarray:
-        nominal = float(vehicle.nominal_voltage)
+    def _voltage(self, thrusters: Any) -> np.ndarray:
+        nominal = float(thrusters.nominal_voltage)
         if "voltage" not in self.dataset:
             return np.full(self.mask.shape, nominal)
         measured = self.dataset["voltage"].to_numpy()

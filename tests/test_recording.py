@@ -165,6 +165,7 @@ class FakeThrusters:
     """Force 0.1 N/µs per volt; thruster i pushes with weight i along x."""
 
     allocation = np.outer(np.eye(6)[0], np.arange(8.0))
+    nominal_voltage = 2.0
 
     def force(self, pwm_us, voltage):
         return 0.1 * (pwm_us - 1500.0) * voltage[None]
@@ -174,8 +175,6 @@ class FakeThrusters:
 
 
 class FakeVehicle:
-    nominal_voltage = 2.0
-
     def thrusters(self, dtype):
         return FakeThrusters()
 

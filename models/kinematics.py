@@ -1,0 +1,163 @@
+"""Do poses and twists tell the same motion? If not, which mix-up of units or frames explains it.
+
+Over windows of about half a second the displacement seen in the poses, expressed in the body,
+must equal the integral of the body twist. Mix-ups (degrees, scalar-last quaternions, velocities in
+the world frame, other axis conventions) leave a residual that one change of reading removes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from .resample import conjugate, continuous, multiply, rotate, rotation_log
+
+_WINDOW_S = 0.5
+_MOVES_M, _TURNS_RAD = 0.02, 0.02  # rms in a window below which nothing can be told
+_EXPLAINED, _DOUBTFUL, _CONTRADICTED = 0.9, 0.8, 0.5
+
+Arrays = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well the integrated twist explains the displacement of the poses.
+
+    Attributes:
+        slope: least-squares factor from integrated twist to displacement, 1 if all is well.
+        explained: 1 − |residual|²/|displacement|² with slope 1; NaN if there is too little motion.
+    """
+
+    slope: float
+    explained: float
+
+
+def agreement(
+    t: Float[np.ndarray, " N"], X_WB: Float[np.ndarray, "7 N"], V_WB_B: Float[np.ndarray, "6 N"]
+) -> tuple[Agreement, Agreement]:
+    """Compare poses and body twists; return the linear and the angular agreement."""
+    moved, integrated = _increments(t, X_WB, V_WB_B)
+    return (
+        _agree(moved[:3], integrated[:3], _MOVES_M),
+        _agree(moved[3:], integrated[3:], _TURNS_RAD),
+    )
+
+
+def _agree(moved: np.ndarray, integrated: np.ndarray, least: float) -> Agreement:
+    known = np.isfinite(moved).all(axis=1) & np.isfinite(integrated).all(axis=1)
+    moved, integrated = moved[known], integrated[known]
+    size = np.sum(moved**2)
+    if not moved.size or np.sqrt(size / moved.shape[1]) < least:
+        return Agreement(np.nan, np.nan)
+    slope = float(np.sum(moved * integrated) / max(np.sum(integrated**2), 1e-12))
+    return Agreement(slope, float(1 - np.sum((moved - integrated) ** 2) / size))
+
+
+def _increments(t: np.ndarray, X_WB: np.ndarray, V: np.ndarray) -> Arrays:
+    """Displacements in B (m, rad) and integrals of the twist over windows, (6, windows)."""
+    q = continuous(X_WB[:4])
+    step = np.diff(t)
+    middle = q[:, 1:] + q[:, :-1]
+    middle = middle / np.linalg.norm(middle, axis=0)
+    moved = np.concatenate(
+        [
+            rotate(conjugate(middle), np.diff(X_WB[4:], axis=1)),
+            rotation_log(multiply(conjugate(q[:, :-1]), q[:, 1:])),
+        ]
+    )
+    integrated = 0.5 * (V[:, 1:] + V[:, :-1]) * step
+    window = np.floor((t[1:] - t[0]) / _WINDOW_S - 1e-9).astype(int)
+    edges = np.flatnonzero(np.concatenate([[True], np.diff(window) > 0]))
+    return np.add.reduceat(moved, edges, axis=1), np.add.reduceat(integrated, edges, axis=1)
+
+
+def _flip(x: np.ndarray, rows: tuple[int, ...]) -> np.ndarray:
+    sign = np.ones((x.shape[0], 1))
+    sign[list(rows)] = -1
+    return x * sign
+
+
+def _world(X: np.ndarray, V: np.ndarray, part: slice) -> Arrays:
+    turned = V.copy()
+    turned[part] = rotate(conjugate(X[:4] / np.linalg.norm(X[:4], axis=0)), V[part])
+    return X, turned
+
+
+_LINEAR: list[tuple[str, Callable[[np.ndarray, np.ndarray], Arrays]]] = [
+    (
+        "u,v,w look like velocities along the world's axes; rotate them into the body",
+        lambda X, V: _world(X, V, slice(0, 3)),
+    ),
+    ("u,v,w look like mm/s; give m/s", lambda X, V: (X, V * 1e-3)),
+    ("u,v,w look like cm/s; give m/s", lambda X, V: (X, V * 1e-2)),
+    ("u,v,w look like km/h; give m/s", lambda X, V: (X, V / 3.6)),
+    ("u,v,w look like knots; give m/s", lambda X, V: (X, V * 0.514444)),
+    ("x,y,z look like mm; give m", lambda X, V: (X, V * 1e3)),
+    ("x,y,z look like cm; give m", lambda X, V: (X, V * 1e2)),
+    (
+        "u,v,w look like forward-right-down while x,y,z and the quaternion do not; "
+        "give all in one convention",
+        lambda X, V: (X, _flip(V, (1, 2))),
+    ),
+    (
+        "z seems to have the wrong sign against w; give all in one convention",
+        lambda X, V: (_flip(X, (6,)), V),
+    ),
+    (
+        "x,y,z look like north-east-down while the quaternion does not; give all in one convention",
+        lambda X, V: (np.concatenate([X[:4], X[[5]], X[[4]], -X[[6]]]), V),
+    ),
+]
+_ANGULAR: list[tuple[str, Callable[[np.ndarray, np.ndarray], Arrays]]] = [
+    ("p,q,r look like deg/s; give rad/s", lambda X, V: (X, np.deg2rad(V))),
+    (
+        "the quaternion's columns look like x,y,z,w; give w first",
+        lambda X, V: (np.concatenate([X[[3, 0, 1, 2]], X[4:]]), V),
+    ),
+    (
+        "p,q,r look like rates about the world's axes; rotate them into the body",
+        lambda X, V: _world(X, V, slice(3, 6)),
+    ),
+    (
+        "the quaternion looks like world-to-body; give body-to-world (its conjugate)",
+        lambda X, V: (np.concatenate([conjugate(X[:4]), X[4:]]), V),
+    ),
+    (
+        "p,q,r look like forward-right-down while the quaternion does not; "
+        "give all in one convention",
+        lambda X, V: (X, _flip(V, (4, 5))),
+    ),
+]
+
+
+def contradictions(
+    t: Float[np.ndarray, " N"], X_WB: Float[np.ndarray, "7 N"], V_WB_B: Float[np.ndarray, "6 N"]
+) -> tuple[list[str], list[str]]:
+    """Return (errors, doubts): sentences on poses and twists that can't both be right.
+
+    An error names the reading that would make them agree, or says that none known does.
+    """
+    if t.size < 3:
+        return [], []
+    errors, doubts = [], []
+    for what, rows, readings in (
+        ("p,q,r", slice(3, 6), _ANGULAR),
+        ("u,v,w", slice(0, 3), _LINEAR),
+    ):
+        part = 1 if rows.start == 3 else 0
+        now = agreement(t, X_WB, V_WB_B)[part]
+        if np.isnan(now.explained) or now.explained > _DOUBTFUL:
+            continue
+        source = "rotation" if part else "displacement"
+        found = f"the integral of {what} explains {max(now.explained, 0):.0%} of the {source}"
+        scores = [agreement(t, *change(X_WB, V_WB_B))[part].explained for _, change in readings]
+        best = int(np.nanargmax([-np.inf if np.isnan(s) else s for s in scores]))
+        if scores[best] > _EXPLAINED:
+            errors.append(f"{found}: {readings[best][0]}")
+            break  # what follows from a wrong attitude need not be told again
+        if now.explained < _CONTRADICTED:
+            errors.append(f"{found}: check units, frames and the order of the quaternion")
+            break
+        doubts.append(f"{found[0].upper()}{found[1:]}; noise, or units and frames to be checked.")
+    return errors, doubts

@@ -1,0 +1,270 @@
+"""Frames and units between ArduPilot (NED world, FRD body, PWM, message units) and this project.
+
+The one place for such conversions, for live messages and logs alike (the bare axis swaps are in
+`models/frames.py`); each has its inverse and a round-trip test. NumPy, component first: fields may
+be scalars or arrays of any batch shape.
+
+ArduPilot: world N is north, east, down; body is forward, right, down; quaternions w x y z rotate
+body to world; yaw is clockwise from north. Here: W is east, north, up; B is forward, left, up.
+"""
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from ...models.frames import frd_to_flu, ned_to_enu, quaternion_to_flu_enu
+
+G = 9.80665  # standard gravity, as ArduPilot's GRAVITY_MSS (m/s²)
+SURFACE_PRESSURE_HPA = 1013.25
+ARDUSUB_PASCAL_PER_METRE = 9800.0  # times BARO_SPEC_GRAV, what ArduSub takes for fresh water
+
+NEUTRAL_US = 1500.0
+UINT16_MAX = 65535
+
+MODES = {
+    0: "STABILIZE",
+    1: "ACRO",
+    2: "ALT_HOLD",
+    3: "AUTO",
+    4: "GUIDED",
+    7: "CIRCLE",
+    9: "SURFACE",
+    16: "POSHOLD",
+    19: "MANUAL",
+    20: "MOTOR_DETECT",
+    21: "SURFTRAK",
+}
+ARMED_FLAG = 128
+
+MOTOR_FUNCTIONS = range(33, 41)  # SERVOn_FUNCTION of Motor1 … Motor8
+PASS_THROUGH_FUNCTIONS = (1, *range(51, 67))  # RCPassThru, RCIN1 … RCIN16
+
+
+def mode_name(custom_mode: int) -> str:
+    """Name of an ArduSub mode number."""
+    return MODES.get(custom_mode, f"MODE_{custom_mode}")
+
+
+# frames
+
+
+def quaternion_to_frd_ned(q_WB: Float[np.ndarray, "4 *batch"]) -> Float[np.ndarray, "4 *batch"]:
+    """Attitude FLU-to-ENU (w x y z) as FRD-to-NED."""
+    return quaternion_to_flu_enu(q_WB)
+
+
+def yaw_ned_to_enu(yaw: ArrayLike) -> np.ndarray:
+    """ψ_ENU = π/2 − ψ_NED, wrapped to (−π, π] (its own inverse)."""
+    turned = np.pi / 2 - np.asarray(yaw, float)
+    return np.pi - np.mod(np.pi - turned, 2 * np.pi)
+
+
+# messages and DataFlash fields to SI in W and B
+
+
+def attitude(
+    q1: ArrayLike, q2: ArrayLike, q3: ArrayLike, q4: ArrayLike
+) -> Float[np.ndarray, "4 *batch"]:
+    """q_WB from ATTITUDE_QUATERNION or XKQ, normalised."""
+    q = quaternion_to_flu_enu(_stack(q1, q2, q3, q4))
+    return q / np.linalg.norm(q, axis=0)
+
+
+def attitude_from_euler(
+    roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike, degrees: bool = False
+) -> Float[np.ndarray, "4 *batch"]:
+    """q_WB from NED roll, pitch, yaw: ATTITUDE (rad) or ATT (degrees)."""
+    half = _stack(roll, pitch, yaw) / 2
+    if degrees:
+        half = np.deg2rad(half)
+    cr, cp, cy = np.cos(half)
+    sr, sp, sy = np.sin(half)
+    return quaternion_to_flu_enu(
+        np.stack(
+            [
+                cr * cp * cy + sr * sp * sy,
+                sr * cp * cy - cr * sp * sy,
+                cr * sp * cy + sr * cp * sy,
+                cr * cp * sy - sr * sp * cy,
+            ]
+        )
+    )
+
+
+def euler_from_attitude(
+    q_WB: Float[np.ndarray, "4 *batch"], degrees: bool = False
+) -> Float[np.ndarray, "3 *batch"]:
+    """NED roll, pitch, yaw (rad) of q_WB: inverse of `attitude_from_euler`, yaw in (−π, π]."""
+    w, x, y, z = quaternion_to_frd_ned(q_WB)
+    rpy = np.stack(
+        [
+            np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+            np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
+            np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        ]
+    )
+    return np.rad2deg(rpy) if degrees else rpy
+
+
+def world_vector(
+    north: ArrayLike, east: ArrayLike, down: ArrayLike
+) -> Float[np.ndarray, "3 *batch"]:
+    """Position (m) or velocity (m/s) in W from NED fields: LOCAL_POSITION_NED, XKF1."""
+    return ned_to_enu(_stack(north, east, down))
+
+
+def body_vector(
+    forward: ArrayLike, right: ArrayLike, down: ArrayLike
+) -> Float[np.ndarray, "3 *batch"]:
+    """Vector in B from FRD fields in SI: rates of ATTITUDE (rad/s), IMU of DataFlash."""
+    return frd_to_flu(_stack(forward, right, down))
+
+
+def imu_angular_rate(
+    xgyro: ArrayLike, ygyro: ArrayLike, zgyro: ArrayLike
+) -> Float[np.ndarray, "3 *batch"]:
+    """ω in B (rad/s) from RAW_IMU or SCALED_IMU fields (mrad/s, FRD)."""
+    return body_vector(xgyro, ygyro, zgyro) * 1e-3
+
+
+def imu_specific_force(
+    xacc: ArrayLike, yacc: ArrayLike, zacc: ArrayLike
+) -> Float[np.ndarray, "3 *batch"]:
+    """Specific force in B (m/s²; +9.8 along z at rest, level) from RAW_IMU fields (mg, FRD)."""
+    return body_vector(xacc, yacc, zacc) * (G * 1e-3)
+
+
+def imu_fields(
+    omega_B: Float[np.ndarray, "3 *batch"], f_B: Float[np.ndarray, "3 *batch"]
+) -> tuple[Float[np.ndarray, "3 *batch"], Float[np.ndarray, "3 *batch"]]:
+    """Gyro (mrad/s) and accelerometer (mg) fields of RAW_IMU, not yet rounded to integers."""
+    return frd_to_flu(omega_B) * 1e3, frd_to_flu(f_B) * (1e3 / G)
+
+
+def filter_delay(cutoff_hz: float) -> float:
+    """Delay (s) of the autopilot's low-pass on gyro or accelerometer (INS_GYRO_FILTER, in Hz).
+
+    A Butterworth filter of second order has the group delay √2/ω_c at low frequency.
+    """
+    return float(np.sqrt(2.0) / (2 * np.pi * cutoff_hz))
+
+
+def pascal_per_metre(specific_gravity: float = 1.0, density: float | None = None) -> float:
+    """Pressure gradient: the autopilot's 9800 · BARO_SPEC_GRAV, or ρ g for a known density."""
+    return ARDUSUB_PASCAL_PER_METRE * specific_gravity if density is None else density * G
+
+
+def depth_from_pressure(
+    press_abs: ArrayLike,
+    surface: float = SURFACE_PRESSURE_HPA,
+    gradient: float = ARDUSUB_PASCAL_PER_METRE,
+) -> np.ndarray:
+    """Depth (m, positive down) from absolute pressure (hPa)."""
+    return (np.asarray(press_abs, float) - surface) * (100.0 / gradient)
+
+
+def pressure_from_depth(
+    depth: ArrayLike,
+    surface: float = SURFACE_PRESSURE_HPA,
+    gradient: float = ARDUSUB_PASCAL_PER_METRE,
+) -> np.ndarray:
+    """Absolute pressure (hPa) at a depth (m)."""
+    return surface + np.asarray(depth, float) * (gradient / 100.0)
+
+
+def height_from_relative_alt(relative_alt: ArrayLike) -> np.ndarray:
+    """Height z in W (m) from GLOBAL_POSITION_INT.relative_alt (mm)."""
+    return np.asarray(relative_alt, float) * 1e-3
+
+
+def climb_from_vz(vz: ArrayLike) -> np.ndarray:
+    """Vertical velocity, up (m/s), from GLOBAL_POSITION_INT.vz (cm/s, down)."""
+    return np.asarray(vz, float) * -1e-2
+
+
+def volts(millivolts: ArrayLike) -> np.ndarray:
+    """Battery voltage (V) from mV fields; 65535 (unknown) and 0 become NaN."""
+    mv = np.asarray(millivolts, float)
+    return np.where((mv == UINT16_MAX) | (mv <= 0), np.nan, mv * 1e-3)
+
+
+def pack_voltage(cells_mv: Float[np.ndarray, "n *batch"]) -> np.ndarray:
+    """Battery voltage (V) from BATTERY_STATUS.voltages: the sum of the entries in use."""
+    known = (cells_mv != UINT16_MAX) & (cells_mv > 0)
+    total = np.where(known, cells_mv, 0.0).sum(axis=0)
+    return np.where(known.any(axis=0), total * 1e-3, np.nan)
+
+
+def thruster_pwm(output_us: ArrayLike, direction: ArrayLike = 1) -> np.ndarray:
+    """PWM (µs) that makes the standard thruster push as this one does at `output_us`.
+
+    With MOT_n_DIRECTION −1 the thruster is mounted or wired the other way round and the output is
+    mirrored about 1500. No pulses (0) means stopped. Its own inverse except for zero.
+    """
+    us = np.asarray(output_us, float)
+    us = np.where(us == 0, NEUTRAL_US, us)
+    return NEUTRAL_US + (us - NEUTRAL_US) * np.asarray(direction, float)
+
+
+def stick(value: ArrayLike, trim: float = NEUTRAL_US, span: float = 400.0) -> np.ndarray:
+    """Pilot's channel in [−1, 1] from PWM (µs)."""
+    return (np.asarray(value, float) - trim) / span
+
+
+# commands to the autopilot
+
+
+def manual_control_fields(
+    surge: float = 0.0,
+    sway: float = 0.0,
+    heave: float = 0.0,
+    roll: float = 0.0,
+    pitch: float = 0.0,
+    yaw: float = 0.0,
+    gain: float = 0.5,
+) -> dict[str, int]:
+    """MANUAL_CONTROL fields for axis demands in [−1, 1] about B (FLU: + left, up, nose down, ccw).
+
+    x, y, r are ±1000 about 0 and z is 0 … 1000 about 500, all four times the pilot gain at the
+    other end; s (pitch, nose up) and t (roll, right side down) are plain µs, ±400. Demands beyond
+    what the gain lets through are clipped.
+
+    Raises:
+        ValueError: if a demand or the gain is not finite, or the gain is not positive.
+    """
+    demands = np.array([surge, sway, heave, roll, pitch, yaw], float)
+    if not np.isfinite(demands).all() or not (np.isfinite(gain) and gain > 0):
+        raise ValueError(f"manual control: demands and gain must be finite, got {demands}, {gain}")
+    surge, sway, heave, roll, pitch, yaw = np.clip(demands, -1, 1)
+
+    def full(value: float) -> int:
+        return round(float(np.clip(1000 * value / gain, -1000, 1000)))
+
+    return {
+        "x": full(surge),
+        "y": full(-sway),
+        "z": round(500 + 0.5 * full(heave)),
+        "r": full(-yaw),
+        "s": round(-400 * pitch),
+        "t": round(400 * roll),
+    }
+
+
+def manual_control_demand(
+    x: int, y: int, z: int, r: int, s: int = 0, t: int = 0, gain: float = 0.5
+) -> Float[np.ndarray, "6"]:
+    """Surge, sway, heave, roll, pitch, yaw in [−1, 1] about B that such fields demand."""
+    return np.array(
+        [
+            gain * x / 1000,
+            -gain * y / 1000,
+            gain * (z - 500) / 500,
+            t / 400,
+            -s / 400,
+            -gain * r / 1000,
+        ]
+    )
+
+
+def _stack(*fields: ArrayLike) -> np.ndarray:
+    return np.stack(np.broadcast_arrays(*(np.asarray(f, float) for f in fields)))

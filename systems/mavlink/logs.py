@@ -1,0 +1,138 @@
+"""A vehicle's log to a recording: telemetry (.tlog) and DataFlash (.BIN), plain or .xz/.gz."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from ...models.errors import UserError
+from ...models.recording import Recording
+from ...models.recording_csv import METADATA, read_csv
+from ...models.vehicle import load_vehicle
+from .fuse import fuse
+from .log_bytes import LogBytes, Progress, no_progress, read_log_bytes
+from .logs_bin import read_bin
+from .logs_tlog import read_tlog
+from .report import ImportReport, tell
+from .signals import Signals
+from .signals_bin import WANTED as BIN_WANTED
+from .signals_bin import signals_from_bin
+from .signals_tlog import WANTED as TLOG_WANTED
+from .signals_tlog import signals_from_tlog
+
+
+def import_log(
+    path: str | os.PathLike[str],
+    *,
+    rate: float = 20.0,
+    vehicle: str = "bluerov2_heavy",
+    minimum: float = 5.0,
+    gap: float = 0.5,
+    water_density: float | None = None,
+    disarmed: bool = False,
+    system: int | None = None,
+    progress: Progress = no_progress,
+) -> tuple[Recording, ImportReport]:
+    """Import a log: one scenario for each stretch of constant mode, armed, without gaps or resets.
+
+    Args:
+        path: the log; its kind is told by its content.
+        rate: of the recording (Hz).
+        vehicle: preset or file whose thruster directions the PWM shall have; named in the result.
+        minimum: shortest stretch kept (s).
+        gap: longest pause between samples of one signal within a stretch (s).
+        water_density: kg/m³, to correct depth and vertical velocity of an autopilot that assumed
+            fresh water; None takes its figures as they are.
+        disarmed: keep disarmed stretches too.
+        system: MAVLink system id, if several autopilots are in the log.
+        progress: called with the fraction done, 0 to 1.
+
+    Raises:
+        UserError: if there is no such log, it can't be read, or nothing usable is in it.
+    """
+    path = Path(path)
+    _check_options(rate, minimum, gap, water_density)
+    motors = [mount.motor for mount in load_vehicle(vehicle).propulsion.mounts]
+    raw = read_log_bytes(path, progress)
+    try:
+        signals = _signals(raw, motors, water_density, system, progress)
+        trajectories, lines, dropped = fuse(
+            signals, rate=rate, minimum=minimum, gap=gap, disarmed=disarmed
+        )
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    if not trajectories:
+        raise UserError(
+            f"{path}: no stretch of {minimum:g} s with attitude and thruster outputs is left "
+            f"({' '.join(dropped) or 'nothing overlaps'}); allow shorter ones or longer gaps"
+        )
+    progress(0.95)
+    report = tell(signals, path.name, trajectories, lines, [*raw.notes, *dropped], 1.0 / rate)
+    recording = Recording.from_trajectories(
+        trajectories, 1.0 / rate, vehicle=vehicle, source=path.name, notes=report.notes()
+    )
+    progress(1.0)
+    return recording, report
+
+
+def load_data(
+    path: str | os.PathLike[str],
+    *,
+    rate: float | None = None,
+    vehicle: str | None = None,
+    progress: Progress = no_progress,
+) -> Recording:
+    """Read any data there is: a recording (.nc), a CSV folder, or a vehicle's log.
+
+    Args:
+        path: file, or folder with a `recording.yaml`.
+        rate: Hz; None keeps that of the data (20 for logs).
+        vehicle: preset or file; None keeps what the data name (bluerov2_heavy for logs).
+        progress: called with the fraction done, 0 to 1.
+
+    Raises:
+        UserError: if the data can't be read, or a stored recording has another rate.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".csv" and path.is_file():
+        raise UserError(f"{path}: give its folder, with a {METADATA} in it (see docs/recording.md)")
+    if path.is_dir() or path.suffix.lower() in (".yaml", ".yml"):
+        recording = read_csv(path, rate=rate)
+    elif path.suffix.lower() in (".nc", ".nc4", ".h5"):
+        recording = Recording.load(path)
+        if rate is not None and abs(recording.dt * rate - 1) > 1e-6:
+            raise UserError(
+                f"{path}: recorded at {1 / recording.dt:g} Hz, not {rate:g}; import the source anew"
+            )
+    else:
+        logged, _ = import_log(
+            path, rate=rate or 20.0, vehicle=vehicle or "bluerov2_heavy", progress=progress
+        )
+        return logged
+    progress(1.0)
+    if vehicle is None or vehicle == recording.vehicle:
+        return recording
+    return Recording(recording.dataset.assign_attrs(vehicle=vehicle))
+
+
+def _signals(
+    raw: LogBytes,
+    motors: Sequence[float],
+    density: float | None,
+    system: int | None,
+    progress: Progress,
+) -> Signals:
+    if raw.kind == "bin":
+        return signals_from_bin(read_bin(raw.data, BIN_WANTED, progress), motors, density)
+    log = read_tlog(raw.data, TLOG_WANTED, system, progress)
+    return signals_from_tlog(log, motors, density)
+
+
+def _check_options(rate: float, minimum: float, gap: float, density: float | None) -> None:
+    for name, value, low, high in (
+        ("rate", rate, 1.0, 400.0),
+        ("minimum", minimum, 0.5, 3600.0),
+        ("gap", gap, 0.01, 60.0),
+        ("water_density", 1000.0 if density is None else density, 900.0, 1100.0),
+    ):
+        if not low <= value <= high:
+            raise UserError(f"{name}: must lie between {low:g} and {high:g}, got {value:g}")

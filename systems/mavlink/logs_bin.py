@@ -1,0 +1,148 @@
+"""ArduPilot DataFlash (.BIN) into arrays: one pass over the record heads, then NumPy decodes.
+
+A file of 44 MB takes about a second, where pymavlink's reader needs half a minute. Names, widths
+and field types of the records come from the file's own FMT records (ArduPilot, AP_Logger).
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from .log_bytes import Progress, no_progress
+
+_HEAD = b"\xa3\x95"
+_FMT_TYPE, _FMT_LENGTH = 128, 89
+_TYPES: dict[str, tuple[str, float | None]] = {
+    "a": ("(32,)<i2", None),
+    "b": ("i1", None),
+    "B": ("u1", None),
+    "c": ("<i2", 0.01),
+    "C": ("<u2", 0.01),
+    "d": ("<f8", None),
+    "e": ("<i4", 0.01),
+    "E": ("<u4", 0.01),
+    "f": ("<f4", None),
+    "g": ("<f2", None),
+    "h": ("<i2", None),
+    "H": ("<u2", None),
+    "i": ("<i4", None),
+    "I": ("<u4", None),
+    "L": ("<i4", 1e-7),
+    "M": ("u1", None),
+    "n": ("S4", None),
+    "N": ("S16", None),
+    "q": ("<i8", None),
+    "Q": ("<u8", None),
+    "Z": ("S64", None),
+}
+
+Table = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class BinLog:
+    """Tables of a DataFlash log by message name, each with `t` (s since boot) and its fields."""
+
+    tables: Mapping[str, Table]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Format:
+    name: str
+    length: int
+    codes: str
+    columns: tuple[str, ...]
+
+    def dtype(self) -> np.dtype:
+        columns = zip(self.columns, self.codes, strict=False)
+        fields = [("_head", "V3"), *((column, _TYPES[code][0]) for column, code in columns)]
+        return _padded(np.dtype(fields), self.length)
+
+
+def _padded(dtype: np.dtype, length: int) -> np.dtype:
+    """Widen a record type to the length its FMT record tells, if the columns cover less."""
+    if dtype.itemsize >= length:
+        return dtype
+    return np.dtype([*dtype.descr, ("_rest", f"V{length - dtype.itemsize}")])
+
+
+def read_bin(data: bytes, wanted: Collection[str], progress: Progress = no_progress) -> BinLog:
+    """Decode the wanted message types; damaged stretches are skipped and told in the notes."""
+    formats, offsets, skipped = _scan(data, wanted, progress)
+    tables: dict[str, Table] = {}
+    unreadable = []
+    for number, found in offsets.items():
+        layout = formats[number]
+        dtype = layout.dtype()
+        if dtype.itemsize != layout.length:
+            unreadable.append(layout.name)
+            continue
+        tables[layout.name] = _decode(data, np.asarray(found), layout, dtype)
+    notes = []
+    if skipped:
+        notes.append(f"{skipped} of {len(data)} bytes of the log are damaged and were skipped.")
+    if unreadable:
+        notes.append(f"Records of unknown layout were left out: {', '.join(sorted(unreadable))}.")
+    return BinLog(tables, tuple(notes))
+
+
+def _scan(
+    data: bytes, wanted: Collection[str], progress: Progress
+) -> tuple[dict[int, _Format], dict[int, list[int]], int]:
+    formats = {_FMT_TYPE: _Format("FMT", _FMT_LENGTH, "BBnNZ", ())}
+    lengths = [0] * 256
+    lengths[_FMT_TYPE] = _FMT_LENGTH
+    keep: list[list[int] | None] = [None] * 256
+    i, end, skipped = 0, len(data), 0
+    report = step = max(end // 50, 1)
+    while i + 3 <= end:
+        number = data[i + 2]
+        length = lengths[number]
+        if data[i] != 0xA3 or data[i + 1] != 0x95 or length == 0:
+            found = data.find(_HEAD, i + 1)
+            i, skipped = (found, skipped + found - i) if found >= 0 else (end, skipped + end - i)
+            continue
+        if i + length > end:  # the log's last record, cut off
+            break
+        if number == _FMT_TYPE:
+            layout = _format(data[i : i + _FMT_LENGTH])
+            if layout is not None:
+                known = data[i + 3]
+                formats[known], lengths[known] = layout, layout.length
+                if layout.name in wanted and keep[known] is None:
+                    keep[known] = []
+        else:
+            kept = keep[number]
+            if kept is not None:
+                kept.append(i)
+        i += length
+        if i > report:
+            report += step
+            progress(0.3 + 0.5 * i / end)
+    return formats, {n: k for n, k in enumerate(keep) if k}, skipped
+
+
+def _format(record: bytes) -> _Format | None:
+    name, codes, columns = (
+        part.split(b"\0")[0].decode("ascii", "replace")
+        for part in (record[5:9], record[9:25], record[25:89])
+    )
+    length = record[4]
+    if length < 3 or not name or any(code not in _TYPES for code in codes):
+        return None
+    return _Format(name, length, codes, tuple(columns.split(",")))
+
+
+def _decode(data: bytes, offsets: np.ndarray, layout: _Format, dtype: np.dtype) -> Table:
+    raw = np.frombuffer(data, np.uint8)
+    rows = raw[offsets[:, None] + np.arange(layout.length)].view(dtype)[:, 0]
+    table: dict[str, np.ndarray] = {}
+    for column, code in zip(layout.columns, layout.codes, strict=False):
+        values = rows[column]
+        scale = _TYPES[code][1]
+        table[column] = values * scale if scale is not None else values
+    if "TimeUS" in table:
+        table["t"] = table["TimeUS"] * 1e-6
+    return table

@@ -1,0 +1,169 @@
+"""MAVLink packets in a telemetry log: framing, checksums, fields; nothing of their meaning.
+
+The layout of a packet is that of the MAVLink serialisation guide (versions 1 and 2); checksum
+seeds, message ids and field layouts are those of pymavlink's ArduPilot dialect.
+"""
+
+import re
+import struct
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+from pymavlink.generator.mavcrc import x25crc
+
+from .log_bytes import Progress, no_progress
+
+STAMP = struct.Struct(">Q")
+_V2, _V1 = 0xFD, 0xFE
+_MAGIC = re.compile(rb"[\xfd\xfe]")
+_SIGNATURE = 13
+_CODES = {
+    "b": "i1",
+    "B": "u1",
+    "h": "<i2",
+    "H": "<u2",
+    "i": "<i4",
+    "I": "<u4",
+    "q": "<i8",
+    "Q": "<u8",
+    "f": "<f4",
+    "d": "<f8",
+    "s": "S1",
+}
+_IDS = {cls.msgname: number for number, cls in dialect.mavlink_map.items()}
+
+# payload start, payload length, message id, system, component, end
+Packet = tuple[int, int, int, int, int, int]
+
+
+@dataclass(frozen=True)
+class Packets:
+    """Where the packets of a log lie: one entry each, in file order; `record` is the time stamp."""
+
+    record: np.ndarray
+    payload: np.ndarray
+    length: np.ndarray
+    message: np.ndarray
+    system: np.ndarray
+    component: np.ndarray
+    end: np.ndarray
+    skipped: int
+
+    def stamps(self, data: bytes) -> np.ndarray:
+        """The logger's clock at each packet (s)."""
+        raw = np.frombuffer(data, np.uint8)
+        words = raw[self.record[:, None] + np.arange(8)].view(">u8")[:, 0]
+        return words.astype(np.float64) * 1e-6
+
+
+def message_id(name: str) -> int:
+    """Number of a message; -1 if the dialect has none of that name."""
+    return _IDS.get(name, -1)
+
+
+def message_name(number: int) -> str:
+    """Name of a message, or `MSG_<number>`."""
+    known = dialect.mavlink_map.get(number)
+    return f"MSG_{number}" if known is None else str(known.msgname)
+
+
+def scan(data: bytes, progress: Progress = no_progress) -> Packets:
+    """Find the packets; after a damaged stretch the search goes on at the next sound packet."""
+    rows: list[tuple[int, int, int, int, int, int, int]] = []
+    append = rows.append
+    i, size, skipped = 0, len(data), 0
+    report = step = max(size // 50, 1)
+    while i + 16 <= size:
+        packet = _packet(data, i + 8, size)
+        if packet is None or not (_followed(data, packet[5], size) or _sound(data, i + 8, packet)):
+            found = _resync(data, i + 1, size)
+            if found == size and packet is None and i + 400 > size:
+                break  # the last record, cut off
+            skipped += found - i
+            i = found
+            continue
+        append((i, *packet))
+        i = packet[5]
+        if i > report:
+            report += step
+            progress(0.3 + 0.4 * i / size)
+    columns = np.array(rows, np.int64).reshape(-1, 7).T
+    return Packets(*columns, skipped=skipped)
+
+
+def _packet(data: bytes, at: int, size: int) -> Packet | None:
+    magic, length = data[at], data[at + 1]
+    if magic == _V2 and at + 12 + length <= size:
+        message = data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16
+        end = at + 12 + length + (_SIGNATURE if data[at + 2] & 1 else 0)
+        return (at + 10, length, message, data[at + 5], data[at + 6], end) if end <= size else None
+    if magic == _V1 and at + 8 + length <= size:
+        return (at + 6, length, data[at + 5], data[at + 3], data[at + 4], at + 8 + length)
+    return None
+
+
+def _followed(data: bytes, end: int, size: int) -> bool:
+    return end + 8 >= size or data[end + 8] in (_V2, _V1)
+
+
+def _sound(data: bytes, at: int, packet: Packet) -> bool:
+    """Check the CRC with the seed of the message."""
+    known = dialect.mavlink_map.get(packet[2])
+    if known is None:
+        return False
+    after = packet[0] + packet[1]
+    crc = x25crc(data[at + 1 : after])
+    crc.accumulate(bytes([known.crc_extra]))
+    return crc.crc == data[after] | data[after + 1] << 8
+
+
+def _resync(data: bytes, start: int, size: int) -> int:
+    """Return the next record from `start` whose packet has a right checksum, or the end."""
+    for match in _MAGIC.finditer(data, start + 8):
+        at = match.start()
+        if at + 8 > size:
+            break
+        packet = _packet(data, at, size)
+        if packet is not None and _sound(data, at, packet):
+            return at - 8
+    return size
+
+
+@cache
+def layout(name: str) -> np.dtype:
+    """NumPy layout of a message's full payload (MAVLink 2, with extensions)."""
+    cls = dialect.mavlink_map[_IDS[name]]
+    codes = re.findall(r"(\d*)([a-zA-Z])", cls.unpacker.format)
+    fields = []
+    for field, (count, code) in zip(cls.ordered_fieldnames, codes, strict=True):
+        if code == "s":
+            fields.append((field, f"S{count or 1}"))
+        elif count:
+            fields.append((field, _CODES[code], (int(count),)))
+        else:
+            fields.append((field, _CODES[code]))
+    return np.dtype(fields)
+
+
+def rows_of(
+    data: bytes, packets: Packets, candidates: np.ndarray, name: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Decode packets of one message: their fields, and the indices of those with a right checksum.
+
+    MAVLink 2 cuts trailing zeros off a payload; they are put back.
+    """
+    dtype = layout(name)
+    size = dtype.itemsize
+    seed = bytes([dialect.mavlink_map[_IDS[name]].crc_extra])
+    parts, good = [], []
+    for i in candidates.tolist():
+        start, length = int(packets.payload[i]), int(packets.length[i])
+        after = start + length
+        crc = x25crc(data[int(packets.record[i]) + 9 : after])
+        crc.accumulate(seed)
+        if crc.crc == data[after] | data[after + 1] << 8:
+            parts.append(data[start:after][:size].ljust(size, b"\0"))
+            good.append(i)
+    return np.frombuffer(b"".join(parts), dtype), np.asarray(good, np.int64)

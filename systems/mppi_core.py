@@ -1,0 +1,273 @@
+"""Model predictive path integral control of a vehicle among pylons, as a pure function."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..models import se3
+from ..models.dynamics import Dynamics
+from ..models.integrate import cast, step
+from .mppi_config import MppiConfig
+from .obstacles import Cylinders, SphereHull
+from .path_integral import (
+    chance_violation,
+    combine_risk,
+    effective_count,
+    path_integral_weights,
+    spline_basis,
+)
+from .wrench_limits import WrenchLimits
+
+
+class MppiState(eqx.Module):
+    """What one call hands to the next: the wrenches planned from the time of the last call on."""
+
+    F_Bo_B: Float[Array, "horizon 6"]
+
+
+class MppiOutput(NamedTuple):
+    """The plan and what it was chosen from; times k dt with k = 0 … H count from the call."""
+
+    X_WB: Float[Array, "7 n"]
+    V_WB_B: Float[Array, "6 n"]
+    F_Bo_B: Float[Array, "6 horizon"]
+    valid: Bool[Array, ""]
+    cost: Float[Array, ""]
+    collision_probability: Float[Array, ""]
+    clearance: Float[Array, ""]
+    effective_samples: Float[Array, ""]
+    temperature: Float[Array, ""]
+    weights: Float[Array, " sequences"]
+    paths: Float[Array, "horizon 3 shown"]
+    path_weights: Float[Array, " shown"]
+
+
+class _Rollouts(NamedTuple):
+    cost: Float[Array, "r n"]
+    clearance: Float[Array, "r n"]
+    kept: tuple[Array, ...]
+
+
+class MppiPlanner(eqx.Module):
+    """Sampled solution of the stochastic optimal control problem of Palmer et al., "Field
+    Experiments",
+
+        min_u E ∫ ‖log(g⁻¹ g_goal)‖²_L + ‖ξ_goal − ξ‖²_Q dt   subject to   u ∈ U,
+        d(g, ξ) = model,  P(g ∈ G over the horizon) ≥ 1 − α,
+
+    by path integrals (Williams et al. 2016). Around the last plan, shifted by the time that went
+    by, wrench sequences are sampled with smooth noise and cut to U. Every sequence meets the same
+    `realisations` of the model's process noise (in pairs of opposite sign), so sequences are
+    compared under equal luck. Costs become weights, the weighted mean sequence is cut to U, and of
+    mean, best sample and last plan the one of least cost is taken: a mean of passing left and of
+    passing right of a pylon is never flown. The plan's states are the model's drift under it.
+
+    `F_bias_W` is a wrench about Bo with axes of W that acts besides the model's (an observed
+    current, say); the plan's wrenches then contain what counters it.
+    """
+
+    dynamics: Dynamics
+    limits: WrenchLimits
+    cylinders: Cylinders
+    hull: SphereHull
+    X_WG: Float[Array, "7"]
+    V_goal: Float[Array, "6"]
+    axes: Float[Array, "6"]
+    bases: tuple[Float[Array, "horizon _"], ...]
+    config: MppiConfig = eqx.field(static=True)
+
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        limits: WrenchLimits,
+        cylinders: Cylinders,
+        hull: SphereHull,
+        X_WG: Float[Array, "7"],
+        V_goal: Float[Array, "6"] | None = None,
+        config: MppiConfig | None = None,
+        dtype: jnp.dtype | type = jnp.float32,
+    ):
+        """`X_WG` is the goal's pose, `V_goal` its twist in B; all arrays are cast to `dtype`."""
+        self.config = MppiConfig() if config is None else config
+        self.dynamics = cast(dynamics, dtype)
+        self.limits = cast(limits, dtype)
+        self.cylinders = cast(cylinders, dtype)
+        self.hull = cast(hull, dtype)
+        self.X_WG = jnp.asarray(X_WG, dtype)
+        self.V_goal = jnp.zeros(6, dtype) if V_goal is None else jnp.asarray(V_goal, dtype)
+        self.axes = cast(limits.axes(), dtype)
+        self.bases = tuple(
+            jnp.asarray(spline_basis(self.config.horizon, k), dtype) for k in self.config.knots
+        )
+
+    def hold_wrench(self, F_bias_W: Float[Array, "6"]) -> Float[Array, "6"]:
+        """The wrench that keeps the vehicle at rest at the goal."""
+        return -self.dynamics.potential_wrench(self.X_WG) - _in_body(self.X_WG, F_bias_W)
+
+    def init(self) -> MppiState:
+        """State before the first call: hold."""
+        hold = self.hold_wrench(jnp.zeros_like(self.V_goal))
+        return MppiState(jnp.broadcast_to(hold[None], (self.config.horizon, 6)))
+
+    def step(
+        self,
+        state: MppiState,
+        key: Array,
+        X_WB: Float[Array, "7"],
+        V_WB_B: Float[Array, "6"],
+        F_bias_W: Float[Array, "6"] | None = None,
+    ) -> tuple[MppiState, MppiOutput]:
+        """Plan from a state; the same arguments give the same plan, bit for bit."""
+        c, dtype = self.config, self.V_goal.dtype
+        X, V = X_WB.astype(dtype), V_WB_B.astype(dtype)
+        bias = jnp.zeros(6, dtype) if F_bias_W is None else F_bias_W.astype(dtype)
+        control_key, noise_key = jax.random.split(key)
+        last = state.F_Bo_B.astype(dtype)
+        nominal = jnp.concatenate([last[c.shift :], jnp.repeat(last[-1:], c.shift, 0)])[: c.horizon]
+        dW = self._process_noise(noise_key)
+
+        F = self.sample(control_key, nominal, bias)
+        stride = max(1, c.sequences // c.shown_paths)
+        shown = slice(0, stride * min(c.shown_paths, c.sequences), stride)
+        rolled = self._rollouts(X, V, F, bias, dW, lambda X, V: (X[4:, shown],))
+        cost, _ = self.sequence_cost(F, rolled, bias)
+        weights, temperature = path_integral_weights(cost, c.effective_samples)
+
+        mean = self._cut(jnp.sum(F * weights[None, None], axis=2))
+        best = F[:, :, jnp.argmin(jnp.where(jnp.isfinite(cost), cost, jnp.inf))]
+        candidates = jnp.stack([mean, best, nominal], axis=2)
+        quiet = None if dW is None else jnp.concatenate([dW, jnp.zeros_like(dW[:, :, :1])], axis=2)
+        tried = self._rollouts(X, V, candidates, bias, quiet, lambda X, V: (X[:, -3:], V[:, -3:]))
+        if dW is not None:
+            tried = _Rollouts(tried.cost[:-1], tried.clearance[:-1], tried.kept)
+        candidate_cost, probability = self.sequence_cost(candidates, tried, bias)
+        candidate_cost = jnp.where(jnp.isfinite(candidate_cost), candidate_cost, jnp.inf)
+        chosen = jnp.argmin(candidate_cost)
+        plan = candidates[:, :, chosen]
+        Xs = jnp.concatenate([X[:, None], tried.kept[0][:, :, chosen].T], axis=1)
+        Vs = jnp.concatenate([V[:, None], tried.kept[1][:, :, chosen].T], axis=1)
+        valid = jnp.isfinite(candidate_cost[chosen]) & jnp.all(jnp.isfinite(plan))
+        hold = jnp.broadcast_to(self.hold_wrench(jnp.zeros_like(bias))[None], plan.shape)
+        output = MppiOutput(
+            X_WB=Xs,
+            V_WB_B=Vs,
+            F_Bo_B=plan.T,
+            valid=valid,
+            cost=candidate_cost[chosen],
+            collision_probability=probability[chosen],
+            clearance=jnp.mean(tried.clearance, axis=0)[chosen],
+            effective_samples=effective_count(weights),
+            temperature=temperature,
+            weights=weights,
+            paths=rolled.kept[0],
+            path_weights=weights[shown],
+        )
+        return MppiState(jnp.where(valid, plan, hold)), output
+
+    def sample(
+        self, key: Array, nominal: Float[Array, "horizon 6"], F_bias_W: Float[Array, "6"]
+    ) -> Float[Array, "horizon 6 sequences"]:
+        """Feasible wrench sequences about `nominal`: itself first, then holding, then with noise."""
+        c = self.config
+        n = c.sequences
+        noise = jnp.asarray(c.noise, nominal.dtype) * self.axes
+        counts = [n // len(self.bases) + (i < n % len(self.bases)) for i in range(len(self.bases))]
+        parts = []
+        for basis, count, k in zip(
+            self.bases, counts, jax.random.split(key, len(counts)), strict=True
+        ):
+            w = jax.random.normal(k, (basis.shape[1], 6 * count), basis.dtype)
+            part = c.smallest_noise ** jnp.linspace(0, 1, count, dtype=basis.dtype)
+            parts.append((basis @ w).reshape(c.horizon, 6, count) * part[None, None])
+        F = nominal[:, :, None] + jnp.concatenate(parts, axis=2) * noise[None, :, None]
+        F = F.at[:, :, 0].set(nominal)
+        if n > 1:
+            F = F.at[:, :, 1].set(self.hold_wrench(F_bias_W)[None])
+        return self._cut(F)
+
+    def sequence_cost(
+        self,
+        F_Bo_B: Float[Array, "horizon 6 n"],
+        rolled: _Rollouts,
+        F_bias_W: Float[Array, "6"],
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """Cost of control sequences over all their realisations, and their collision probability."""
+        c, dt = self.config, self.config.dt
+        total = combine_risk(rolled.cost, c.risk, c.cvar_part)
+        used = (F_Bo_B - self.hold_wrench(F_bias_W)[None, :, None]) / self.axes[None, :, None]
+        total = total + c.effort_weight * dt * jnp.sum(used * used, axis=(0, 1))
+        change = jnp.diff(used, axis=0) / dt
+        total = total + c.rate_weight * dt * jnp.sum(change * change, axis=(0, 1))
+        if self.cylinders.radius.shape[0] == 0:
+            return total, jnp.zeros_like(total)
+        alpha = 0.5 if c.collision_risk is None else c.collision_risk
+        probability, excess, missing = chance_violation(rolled.clearance, alpha, c.clearance_std)
+        if c.collision_risk is not None:
+            total = total + c.risk_weight * (excess + missing)
+        return total, probability
+
+    def _process_noise(self, key: Array) -> Float[Array, "horizon 6 r"] | None:
+        """Brownian increments (√s) for the realisations; None for a single one.
+
+        Pairs have opposite signs, so the mean is that without noise, and each axis is scaled to the
+        mean square that its Brownian path has over the horizon: a handful of realisations then
+        spreads as much as many would.
+        """
+        c = self.config
+        if c.realisations == 1:
+            return None
+        half = (c.realisations + 1) // 2
+        dW = jax.random.normal(key, (c.horizon, 6, half), self.V_goal.dtype) * c.dt**0.5
+        sampled = jnp.mean(jnp.cumsum(dW, axis=0) ** 2, axis=(0, 2))
+        dW = dW * jnp.sqrt(c.dt * (c.horizon + 1) / 2 / sampled)[None, :, None]
+        return jnp.concatenate([dW, -dW], axis=2)[:, :, : c.realisations]
+
+    def _cut(self, F: Array) -> Array:
+        """Wrenches (horizon, 6, …) cut to the feasible set."""
+        return jnp.moveaxis(self.limits.clip(jnp.moveaxis(F, 1, 0)), 0, 1)
+
+    def _state_cost(self, X: Array, V: Array) -> Array:
+        """Cost rate of the paper's problem and of the speed limit."""
+        c = self.config
+        L = jnp.asarray(c.pose_weight, V.dtype)[:, None]
+        Q = jnp.asarray(c.twist_weight, V.dtype)[:, None]
+        to_goal, twist = se3.local(X, self.X_WG), self.V_goal[:, None] - V
+        cost = jnp.sum(L * to_goal * to_goal + Q * twist * twist, axis=0)
+        if c.speed_limit is not None:
+            speed = jnp.sqrt(jnp.sum(V[:3] * V[:3], axis=0))
+            cost = cost + c.speed_weight * jnp.maximum(speed - c.speed_limit, 0) ** 2
+        return cost
+
+    def _rollouts(self, X0: Array, V0: Array, F: Array, bias: Array, dW: Array | None, keep):
+        """All sequences (horizon, 6, n) under all noise paths (horizon, 6, r), r-major in the batch."""
+        c = self.config
+        n = F.shape[2]
+        r = 1 if dW is None else dW.shape[2]
+        X = jnp.broadcast_to(X0[:, None], (7, r * n))
+        V = jnp.broadcast_to(V0[:, None], (6, r * n))
+        last = jnp.zeros(c.horizon, V.dtype).at[-1].set(c.terminal_time)
+
+        def advance(carry, inputs):
+            X, V, cost, least = carry
+            F, dW, terminal = inputs
+            wrench = jnp.tile(F, (1, r)) + _in_body(X, bias)
+            X, V = step(
+                self.dynamics, X, V, wrench, c.dt, None if dW is None else jnp.repeat(dW, n, 1)
+            )
+            distance = self.hull.clearance(X, self.cylinders)
+            near = jnp.maximum(1 - distance / c.margin, 0)
+            cost = cost + (c.dt + terminal) * self._state_cost(X, V)
+            cost = cost + c.dt * c.margin_weight * near * near
+            return (X, V, cost, jnp.minimum(least, distance)), keep(X, V)
+
+        start = (X, V, jnp.zeros_like(V[0]), jnp.full_like(V[0], jnp.inf))
+        (_, _, cost, least), kept = jax.lax.scan(advance, start, (F, dW, last))
+        return _Rollouts(cost.reshape(r, n), least.reshape(r, n), kept)
+
+
+def _in_body(X_WB: Array, F_W: Array) -> Array:
+    """A wrench about Bo whose axes are W's, with the axes of B."""
+    return jnp.concatenate([se3.rotate_inverse(X_WB, F_W[:3]), se3.rotate_inverse(X_WB, F_W[3:])])

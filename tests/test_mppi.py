@@ -1,0 +1,277 @@
+"""The planner's truths; `test_path_integral` has those of its weights and risks."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pydrake.common import RandomDistribution, RandomGenerator
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, RandomSource
+
+from spinndrift.models import se3
+from spinndrift.models.errors import UserError
+from spinndrift.models.integrate import rollout
+from spinndrift.models.rigid_body import FossenDynamics
+from spinndrift.systems.mppi import FIGURES, Mppi, key_from_gaussians
+from spinndrift.systems.mppi_config import MppiConfig
+from spinndrift.systems.mppi_core import MppiPlanner, MppiState
+from spinndrift.systems.obstacles import Cylinders, Pylon, SphereHull
+from spinndrift.systems.wrench_limits import BoxLimits
+
+HULL = SphereHull.cover((0.4, 0.4, 0.3), (1, 1))
+MASS = np.diag([20.0, 20.0, 20.0, 1.0, 1.0, 1.0])
+LIMIT = BoxLimits(jnp.array([40.0, 40.0, 40.0, 5.0, 5.0, 5.0]))
+PYLON = [Pylon(1.0, 0.05)]
+step = jax.jit(lambda planner, state, key, X, V, bias: planner.step(state, key, X, V, bias))
+clearance = jax.jit(lambda X_WB: HULL.clearance(X_WB, Cylinders.create(PYLON)))
+NONE = jnp.zeros(6)
+
+
+def neutral(drag=0.0, diffusion=0.0):
+    return FossenDynamics(
+        rigid_inertia=MASS,
+        added_mass=np.zeros((6, 6)),
+        linear_drag=drag * MASS,
+        quadratic_drag=np.zeros((6, 6)),
+        weight=200.0,
+        buoyancy=200.0,
+        p_BoBcm_B=np.zeros(3),
+        p_BoCb_B=np.zeros(3),
+        diffusion=diffusion * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]),
+    )
+
+
+def at(x, y=0.0, z=0.0):
+    return se3.identity().at[4:].set(jnp.array([x, y, z]))
+
+
+def settle(planner, X, V, count, seed=0, bias=NONE):
+    """Plan again and again from the same state: rows put in front undo the shift in time."""
+    rows = planner.config.shift
+    state, output = planner.init(), None
+    for i in range(count):
+        longer = jnp.concatenate([jnp.zeros((rows, 6), state.F_Bo_B.dtype), state.F_Bo_B])
+        key = jax.random.key(seed + i)
+        state, output = step(planner, MppiState(longer), key, X, V, bias)
+    return state, output
+
+
+# ------------------------------------------------------------------------------------- optimality
+
+FREE = MppiConfig(
+    horizon=40,
+    dt=0.1,
+    sequences=400,
+    realisations=1,
+    pose_weight=(1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
+    twist_weight=(0.5, 0.5, 0.5, 0.5, 0.5, 0.5),
+    terminal_time=1.0,
+    effort_weight=4.0,
+    rate_weight=0.0,
+    speed_limit=None,
+    noise=(0.3, 0.0, 0.0, 0.0, 0.0, 0.0),
+    smallest_noise=0.02,
+)
+
+
+def double_integrator_optimum(config, distance, mass, limit):
+    """Least cost of x⁺ = x + h v, v⁺ = v + h F/m from rest at `distance`, by linear least squares."""
+    n, h = config.horizon, config.dt
+    v_of_F = np.tril(np.ones((n, n))) * h / mass
+    x_of_F = np.vstack([np.zeros(n), np.cumsum(v_of_F, axis=0)[:-1]]) * h
+    time = np.full(n, h)
+    time[-1] += config.terminal_time
+    rows = [
+        np.sqrt(time * config.pose_weight[0])[:, None] * x_of_F,
+        np.sqrt(time * config.twist_weight[0])[:, None] * v_of_F,
+        np.sqrt(h * config.effort_weight) / limit * np.eye(n),
+    ]
+    aim = np.concatenate([np.sqrt(time * config.pose_weight[0]) * distance, np.zeros(2 * n)])
+    A = np.vstack(rows)
+    F = np.linalg.lstsq(A, aim, rcond=None)[0]
+    return float(np.sum((A @ F - aim) ** 2)), F
+
+
+def test_without_obstacles_it_finds_the_optimum_of_a_double_integrator():
+    distance = 1.0
+    planner = MppiPlanner(neutral(), LIMIT, Cylinders.create([]), HULL, at(distance), config=FREE)
+    optimum, F = double_integrator_optimum(FREE, distance, 20.0, 40.0)
+    idle = distance**2 * (FREE.horizon * FREE.dt + FREE.terminal_time)
+    _, plan = settle(planner, at(0.0), NONE, 40)
+    assert optimum < float(plan.cost) * (1 + 1e-5)
+    assert float(plan.cost) - optimum < 0.01 * (idle - optimum)
+    assert np.max(np.abs(np.asarray(plan.F_Bo_B[0]) - F)) < 0.15 * np.max(np.abs(F))
+
+
+# ------------------------------------------------------------------------------- among obstacles
+
+AMONG = MppiConfig(
+    horizon=40,
+    dt=0.1,
+    sequences=120,
+    realisations=8,
+    terminal_time=1.0,
+    collision_risk=0.05,
+    clearance_std=0.02,
+    margin=0.05,
+    margin_weight=5.0,
+    risk_weight=300.0,
+    shown_paths=7,
+)
+
+
+def among(diffusion=0.0, pylons=PYLON, config=AMONG, **more):
+    return MppiPlanner(
+        neutral(drag=0.5, diffusion=diffusion),
+        LIMIT,
+        Cylinders.create(pylons),
+        HULL,
+        more.pop("goal", at(2.0)),
+        config=config,
+    )
+
+
+def test_weights_sum_to_one_and_the_plan_is_the_models_own_path():
+    planner = among()
+    _, plan = settle(planner, at(0.0), NONE, 3)
+    assert float(jnp.sum(plan.weights)) == pytest.approx(1, abs=1e-5)
+    assert float(plan.effective_samples) == pytest.approx(12, rel=0.02)
+    assert plan.X_WB.shape == (7, 41)
+    assert plan.F_Bo_B.shape == (6, 40)
+    assert plan.paths.shape == (40, 3, 7)
+    assert plan.valid
+    X, V = rollout(
+        planner.dynamics, plan.X_WB[:, 0], plan.V_WB_B[:, 0], plan.F_Bo_B.T, 0.1, remat=False
+    )
+    np.testing.assert_allclose(plan.X_WB[:, 1:].T, X, atol=2e-5)
+    np.testing.assert_allclose(plan.V_WB_B[:, 1:].T, V, atol=2e-5)
+
+
+def test_wrenches_stay_in_the_feasible_set():
+    planner = among(goal=at(50.0))
+    _, plan = settle(planner, at(0.0), NONE, 6)
+    limit = np.asarray(LIMIT.limit)[:, None]
+    assert np.all(np.abs(plan.F_Bo_B) <= limit * (1 + 1e-6))
+    sampled = planner.sample(jax.random.key(0), planner.init().F_Bo_B + 30.0, NONE.astype("f4"))
+    assert np.all(np.abs(sampled) <= np.asarray(LIMIT.limit)[None, :, None] * (1 + 1e-6))
+
+
+def test_the_same_key_gives_the_same_plan_bit_for_bit_and_another_key_another():
+    planner = among()
+    plans = [settle(planner, at(0.0), NONE, 2, seed)[1] for seed in (5, 5, 6)]
+    for a, b in zip(plans[0], plans[1], strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(plans[0].F_Bo_B, plans[2].F_Bo_B)
+
+
+def test_process_noise_makes_the_plan_keep_its_distance():
+    """The chance constraint turns noise into room: the same problem with and without noise."""
+
+    def room(planner):
+        plans = [settle(planner, at(0.0), NONE, 12, seed)[1] for seed in (0, 100, 200, 300, 400)]
+        for plan in plans:
+            assert float(plan.X_WB[4, -1]) > 0.9  # beside the pylon, not waiting before it
+            assert float(plan.collision_probability) < 0.1
+        return np.array([jnp.min(clearance(plan.X_WB.astype(float))) for plan in plans])
+
+    still, noisy = room(among(0.0)), room(among(1.5))
+    assert np.all(still > 0)
+    assert np.mean(noisy) > np.mean(still) + 0.08
+    assert np.min(noisy) > np.max(still)
+
+
+def test_noise_paths_have_the_brownian_mean_and_spread():
+    dW = among()._process_noise(jax.random.key(4))
+    assert dW.shape == (40, 6, 8)
+    W = jnp.cumsum(dW, axis=0)
+    np.testing.assert_allclose(jnp.mean(W, axis=2), 0, atol=1e-6)
+    times = 0.1 * np.arange(1, 41)
+    np.testing.assert_allclose(jnp.mean(W**2, axis=(0, 2)), np.mean(times), rtol=1e-5)
+
+
+def test_a_start_inside_a_pylon_gives_finite_numbers_and_a_way_out():
+    planner = among(1.0, pylons=[Pylon(0.05, 0.0, diameter=1.0)])
+    _, plan = settle(planner, at(0.0), NONE, 8)
+    for part in plan:
+        assert np.all(np.isfinite(part))
+    assert float(plan.collision_probability) > 0.9
+    assert float(jnp.sum(plan.weights)) == pytest.approx(1, abs=1e-5)
+    distance = np.hypot(plan.X_WB[4] - 0.05, plan.X_WB[5])
+    assert distance[-1] > distance[0] + 0.3
+
+
+def test_a_state_of_nan_is_no_plan_and_is_forgotten():
+    planner = among()
+    state, plan = settle(planner, at(np.nan), NONE, 1)
+    assert not plan.valid
+    assert np.all(np.isfinite(state.F_Bo_B))
+    assert np.all(np.isfinite(plan.weights))
+    assert settle(planner, at(0.0), NONE, 1)[1].valid
+
+
+def test_an_observed_push_is_countered_at_the_goal():
+    push = jnp.array([5.0, -8.0, 3.0, 0.0, 0.0, 0.0])
+    planner = among(pylons=[Pylon(50.0, 0.0)])
+    _, plan = settle(planner, at(2.0), NONE, 10, bias=push)
+    np.testing.assert_allclose(np.mean(plan.F_Bo_B, axis=1)[:3], -push[:3], atol=1.0)
+    assert np.max(np.abs(np.asarray(plan.X_WB[4:]) - np.array([[2.0], [0.0], [0.0]]))) < 0.1
+
+
+def test_settings_are_checked():
+    with pytest.raises(UserError, match="period"):
+        MppiConfig(period=0.07)
+    with pytest.raises(UserError, match="effective_samples"):
+        MppiConfig(sequences=10, effective_samples=10.0)
+    with pytest.raises(UserError, match="collision_risk"):
+        MppiConfig(collision_risk=1.0)
+    with pytest.raises(UserError, match="noise"):
+        MppiConfig(noise=(0.1, -0.1, 0.1, 0.1, 0.1, 0.1))
+
+
+# ------------------------------------------------------------------------------------- in Drake
+
+
+def test_keys_differ_with_any_bit_of_the_noise():
+    w = jnp.array([0.3, -1.2, 0.0, 2.5])
+    keys = {tuple(np.asarray(key_from_gaussians(w)).tolist())}
+    for i in range(4):
+        keys.add(tuple(np.asarray(key_from_gaussians(w.at[i].add(1e-12))).tolist()))
+    assert len(keys) == 5
+
+
+def test_the_system_plans_from_its_ports_and_repeats_itself():
+    builder = DiagramBuilder()
+    system = builder.AddSystem(Mppi(among()))
+    for name, value in (("X_WB", at(0.0)), ("V_WB_B", NONE)):
+        source = builder.AddSystem(ConstantVectorSource(np.asarray(value)))
+        builder.Connect(source.get_output_port(), system.GetInputPort(name))
+    noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 4, 0.2))
+    builder.Connect(noise.get_output_port(), system.GetInputPort("noise"))
+    diagram = builder.Build()
+    plans = []
+    for _ in range(2):
+        simulator = Simulator(diagram)
+        context = simulator.get_mutable_context()
+        diagram.SetRandomContext(context, RandomGenerator(3))
+        own = system.GetMyContextFromRoot(context)
+        assert not np.any(system.GetOutputPort("plan").Eval(own))
+        simulator.AdvanceTo(0.25)
+        plans.append(system.GetOutputPort("plan").Eval(own).copy())
+        samples = system.samples.unpack(jnp.asarray(system.GetOutputPort("samples").Eval(own)))
+        figures = dict(
+            zip(FIGURES, system.GetOutputPort("figures").Eval(own).tolist(), strict=True)
+        )
+    np.testing.assert_array_equal(plans[0], plans[1])
+    plan = system.layout.unpack(jnp.asarray(plans[0]))
+    assert float(plan.t0) == pytest.approx(0.2)
+    np.testing.assert_allclose(plan.X_WB[:, 0], at(0.0), atol=1e-6)
+    assert samples.p_WB.shape == (40, 3, 7)
+    assert figures["valid"] == 1
+    assert figures["effective_samples"] == pytest.approx(12, rel=0.02)
+
+
+def test_config_is_replaceable():
+    assert replace(AMONG, horizon=80).layout.size == 1534

@@ -6,7 +6,9 @@ loadable if it is registered here (`register`), so that reading a file never run
 
 import dataclasses
 import json
+import struct
 import zipfile
+import zlib
 from collections.abc import Callable
 from os import PathLike
 from typing import Any, NamedTuple
@@ -25,6 +27,22 @@ from .spinn import Spinn, SpinnConfig
 
 FORMAT = "spinndrift model"
 VERSION = 1
+
+
+_DAMAGE = (
+    ValueError,  # not a zip, wrong JSON, wrong array header
+    TypeError,  # a lone array instead of an archive, wrong JSON structure
+    AttributeError,
+    LookupError,  # a missing array or header field
+    EOFError,
+    SyntaxError,  # array header
+    ArithmeticError,
+    RuntimeError,  # zip features nobody wrote here: encryption, other compressions
+    MemoryError,  # an absurd size in a damaged array header
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+)
 
 
 class Kind(NamedTuple):
@@ -114,7 +132,7 @@ def load_model(
         old, treedef = jax.tree.flatten(arrays)
         if [leaf.shape for leaf in old] != [leaf.shape for leaf in leaves]:
             raise ValueError("the arrays don't have the shapes of the described model")
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError) as error:
         raise UserError(f"{path}: not a model this version can make ({error}).") from error
     wide = any(leaf.dtype == np.float64 for leaf in leaves)
     if dtype is None and wide and jnp.asarray(0.0).dtype != jnp.float64:
@@ -153,7 +171,7 @@ def _read(path: str | PathLike[str]) -> tuple[dict[str, Any], list[np.ndarray]]:
         raise UserError(f"{path}: no such model file; check the path.") from None
     except OSError as error:
         raise UserError(f"{path}: can't be read ({error.strerror or error}).") from error
-    except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+    except _DAMAGE as error:
         raise UserError(
             f"{path}: not a whole spinndrift model file ({error}); save or copy it again."
         ) from error

@@ -28,7 +28,7 @@ def jacobi(
     sweeps = (6 if A.dtype == jnp.float64 else 5) if sweeps is None else sweeps
     eye = jnp.eye(_N, dtype=A.dtype).reshape((_N, _N) + (1,) * (A.ndim - 2))
 
-    def turn(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def turn(_: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         A, Q = state
         c, s = _rotations(A)
         A = _rotate_columns(_rotate_columns(A, c, s).swapaxes(0, 1), c, s)

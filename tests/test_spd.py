@@ -1,0 +1,165 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from spinndrift.models import spd, symmetric
+from spinndrift.models.spd import CholeskySpd, EigenSpd
+
+KINDS = [CholeskySpd, EigenSpd]
+SCALE = np.array([4.0, 5.0, 6.0, 0.4, 0.5, 0.6])
+
+
+def raw_numbers(seed, *batch, spread=1.0):
+    return np.random.default_rng(seed).normal(scale=spread, size=(21, *batch))
+
+
+def symmetric_matrices(seed, count):
+    A = np.random.default_rng(seed).normal(size=(6, 6, count))
+    return A + A.swapaxes(0, 1)
+
+
+def squareplus_of_matrix(A):
+    w, Q = np.linalg.eigh(np.moveaxis(A, (0, 1), (-2, -1)))
+    F = (Q * ((w + np.sqrt(w * w + 4)) / 2)[..., None, :]) @ np.swapaxes(Q, -1, -2)
+    return np.moveaxis(F, (-2, -1), (0, 1))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_operator_agrees_with_its_own_dense_matrix(kind):
+    A = kind.from_raw(jnp.asarray(raw_numbers(0, 3, 5)), jnp.asarray(SCALE))
+    x = np.random.default_rng(1).normal(size=(6, 3, 5))
+    dense = np.asarray(A.matrix())
+    np.testing.assert_allclose(A.matvec(jnp.asarray(x)), np.einsum("ij...,j...->i...", dense, x))
+    solved = np.moveaxis(np.asarray(A.solve(jnp.asarray(x))), 0, -1)
+    expected = np.linalg.solve(
+        np.moveaxis(dense, (0, 1), (-2, -1)), np.moveaxis(x, 0, -1)[..., None]
+    )
+    np.testing.assert_allclose(solved, expected[..., 0], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_matrices_are_symmetric_and_positive_for_large_outputs(kind):
+    A = np.moveaxis(
+        np.asarray(
+            kind.from_raw(jnp.asarray(raw_numbers(2, 200, spread=5.0)), jnp.ones(6)).matrix()
+        ),
+        -1,
+        0,
+    )
+    np.testing.assert_allclose(A, A.swapaxes(1, 2), atol=1e-12 * np.abs(A).max())
+    if kind is EigenSpd:
+        assert np.linalg.eigvalsh(A).min() > 0
+    else:
+        np.linalg.cholesky(A)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_zeros_give_the_squared_scale(kind, dtype):
+    A = kind.from_raw(jnp.zeros((21, 2), dtype), jnp.asarray(SCALE, dtype))
+    np.testing.assert_allclose(A.matrix()[..., 0], np.diag(SCALE**2), rtol=1e-6)
+    assert A.matrix().dtype == A.solve(jnp.ones((6, 2), dtype)).dtype == dtype
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_single_matrix_equals_its_batch_entry(kind):
+    raw, x = raw_numbers(3, 4), np.random.default_rng(4).normal(size=(6, 4))
+    scale = jnp.asarray(SCALE)
+    many = kind.from_raw(jnp.asarray(raw), scale).solve(jnp.asarray(x))
+    one = kind.from_raw(jnp.asarray(raw[:, 2]), scale).solve(jnp.asarray(x[:, 2]))
+    np.testing.assert_allclose(many[:, 2], one, rtol=1e-12)
+
+
+def test_float32_solve_undoes_matvec():
+    raw = jnp.asarray(raw_numbers(5, 1000, spread=0.5), jnp.float32)
+    x = jnp.asarray(np.random.default_rng(6).normal(size=(6, 1000)), jnp.float32)
+    for kind in KINDS:
+        A = kind.from_raw(raw, jnp.asarray(SCALE, jnp.float32))
+        np.testing.assert_allclose(A.solve(A.matvec(x)), x, atol=2e-4)
+
+
+def test_packing_and_unpacking_are_inverse():
+    A = symmetric_matrices(7, 3)
+    rows = spd.unpack_symmetric(spd.pack(jnp.asarray(A)))
+    np.testing.assert_array_equal(np.asarray(rows), A)
+
+
+def test_squareplus_is_positive_reciprocal_and_keeps_digits():
+    x = jnp.asarray([-1e4, -30.0, -1.0, 0.0, 2.0, 1e4], jnp.float32)
+    y = spd.squareplus(x)
+    assert np.all(y > 0)
+    assert y[3] == 1
+    np.testing.assert_allclose(y * spd.squareplus(-x), 1, rtol=1e-6)
+    exact = np.asarray(x, float)
+    np.testing.assert_allclose(y[3:], (exact + np.sqrt(exact**2 + 4))[3:] / 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float32, 1e-5), (jnp.float64, 1e-13)])
+def test_jacobi_reaches_rounding_also_for_meeting_eigenvalues(dtype, tolerance):
+    rng = np.random.default_rng(8)
+    w = rng.normal(size=(300, 6))
+    w[100:200, 1] = w[100:200, 0]
+    w[200:, 1:4] = w[200:, :1] * (1 + 1e-7 * rng.normal(size=(100, 3)))
+    w[0], w[1] = 0.0, 2.0
+    Q = np.linalg.qr(rng.normal(size=(300, 6, 6)))[0]
+    A = jnp.asarray(np.moveaxis((Q * w[:, None]) @ Q.swapaxes(1, 2), 0, -1), dtype)
+    values, vectors = (np.asarray(a, float) for a in symmetric.jacobi(A))
+    np.testing.assert_allclose(np.sort(values, axis=0), np.sort(w, axis=1).T, atol=tolerance)
+    back = np.einsum("ikb,kb,jkb->ijb", vectors, values, vectors)
+    np.testing.assert_allclose(back, A, atol=tolerance)
+    gram = np.einsum("kib,kjb->ijb", vectors, vectors)
+    np.testing.assert_allclose(
+        gram, np.broadcast_to(np.eye(6)[..., None], gram.shape), atol=tolerance
+    )
+
+
+def test_positive_is_the_function_of_the_eigenvalues():
+    A = symmetric_matrices(9, 20)
+    up, down = symmetric.positive(jnp.asarray(A))
+    np.testing.assert_allclose(up, squareplus_of_matrix(A), atol=1e-12)
+    np.testing.assert_allclose(down, squareplus_of_matrix(-A), atol=1e-12)
+
+
+@pytest.mark.parametrize("gap", [1.0, 1e-3, 1e-9, 0.0])
+def test_derivative_of_positive_is_right_where_eigenvalues_meet(gap):
+    rng = np.random.default_rng(10)
+    Q = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    A = (Q * (0.7 + gap * np.array([0.0, 1.0, -1.0, 0.5, 2.0, 0.3]))) @ Q.T
+    dA = symmetric_matrices(11, 1)[..., 0]
+    h = 1e-5
+    slope = (squareplus_of_matrix(A + h * dA) - squareplus_of_matrix(A - h * dA)) / (2 * h)
+    (_, _), (up, down) = jax.jvp(symmetric.positive, (jnp.asarray(A),), (jnp.asarray(dA),))
+    np.testing.assert_allclose(up, slope, atol=1e-8)
+    slope = (squareplus_of_matrix(-A - h * dA) - squareplus_of_matrix(-A + h * dA)) / (2 * h)
+    np.testing.assert_allclose(down, slope, atol=1e-8)
+    weight = rng.normal(size=(6, 6))
+    pull = jax.grad(lambda A: jnp.sum(weight * symmetric.positive(A)[0]))(jnp.asarray(A))
+    np.testing.assert_allclose(jnp.sum(pull * dA), jnp.sum(weight * up), rtol=1e-9)
+
+
+def test_eigh_differentiates_to_nan_at_a_multiple_of_the_identity_and_positive_does_not():
+    def through_eigh(A):
+        w, Q = jnp.linalg.eigh(A)
+        return jnp.sum((Q * spd.squareplus(w)[None]) @ Q.T * jnp.arange(36.0).reshape(6, 6))
+
+    def ours(A):
+        return jnp.sum(symmetric.positive(A)[0] * jnp.arange(36.0).reshape(6, 6))
+
+    assert np.all(np.isnan(jax.grad(through_eigh)(0.5 * jnp.eye(6))))
+    slope = (1 + 0.5 / np.sqrt(4.25)) / 2
+    np.testing.assert_allclose(
+        jax.grad(ours)(0.5 * jnp.eye(6)), slope * np.arange(36.0).reshape(6, 6), rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_of_solve_agree_with_differences(kind):
+    raw, y = jnp.asarray(raw_numbers(12)), jnp.asarray(np.random.default_rng(13).normal(size=6))
+
+    def value(raw, y):
+        return jnp.sum(jnp.sin(kind.from_raw(raw, jnp.asarray(SCALE)).solve(y)))
+
+    direction, h = jnp.asarray(raw_numbers(14)), 1e-6
+    slope = (value(raw + h * direction, y) - value(raw - h * direction, y)) / (2 * h)
+    np.testing.assert_allclose(jnp.sum(jax.grad(value)(raw, y) * direction), slope, rtol=1e-6)

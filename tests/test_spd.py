@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ from spinndrift.models import spd, symmetric
 from spinndrift.models.spd import CholeskySpd, EigenSpd
 
 KINDS = [CholeskySpd, EigenSpd]
+positive = jax.jit(symmetric.positive)
 SCALE = np.array([4.0, 5.0, 6.0, 0.4, 0.5, 0.6])
 
 
@@ -25,58 +28,58 @@ def squareplus_of_matrix(A):
     return np.moveaxis(F, (-2, -1), (0, 1))
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def evaluate(kind, raw, scale, x):
+    A = kind.from_raw(raw, scale)
+    return A.matvec(x), A.solve(x), A.matrix()
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def there_and_back(kind, raw, scale, x):
+    A = kind.from_raw(raw, scale)
+    return A.solve(A.matvec(x))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_operator_agrees_with_its_own_dense_matrix(kind):
-    A = kind.from_raw(jnp.asarray(raw_numbers(0, 3, 5)), jnp.asarray(SCALE))
     x = np.random.default_rng(1).normal(size=(6, 3, 5))
-    dense = np.asarray(A.matrix())
-    np.testing.assert_allclose(A.matvec(jnp.asarray(x)), np.einsum("ij...,j...->i...", dense, x))
-    solved = np.moveaxis(np.asarray(A.solve(jnp.asarray(x))), 0, -1)
-    expected = np.linalg.solve(
-        np.moveaxis(dense, (0, 1), (-2, -1)), np.moveaxis(x, 0, -1)[..., None]
-    )
-    np.testing.assert_allclose(solved, expected[..., 0], rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_matrices_are_symmetric_and_positive_for_large_outputs(kind):
-    A = np.moveaxis(
-        np.asarray(
-            kind.from_raw(jnp.asarray(raw_numbers(2, 200, spread=5.0)), jnp.ones(6)).matrix()
-        ),
-        -1,
-        0,
-    )
-    np.testing.assert_allclose(A, A.swapaxes(1, 2), atol=1e-12 * np.abs(A).max())
-    if kind is EigenSpd:
-        assert np.linalg.eigvalsh(A).min() > 0
-    else:
-        np.linalg.cholesky(A)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_zeros_give_the_squared_scale(kind, dtype):
-    A = kind.from_raw(jnp.zeros((21, 2), dtype), jnp.asarray(SCALE, dtype))
-    np.testing.assert_allclose(A.matrix()[..., 0], np.diag(SCALE**2), rtol=1e-6)
-    assert A.matrix().dtype == A.solve(jnp.ones((6, 2), dtype)).dtype == dtype
+    applied, solved, dense = evaluate(kind, raw_numbers(0, 3, 5), SCALE, x)
+    np.testing.assert_allclose(applied, np.einsum("ij...,j...->i...", dense, x))
+    matrices = np.moveaxis(np.asarray(dense), (0, 1), (-2, -1))
+    expected = np.linalg.solve(matrices, np.moveaxis(x, 0, -1)[..., None])[..., 0]
+    np.testing.assert_allclose(np.moveaxis(np.asarray(solved), 0, -1), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_single_matrix_equals_its_batch_entry(kind):
-    raw, x = raw_numbers(3, 4), np.random.default_rng(4).normal(size=(6, 4))
-    scale = jnp.asarray(SCALE)
-    many = kind.from_raw(jnp.asarray(raw), scale).solve(jnp.asarray(x))
-    one = kind.from_raw(jnp.asarray(raw[:, 2]), scale).solve(jnp.asarray(x[:, 2]))
-    np.testing.assert_allclose(many[:, 2], one, rtol=1e-12)
+    raw, x = raw_numbers(0, 3, 5), np.random.default_rng(1).normal(size=(6, 3, 5))
+    many = evaluate(kind, raw, SCALE, x)
+    one = evaluate(kind, raw[:, 2, 1], SCALE, x[:, 2, 1])
+    for batch, single in zip(many, one, strict=True):
+        np.testing.assert_allclose(batch[..., 2, 1], single, rtol=1e-11)
 
 
-def test_float32_solve_undoes_matvec():
-    raw = jnp.asarray(raw_numbers(5, 1000, spread=0.5), jnp.float32)
-    x = jnp.asarray(np.random.default_rng(6).normal(size=(6, 1000)), jnp.float32)
-    for kind in KINDS:
-        A = kind.from_raw(raw, jnp.asarray(SCALE, jnp.float32))
-        np.testing.assert_allclose(A.solve(A.matvec(x)), x, atol=2e-4)
+@pytest.mark.parametrize("kind", KINDS)
+def test_matrices_are_symmetric_and_positive_for_large_outputs(kind):
+    _, _, dense = evaluate(kind, raw_numbers(2, 200, spread=5.0), np.ones(6), np.ones((6, 200)))
+    A = np.moveaxis(np.asarray(dense), -1, 0)
+    np.testing.assert_allclose(A, A.swapaxes(1, 2), atol=1e-12 * np.abs(A).max())
+    np.linalg.cholesky(A)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_zeros_give_the_squared_scale_in_the_given_precision(kind, dtype):
+    results = evaluate(kind, np.zeros((21, 2), dtype), SCALE.astype(dtype), np.ones((6, 2), dtype))
+    np.testing.assert_allclose(results[2][..., 0], np.diag(SCALE**2), rtol=1e-6)
+    assert all(result.dtype == dtype for result in results)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_float32_solve_undoes_matvec(kind):
+    raw = raw_numbers(5, 1000, spread=0.5).astype(np.float32)
+    x = np.random.default_rng(6).normal(size=(6, 1000)).astype(np.float32)
+    np.testing.assert_allclose(there_and_back(kind, raw, np.float32(SCALE), x), x, atol=2e-4)
 
 
 def test_packing_and_unpacking_are_inverse():
@@ -104,7 +107,7 @@ def test_jacobi_reaches_rounding_also_for_meeting_eigenvalues(dtype, tolerance):
     w[0], w[1] = 0.0, 2.0
     Q = np.linalg.qr(rng.normal(size=(300, 6, 6)))[0]
     A = jnp.asarray(np.moveaxis((Q * w[:, None]) @ Q.swapaxes(1, 2), 0, -1), dtype)
-    values, vectors = (np.asarray(a, float) for a in symmetric.jacobi(A))
+    values, vectors = (np.asarray(a, float) for a in jax.jit(symmetric.jacobi)(A))
     np.testing.assert_allclose(np.sort(values, axis=0), np.sort(w, axis=1).T, atol=tolerance)
     back = np.einsum("ikb,kb,jkb->ijb", vectors, values, vectors)
     np.testing.assert_allclose(back, A, atol=tolerance)
@@ -116,7 +119,7 @@ def test_jacobi_reaches_rounding_also_for_meeting_eigenvalues(dtype, tolerance):
 
 def test_positive_is_the_function_of_the_eigenvalues():
     A = symmetric_matrices(9, 20)
-    up, down = symmetric.positive(jnp.asarray(A))
+    up, down = positive(jnp.asarray(A))
     np.testing.assert_allclose(up, squareplus_of_matrix(A), atol=1e-12)
     np.testing.assert_allclose(down, squareplus_of_matrix(-A), atol=1e-12)
 
@@ -129,12 +132,12 @@ def test_derivative_of_positive_is_right_where_eigenvalues_meet(gap):
     dA = symmetric_matrices(11, 1)[..., 0]
     h = 1e-5
     slope = (squareplus_of_matrix(A + h * dA) - squareplus_of_matrix(A - h * dA)) / (2 * h)
-    (_, _), (up, down) = jax.jvp(symmetric.positive, (jnp.asarray(A),), (jnp.asarray(dA),))
+    (_, _), (up, down) = jax.jvp(positive, (jnp.asarray(A),), (jnp.asarray(dA),))
     np.testing.assert_allclose(up, slope, atol=1e-8)
     slope = (squareplus_of_matrix(-A - h * dA) - squareplus_of_matrix(-A + h * dA)) / (2 * h)
     np.testing.assert_allclose(down, slope, atol=1e-8)
     weight = rng.normal(size=(6, 6))
-    pull = jax.grad(lambda A: jnp.sum(weight * symmetric.positive(A)[0]))(jnp.asarray(A))
+    pull = jax.grad(lambda A: jnp.sum(weight * positive(A)[0]))(jnp.asarray(A))
     np.testing.assert_allclose(jnp.sum(pull * dA), jnp.sum(weight * up), rtol=1e-9)
 
 
@@ -144,7 +147,7 @@ def test_eigh_differentiates_to_nan_at_a_multiple_of_the_identity_and_positive_d
         return jnp.sum((Q * spd.squareplus(w)[None]) @ Q.T * jnp.arange(36.0).reshape(6, 6))
 
     def ours(A):
-        return jnp.sum(symmetric.positive(A)[0] * jnp.arange(36.0).reshape(6, 6))
+        return jnp.sum(positive(A)[0] * jnp.arange(36.0).reshape(6, 6))
 
     assert np.all(np.isnan(jax.grad(through_eigh)(0.5 * jnp.eye(6))))
     slope = (1 + 0.5 / np.sqrt(4.25)) / 2
@@ -157,6 +160,7 @@ def test_eigh_differentiates_to_nan_at_a_multiple_of_the_identity_and_positive_d
 def test_gradients_of_solve_agree_with_differences(kind):
     raw, y = jnp.asarray(raw_numbers(12)), jnp.asarray(np.random.default_rng(13).normal(size=6))
 
+    @jax.jit
     def value(raw, y):
         return jnp.sum(jnp.sin(kind.from_raw(raw, jnp.asarray(SCALE)).solve(y)))
 

@@ -15,7 +15,8 @@ from .resample import conjugate, continuous, multiply, rotate, rotation_log
 
 _WINDOW_S = 0.5
 _MOVES_M, _TURNS_RAD = 0.02, 0.02  # rms in a window below which nothing can be told
-_EXPLAINED, _DOUBTFUL, _CONTRADICTED = 0.9, 0.8, 0.5
+_AGREED, _EXPLAINED, _DOUBTFUL, _CONTRADICTED = 0.98, 0.9, 0.8, 0.5
+_BETTER = 0.3  # a reading that leaves less than this part of the residual is the right one
 
 Arrays = tuple[np.ndarray, np.ndarray]
 
@@ -147,17 +148,20 @@ def contradictions(
     ):
         part = 1 if rows.start == 3 else 0
         now = agreement(t, X_WB, V_WB_B)[part]
-        if np.isnan(now.explained) or now.explained > _DOUBTFUL:
+        if np.isnan(now.explained) or now.explained > _AGREED:
             continue
         source = "rotation" if part else "displacement"
         found = f"the integral of {what} explains {max(now.explained, 0):.0%} of the {source}"
         scores = [agreement(t, *change(X_WB, V_WB_B))[part].explained for _, change in readings]
         best = int(np.nanargmax([-np.inf if np.isnan(s) else s for s in scores]))
-        if scores[best] > _EXPLAINED:
+        if scores[best] > _EXPLAINED and 1 - scores[best] < _BETTER * (1 - now.explained):
             errors.append(f"{found}: {readings[best][0]}")
             break  # what follows from a wrong attitude need not be told again
         if now.explained < _CONTRADICTED:
             errors.append(f"{found}: check units, frames and the order of the quaternion")
             break
-        doubts.append(f"{found[0].upper()}{found[1:]}; noise, or units and frames to be checked.")
+        if now.explained < _DOUBTFUL:
+            doubts.append(
+                f"{found[0].upper()}{found[1:]}; noise, or units and frames to be checked."
+            )
     return errors, doubts

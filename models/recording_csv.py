@@ -189,7 +189,7 @@ def _check_time(table: Table) -> None:
         raise UserError(f"{table.at(row)}: column `t` is no finite number; give seconds")
     if t.size < 2:
         raise UserError(f"{table.path}: a single sample is no trajectory; give at least two")
-    for row in np.flatnonzero(np.diff(t) <= 0)[:1] + 1:
+    for row in (np.flatnonzero(np.diff(t) <= 0)[:1] + 1).tolist():
         kind = "repeats" if t[row] == t[row - 1] else "goes back from"
         raise UserError(
             f"{table.at(row)}: time {t[row]:g} s {kind} {t[row - 1]:g} s; "

@@ -8,11 +8,16 @@ ArduPilot: world N is north, east, down; body is forward, right, down; quaternio
 body to world; yaw is clockwise from north. Here: W is east, north, up; B is forward, left, up.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ...models.frames import frd_to_flu, ned_to_enu, quaternion_to_flu_enu
+
+Field = ArrayLike | float | int | Sequence[float]
+Values = np.ndarray | np.float64
 
 G = 9.80665  # standard gravity, as ArduPilot's GRAVITY_MSS (m/s²)
 SURFACE_PRESSURE_HPA = 1013.25
@@ -53,7 +58,7 @@ def quaternion_to_frd_ned(q_WB: Float[np.ndarray, "4 *batch"]) -> Float[np.ndarr
     return quaternion_to_flu_enu(q_WB)
 
 
-def yaw_ned_to_enu(yaw: ArrayLike) -> np.ndarray:
+def yaw_ned_to_enu(yaw: Field) -> Values:
     """ψ_ENU = π/2 − ψ_NED, wrapped to (−π, π] (its own inverse)."""
     turned = np.pi / 2 - np.asarray(yaw, float)
     return np.pi - np.mod(np.pi - turned, 2 * np.pi)
@@ -63,7 +68,7 @@ def yaw_ned_to_enu(yaw: ArrayLike) -> np.ndarray:
 
 
 def attitude(
-    q1: ArrayLike, q2: ArrayLike, q3: ArrayLike, q4: ArrayLike
+    q1: Field, q2: Field, q3: Field, q4: Field
 ) -> Float[np.ndarray, "4 *batch"]:
     """q_WB from ATTITUDE_QUATERNION or XKQ, normalised."""
     q = quaternion_to_flu_enu(_stack(q1, q2, q3, q4))
@@ -71,7 +76,7 @@ def attitude(
 
 
 def attitude_from_euler(
-    roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike, degrees: bool = False
+    roll: Field, pitch: Field, yaw: Field, degrees: bool = False
 ) -> Float[np.ndarray, "4 *batch"]:
     """q_WB from NED roll, pitch, yaw: ATTITUDE (rad) or ATT (degrees)."""
     half = _stack(roll, pitch, yaw) / 2
@@ -107,28 +112,28 @@ def euler_from_attitude(
 
 
 def world_vector(
-    north: ArrayLike, east: ArrayLike, down: ArrayLike
+    north: Field, east: Field, down: Field
 ) -> Float[np.ndarray, "3 *batch"]:
     """Position (m) or velocity (m/s) in W from NED fields: LOCAL_POSITION_NED, XKF1."""
     return ned_to_enu(_stack(north, east, down))
 
 
 def body_vector(
-    forward: ArrayLike, right: ArrayLike, down: ArrayLike
+    forward: Field, right: Field, down: Field
 ) -> Float[np.ndarray, "3 *batch"]:
     """Vector in B from FRD fields in SI: rates of ATTITUDE (rad/s), IMU of DataFlash."""
     return frd_to_flu(_stack(forward, right, down))
 
 
 def imu_angular_rate(
-    xgyro: ArrayLike, ygyro: ArrayLike, zgyro: ArrayLike
+    xgyro: Field, ygyro: Field, zgyro: Field
 ) -> Float[np.ndarray, "3 *batch"]:
     """ω in B (rad/s) from RAW_IMU or SCALED_IMU fields (mrad/s, FRD)."""
     return body_vector(xgyro, ygyro, zgyro) * 1e-3
 
 
 def imu_specific_force(
-    xacc: ArrayLike, yacc: ArrayLike, zacc: ArrayLike
+    xacc: Field, yacc: Field, zacc: Field
 ) -> Float[np.ndarray, "3 *batch"]:
     """Specific force in B (m/s²; +9.8 along z at rest, level) from RAW_IMU fields (mg, FRD)."""
     return body_vector(xacc, yacc, zacc) * (G * 1e-3)
@@ -155,47 +160,47 @@ def pascal_per_metre(specific_gravity: float = 1.0, density: float | None = None
 
 
 def depth_from_pressure(
-    press_abs: ArrayLike,
+    press_abs: Field,
     surface: float = SURFACE_PRESSURE_HPA,
     gradient: float = ARDUSUB_PASCAL_PER_METRE,
-) -> np.ndarray:
+) -> Values:
     """Depth (m, positive down) from absolute pressure (hPa)."""
     return (np.asarray(press_abs, float) - surface) * (100.0 / gradient)
 
 
 def pressure_from_depth(
-    depth: ArrayLike,
+    depth: Field,
     surface: float = SURFACE_PRESSURE_HPA,
     gradient: float = ARDUSUB_PASCAL_PER_METRE,
-) -> np.ndarray:
+) -> Values:
     """Absolute pressure (hPa) at a depth (m)."""
     return surface + np.asarray(depth, float) * (gradient / 100.0)
 
 
-def height_from_relative_alt(relative_alt: ArrayLike) -> np.ndarray:
+def height_from_relative_alt(relative_alt: Field) -> Values:
     """Height z in W (m) from GLOBAL_POSITION_INT.relative_alt (mm)."""
     return np.asarray(relative_alt, float) * 1e-3
 
 
-def climb_from_vz(vz: ArrayLike) -> np.ndarray:
+def climb_from_vz(vz: Field) -> Values:
     """Vertical velocity, up (m/s), from GLOBAL_POSITION_INT.vz (cm/s, down)."""
     return np.asarray(vz, float) * -1e-2
 
 
-def volts(millivolts: ArrayLike) -> np.ndarray:
+def volts(millivolts: Field) -> Values:
     """Battery voltage (V) from mV fields; 65535 (unknown) and 0 become NaN."""
     mv = np.asarray(millivolts, float)
     return np.where((mv == UINT16_MAX) | (mv <= 0), np.nan, mv * 1e-3)
 
 
-def pack_voltage(cells_mv: Float[np.ndarray, "n *batch"]) -> np.ndarray:
+def pack_voltage(cells_mv: Float[np.ndarray, "n *batch"]) -> Values:
     """Battery voltage (V) from BATTERY_STATUS.voltages: the sum of the entries in use."""
     known = (cells_mv != UINT16_MAX) & (cells_mv > 0)
     total = np.where(known, cells_mv, 0.0).sum(axis=0)
     return np.where(known.any(axis=0), total * 1e-3, np.nan)
 
 
-def thruster_pwm(output_us: ArrayLike, direction: ArrayLike = 1) -> np.ndarray:
+def thruster_pwm(output_us: Field, direction: Field = 1) -> Values:
     """PWM (µs) that makes the standard thruster push as this one does at `output_us`.
 
     With MOT_n_DIRECTION −1 the thruster is mounted or wired the other way round and the output is
@@ -206,7 +211,7 @@ def thruster_pwm(output_us: ArrayLike, direction: ArrayLike = 1) -> np.ndarray:
     return NEUTRAL_US + (us - NEUTRAL_US) * np.asarray(direction, float)
 
 
-def stick(value: ArrayLike, trim: float = NEUTRAL_US, span: float = 400.0) -> np.ndarray:
+def stick(value: Field, trim: float = NEUTRAL_US, span: float = 400.0) -> Values:
     """Pilot's channel in [−1, 1] from PWM (µs)."""
     return (np.asarray(value, float) - trim) / span
 
@@ -266,5 +271,5 @@ def manual_control_demand(
     )
 
 
-def _stack(*fields: ArrayLike) -> np.ndarray:
+def _stack(*fields: Field) -> np.ndarray:
     return np.stack(np.broadcast_arrays(*(np.asarray(f, float) for f in fields)))

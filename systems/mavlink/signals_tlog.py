@@ -216,13 +216,13 @@ def _pressure_depth(
 def _voltage(tables: Mapping[str, Table]) -> Series | None:
     if (battery := tables.get("BATTERY_STATUS")) is not None:
         main = battery["id"] == 0
-        volts = codec.pack_voltage(battery["voltages"][main].T.astype(float))
+        volts = np.asarray(codec.pack_voltage(battery["voltages"][main].T.astype(float)))
         known = np.isfinite(volts)
         found = series(battery["t"][main][known], volts[known], "BATTERY_STATUS")
         if found is not None:
             return found
     if (status := tables.get("SYS_STATUS")) is not None:
-        volts = codec.volts(status["voltage_battery"])
+        volts = np.asarray(codec.volts(status["voltage_battery"]))
         known = np.isfinite(volts)
         return series(status["t"][known], volts[known], "SYS_STATUS")
     return None

@@ -1,0 +1,86 @@
+"""Poses against twists: agreement is near one for true motion, and mix-ups are called by name."""
+
+import numpy as np
+import pytest
+from motion import smooth_motion
+
+from spinndrift.models.kinematics import agreement, contradictions
+from spinndrift.models.resample import conjugate, rotate
+
+T = np.arange(0.0, 20.0, 0.05)
+
+
+def test_true_motion_agrees_and_noise_of_real_sensors_is_no_contradiction():
+    X, V, _ = smooth_motion(T)
+    for part in agreement(T, X, V):
+        assert part.explained > 0.999
+        assert part.slope == pytest.approx(1.0, abs=0.01)
+    assert contradictions(T, X, V) == ([], [])
+    rng = np.random.default_rng(0)
+    noisy = V + rng.normal(size=V.shape) * 0.02
+    noisy_X = X + np.concatenate([np.zeros((4, T.size)), rng.normal(size=(3, T.size)) * 0.01])
+    assert contradictions(T, noisy_X, noisy) == ([], [])
+
+
+def test_a_vehicle_at_rest_contradicts_nothing():
+    X, V, _ = smooth_motion(T)
+    X[:] = X[:, :1]
+    assert contradictions(T, X, 0.001 * V) == ([], [])
+
+
+def scaled(row, factor):
+    def change(X, V, v_W):
+        V[row] *= factor
+        return X, V
+
+    return change
+
+
+def world_velocity(X, V, v_W):
+    V[:3] = v_W
+    return X, V
+
+
+def world_rates(X, V, v_W):
+    V[3:] = rotate(X[:4], V[3:])
+    return X, V
+
+
+def scalar_last(X, V, v_W):
+    return np.concatenate([X[[1, 2, 3, 0]], X[4:]]), V
+
+
+def inverse(X, V, v_W):
+    return np.concatenate([conjugate(X[:4]), X[4:]]), V
+
+
+def body_frd(X, V, v_W):
+    V[[1, 2]] *= -1
+    return X, V
+
+
+def position_ned(X, V, v_W):
+    return np.concatenate([X[:4], X[[5]], X[[4]], -X[[6]]]), V
+
+
+@pytest.mark.parametrize(
+    ("mix_up", "sentence"),
+    [
+        (scaled(slice(3, 6), 180 / np.pi), "deg/s"),
+        (scaled(slice(0, 3), 1 / 0.514444), "knots"),
+        (scaled(slice(0, 3), 3.6), "km/h"),
+        (scaled(slice(0, 3), 1000), "mm/s"),
+        (world_velocity, "along the world's axes"),
+        (world_rates, "about the world's axes"),
+        (scalar_last, "x,y,z,w"),
+        (inverse, "world-to-body"),
+        (body_frd, "forward-right-down"),
+        (position_ned, "north-east-down"),
+        (scaled(slice(0, 3), -1), "check units, frames"),
+    ],
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_mix_ups_are_named(mix_up, sentence, seed):
+    errors, _ = contradictions(T, *mix_up(*smooth_motion(T, seed=seed)))
+    assert len(errors) == 1
+    assert sentence in errors[0]

@@ -1,5 +1,6 @@
 """The path integral planner in a diagram."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -65,7 +66,8 @@ class Mppi(LeafSystem):
         self._V = self.DeclareVectorInputPort("V_WB_B", 6)
         self._bias = self.DeclareVectorInputPort("F_bias_Bo_W", 6)
         self._noise = self.DeclareVectorInputPort("noise", 4, RandomDistribution.kGaussian)
-        start = np.asarray(planner.init().F_Bo_B, float).ravel()
+        first = eqx.filter_jit(MppiPlanner.init)(planner)
+        start: Float[np.ndarray, " n"] = np.asarray(first.F_Bo_B, float).ravel()
         self._nominal = self.DeclareDiscreteState(start)
         self._plan = self.DeclareDiscreteState(self.layout.size)
         self._samples = self.DeclareDiscreteState(self.samples.size)

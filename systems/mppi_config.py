@@ -9,7 +9,9 @@ from .plan import PlanLayout
 
 @dataclass(frozen=True)
 class MppiConfig:
-    """Cost, sampling and risk of `systems.mppi_core.MppiPlanner`; per axis: x, y, z, roll, pitch, yaw.
+    """Cost, sampling and risk of `systems.mppi_core.MppiPlanner`.
+
+    Six numbers are for x, y, z, roll, pitch, yaw.
 
     Attributes:
         horizon: number of steps.

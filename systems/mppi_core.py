@@ -98,7 +98,7 @@ class MppiPlanner(eqx.Module):
         self.hull = cast(hull, dtype)
         self.X_WG = jnp.asarray(X_WG, dtype)
         self.V_goal = jnp.zeros(6, dtype) if V_goal is None else jnp.asarray(V_goal, dtype)
-        self.axes = cast(limits.axes(), dtype)
+        self.axes = eqx.filter_jit(type(limits).axes)(limits).astype(dtype)
         self.bases = tuple(
             jnp.asarray(spline_basis(self.config.horizon, k), dtype) for k in self.config.knots
         )
@@ -170,7 +170,7 @@ class MppiPlanner(eqx.Module):
     def sample(
         self, key: Array, nominal: Float[Array, "horizon 6"], F_bias_W: Float[Array, "6"]
     ) -> Float[Array, "horizon 6 sequences"]:
-        """Feasible wrench sequences about `nominal`: itself first, then holding, then with noise."""
+        """Feasible wrench sequences about `nominal`: itself, then holding, then with noise."""
         c = self.config
         n = c.sequences
         noise = jnp.asarray(c.noise, nominal.dtype) * self.axes
@@ -194,7 +194,7 @@ class MppiPlanner(eqx.Module):
         rolled: _Rollouts,
         F_bias_W: Float[Array, "6"],
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """Cost of control sequences over all their realisations, and their collision probability."""
+        """Cost of sequences over all their realisations, and their collision probability."""
         c, dt = self.config, self.config.dt
         total = combine_risk(rolled.cost, c.risk, c.cvar_part)
         used = (F_Bo_B - self.hold_wrench(F_bias_W)[None, :, None]) / self.axes[None, :, None]
@@ -242,7 +242,7 @@ class MppiPlanner(eqx.Module):
         return cost
 
     def _rollouts(self, X0: Array, V0: Array, F: Array, bias: Array, dW: Array | None, keep):
-        """All sequences (horizon, 6, n) under all noise paths (horizon, 6, r), r-major in the batch."""
+        """Sequences (horizon, 6, n) under all noise paths (horizon, 6, r), r-major in the batch."""
         c = self.config
         n = F.shape[2]
         r = 1 if dW is None else dW.shape[2]

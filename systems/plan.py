@@ -10,7 +10,7 @@ from ..models import se3
 
 
 class Plan(NamedTuple):
-    """States at t0 + k dt for k = 0 … H and the wrenches that act between them (zero-order hold)."""
+    """States at t0 + k dt for k = 0 … H and the wrenches held between them."""
 
     t0: Float[Array, ""]
     X_WB: Float[Array, "7 n"]

@@ -1,6 +1,7 @@
 """The planner's truths; `test_path_integral` has those of its weights and risks."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from spinndrift.systems.mppi import FIGURES, Mppi, key_from_gaussians
 from spinndrift.systems.mppi_config import MppiConfig
 from spinndrift.systems.mppi_core import MppiPlanner, MppiState
 from spinndrift.systems.obstacles import Cylinders, Pylon, SphereHull
+from spinndrift.systems.plan_samples import SampleLayout
 from spinndrift.systems.wrench_limits import BoxLimits
 
 HULL = SphereHull.cover((0.4, 0.4, 0.3), (1, 1))
@@ -51,12 +53,12 @@ def at(x, y=0.0, z=0.0):
 def settle(planner, X, V, count, seed=0, bias=NONE):
     """Plan again and again from the same state: rows put in front undo the shift in time."""
     rows = planner.config.shift
-    state, output = planner.init(), None
+    state, output = planner.init(), []
     for i in range(count):
         longer = jnp.concatenate([jnp.zeros((rows, 6), state.F_Bo_B.dtype), state.F_Bo_B])
         key = jax.random.key(seed + i)
-        state, output = step(planner, MppiState(longer), key, X, V, bias)
-    return state, output
+        state, *output = step(planner, MppiState(longer), key, X, V, bias)
+    return state, output[0]
 
 
 # ------------------------------------------------------------------------------------- optimality
@@ -78,7 +80,7 @@ FREE = MppiConfig(
 
 
 def double_integrator_optimum(config, distance, mass, limit):
-    """Least cost of x⁺ = x + h v, v⁺ = v + h F/m from rest at `distance`, by linear least squares."""
+    """Least cost of x⁺ = x + h v, v⁺ = v + h F/m from rest at `distance`: least squares."""
     n, h = config.horizon, config.dt
     v_of_F = np.tril(np.ones((n, n))) * h / mass
     x_of_F = np.vstack([np.zeros(n), np.cumsum(v_of_F, axis=0)[:-1]]) * h
@@ -185,6 +187,7 @@ def test_process_noise_makes_the_plan_keep_its_distance():
 
 def test_noise_paths_have_the_brownian_mean_and_spread():
     dW = among()._process_noise(jax.random.key(4))
+    assert dW is not None
     assert dW.shape == (40, 6, 8)
     W = jnp.cumsum(dW, axis=0)
     np.testing.assert_allclose(jnp.mean(W, axis=2), 0, atol=1e-6)
@@ -244,14 +247,14 @@ def test_keys_differ_with_any_bit_of_the_noise():
 
 def test_the_system_plans_from_its_ports_and_repeats_itself():
     builder = DiagramBuilder()
-    system = builder.AddSystem(Mppi(among()))
+    system: Any = builder.AddSystem(Mppi(among()))
     for name, value in (("X_WB", at(0.0)), ("V_WB_B", NONE)):
         source = builder.AddSystem(ConstantVectorSource(np.asarray(value)))
         builder.Connect(source.get_output_port(), system.GetInputPort(name))
     noise = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 4, 0.2))
     builder.Connect(noise.get_output_port(), system.GetInputPort("noise"))
     diagram = builder.Build()
-    plans = []
+    plans, samples, figures = [], SampleLayout(1, 0.1, 1).unpack(jnp.zeros(5)), {}
     for _ in range(2):
         simulator = Simulator(diagram)
         context = simulator.get_mutable_context()

@@ -1,3 +1,5 @@
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,7 +64,7 @@ class DrakeOracle:
         poses.set_value(self.frame, RigidTransform(RollPitchYaw(rpy), position))
         port = self.graph.get_source_pose_port(self.source)
         port.FixValue(self.context, poses)
-        query = self.graph.get_query_output_port().Eval(self.context)
+        query: Any = self.graph.get_query_output_port().Eval(self.context)
         pairs = [
             query.ComputeSignedDistancePairClosestPoints(self.box, c).distance
             for c in self.cylinders

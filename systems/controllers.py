@@ -1,0 +1,308 @@
+"""Controllers by kind: each is a dataclass for YAML that adds itself to a diagram.
+
+A controller is any system with the input ports `X_WB` (7) and `V_WB_B` (6), the estimated state,
+and the output port `F_Bo_B` (6), the wrench it wants.
+"""
+
+import abc
+import importlib
+import importlib.util
+import inspect
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from pydrake.systems.framework import Diagram, DiagramBuilder, System
+
+from ..models.checkpoint import load_model
+from ..models.checks import Vector6, check_numbers, require
+from ..models.dynamics import Dynamics
+from ..models.errors import UserError
+from ..models.vehicle import load_vehicle
+from .disturbance_observer import DisturbanceObserver, MomentumObserver
+from .impedance import Impedance, ImpedanceGains, ImpedanceLaw
+from .mppi import Mppi
+from .mppi_config import MppiConfig
+from .mppi_core import MppiPlanner
+from .obstacles import Cylinders, SphereHull
+from .paths import FigureEight, HoldPose, PoseConfig, Waypoints
+from .plan import PlanLayout
+from .reference import Reference
+from .station import add_noise
+from .station_config import StationConfig
+from .wrench_limits import ThrusterLimits
+
+INPUTS = {"X_WB": 7, "V_WB_B": 6}
+"""Input ports of every controller and their sizes."""
+
+OUTPUTS = {"F_Bo_B": 6}
+"""Output ports of every controller and their sizes; it may have more."""
+
+
+class Controller(abc.ABC):
+    """A kind of controller."""
+
+    @abc.abstractmethod
+    def build(self, station: StationConfig) -> System:
+        """The system; it may read vehicle, obstacles and rates of the station it is made for."""
+
+    def add_to(self, builder: DiagramBuilder, station: StationConfig) -> System:
+        """Add the system to a diagram under the name `controller`.
+
+        Raises:
+            UserError: it lacks a port, or a port has another size.
+        """
+        system = self.build(station)
+        inputs = {port.get_name(): port.size() for port in _input_ports(system)}
+        outputs = {port.get_name(): port.size() for port in _output_ports(system)}
+        for kind, wanted, has in (("input", INPUTS, inputs), ("output", OUTPUTS, outputs)):
+            for name, size in wanted.items():
+                if has.get(name) != size:
+                    raise UserError(
+                        f"controller {type(system).__name__} needs the {kind} port `{name}` of "
+                        f"size {size}; it has {has or 'none'}"
+                    )
+        return builder.AddNamedSystem("controller", system)
+
+
+@dataclass(frozen=True)
+class ObserverConfig:
+    """Settings of the disturbance observer (`systems.disturbance_observer`).
+
+    Attributes:
+        time_constant: of its low-pass (s).
+        largest_force: bound of the observed force (N).
+        largest_moment: bound of the observed moment (N·m).
+        period: between calls (s), that of the state estimates.
+    """
+
+    time_constant: float = 1.5
+    largest_force: float = 60.0
+    largest_moment: float = 5.0
+    period: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        check_numbers(self)
+        for name in ("time_constant", "largest_force", "largest_moment", "period"):
+            require(getattr(self, name) > 0, self, name, "give a number above zero")
+
+    def build(self, dynamics: Dynamics) -> DisturbanceObserver:
+        """The observer for a model."""
+        limit = (self.largest_force, self.largest_moment)
+        observer = MomentumObserver(dynamics, self.time_constant, limit)
+        return DisturbanceObserver(observer, self.period)
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How a plan is tracked.
+
+    Attributes:
+        gains: of the impedance law.
+        error_limit: the distance (m) and angle (rad) beyond which it pulls no harder.
+        period: between calls (s).
+        observer: of steady wrenches, which planner and reference then counter; none if null.
+    """
+
+    gains: ImpedanceGains = field(default_factory=ImpedanceGains)
+    error_limit: tuple[float, float] = (1.0, 1.0)
+    period: float = 0.02
+    observer: ObserverConfig | None = field(default_factory=ObserverConfig)
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        check_numbers(self)
+        require(min(self.error_limit) > 0, self, "error_limit", "give numbers above zero")
+        require(self.period > 0, self, "period", "give a time above zero")
+
+    def build(
+        self,
+        station: StationConfig,
+        source: System,
+        layout: PlanLayout,
+        observed: Dynamics,
+        noise_period: float | None = None,
+    ) -> Diagram:
+        """A controller around the source of a plan, with its `plan` (and more) put out as well.
+
+        `observed` is the model from which the observer takes its expectation; `noise_period` (s)
+        is how often the source's `noise` is drawn.
+        """
+        vehicle = station.load_vehicle()
+        limits = ThrusterLimits.create(vehicle.thrusters(), station.voltage)
+        K_p, K_d = self.gains.matrices(vehicle.dynamics())
+        law = ImpedanceLaw(K_p, K_d, limits, self.error_limit)
+        builder = DiagramBuilder()
+        builder.AddNamedSystem("source", source)
+        impedance = builder.AddNamedSystem("impedance", Impedance(law, layout, self.period))
+        builder.Connect(source.GetOutputPort("plan"), impedance.GetInputPort("plan"))
+        systems = [impedance]
+        if self.observer is not None:
+            observer = builder.AddNamedSystem("observer", self.observer.build(observed))
+            builder.Connect(impedance.GetOutputPort("F_Bo_B"), observer.GetInputPort("F_Bo_B"))
+            bias = observer.GetOutputPort("F_bias_Bo_W")
+            builder.Connect(bias, source.GetInputPort("F_bias_Bo_W"))
+            builder.ExportOutput(bias, "F_bias_Bo_W")
+            systems.append(observer)
+        if source.HasInputPort("X_WB"):
+            systems.append(source)
+        for name in INPUTS:
+            builder.ExportInput(systems[0].GetInputPort(name), name)
+            for system in systems[1:]:
+                builder.ConnectInput(name, system.GetInputPort(name))
+        if noise_period is not None:
+            add_noise(builder, source, "noise", noise_period)
+        builder.ExportOutput(impedance.GetOutputPort("F_Bo_B"), "F_Bo_B")
+        for port in _output_ports(source):
+            builder.ExportOutput(port, port.get_name())
+        return builder.Build()
+
+
+@dataclass(frozen=True)
+class MppiImpedance(Controller):
+    """Path integral planning among the station's obstacles, tracked by impedance control.
+
+    Attributes:
+        goal: where to go.
+        planner: settings of the planner.
+        model: a checkpoint of the dynamics to plan with; physics if left out.
+        vehicle: whose physics to plan with; the station's if left out.
+        diffusion: b of the physics' process noise (N√s and N·m√s): what waves, wake and pushes do
+            to the vehicle, as white noise. A wrench of standard deviation σ and time constant τ
+            counts as σ √(2τ).
+        tracking: settings of the tracking.
+    """
+
+    goal: PoseConfig
+    planner: MppiConfig = field(default_factory=MppiConfig)
+    model: Path | None = None
+    vehicle: str | None = None
+    diffusion: Vector6 = (3.0, 3.0, 3.0, 0.2, 0.2, 0.2)
+    tracking: Tracking = field(default_factory=Tracking)
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        check_numbers(self)
+        require(min(self.diffusion) >= 0, self, "diffusion", "give six numbers of zero or more")
+
+    def dynamics(self, station: StationConfig) -> Dynamics:
+        """The model to plan with."""
+        if self.model is not None:
+            return load_model(self.model, float)[0]
+        vehicle = load_vehicle(self.vehicle or station.vehicle)
+        return vehicle.dynamics(np.array(self.diffusion))
+
+    def build(self, station: StationConfig) -> Diagram:
+        vehicle = station.load_vehicle()
+        model = self.dynamics(station)
+        limits = ThrusterLimits.create(
+            vehicle.thrusters(), station.voltage, self.planner.wrench_fraction
+        )
+        planner = MppiPlanner(
+            model,
+            limits,
+            Cylinders.create(station.obstacles),
+            SphereHull.cover(vehicle.size),
+            self.goal.pose(),
+            config=self.planner,
+        )
+        c = self.planner
+        return self.tracking.build(station, Mppi(planner), c.layout, model, c.period)
+
+
+@dataclass(frozen=True)
+class TrackReference(Controller):
+    """Impedance control along a path that is given beforehand; obstacles don't count.
+
+    Attributes:
+        path: the path.
+        feedforward: add the wrenches that the physics of the station's vehicle needs on the path.
+        tracking: settings of the tracking.
+    """
+
+    path: HoldPose | Waypoints | FigureEight
+    feedforward: bool = True
+    tracking: Tracking = field(default_factory=Tracking)
+
+    def build(self, station: StationConfig) -> Diagram:
+        model = station.load_vehicle().dynamics()
+        reference = Reference(self.path, model if self.feedforward else None)
+        return self.tracking.build(station, reference, reference.layout, model)
+
+
+@dataclass(frozen=True)
+class Own(Controller):
+    """A controller of one's own.
+
+    Attributes:
+        system: `path/to/file.py:ClassName` or `package.module:ClassName` of a Drake system.
+        parameters: keyword arguments of its constructor. If that has an argument `vehicle` and
+            none is given here, it gets the station's `Vehicle`.
+    """
+
+    system: str
+    parameters: dict[str, bool | int | float | str | list[float]] = field(default_factory=dict)
+
+    def build(self, station: StationConfig) -> System:
+        where, _, name = self.system.rpartition(":")
+        if not where or not name:
+            raise UserError(
+                f"Own.system is `{self.system}`: write path/to/file.py:ClassName, or "
+                "package.module:ClassName"
+            )
+        found = getattr(_module(where), name, None)
+        if not (inspect.isclass(found) and issubclass(found, System)):
+            raise UserError(f"Own.system: {where} has no Drake system called `{name}`")
+        arguments: dict = dict(self.parameters)
+        signature = inspect.signature(found)
+        if "vehicle" in signature.parameters:
+            arguments.setdefault("vehicle", station.load_vehicle())
+        try:
+            signature.bind(**arguments)
+        except TypeError as error:
+            raise UserError(
+                f"Own.parameters do not fit {name}{signature}: {error}; give what it takes"
+            ) from error
+        return found(**arguments)
+
+
+ControllerKind = MppiImpedance | TrackReference | Own
+"""The kinds that a scenario can name by a tag."""
+
+
+def _module(where: str) -> ModuleType:
+    """The module of a dotted name, or of a file, which is run at most once."""
+    path = Path(where).resolve()
+    if path.suffix != ".py":
+        try:
+            return importlib.import_module(where)
+        except ModuleNotFoundError as error:
+            raise UserError(
+                f"Own.system: there is no module `{where}`; a file's name ends in .py"
+            ) from error
+    if not path.is_file():
+        raise UserError(f"Own.system: there is no file {where}; check the path")
+    name = f"own_controller_{path.stem}_{abs(hash(str(path))):x}"
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(name, path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[name] = module
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[name]
+            raise
+    return sys.modules[name]
+
+
+def _input_ports(system: System) -> list:
+    return [system.get_input_port(i) for i in range(system.num_input_ports())]
+
+
+def _output_ports(system: System) -> list:
+    return [system.get_output_port(i) for i in range(system.num_output_ports())]

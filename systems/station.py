@@ -1,0 +1,122 @@
+"""The station: everything between a controller's wrench and the state it is told."""
+
+from pydrake.common import RandomDistribution
+from pydrake.systems.framework import Diagram, DiagramBuilder, System
+from pydrake.systems.primitives import ConstantVectorSource, RandomSource
+
+from .disturbance_source import DisturbanceSource
+from .ekf import Ekf
+from .learned_plant import LearnedPlant
+from .sensor_suite import SensorSuite
+from .station_config import StationConfig
+from .thruster_bank import ThrustAllocation, ThrusterBank
+
+INPUTS = {"F_Bo_B": 6}
+"""Input ports and their sizes: the wrench a controller wants."""
+
+OUTPUTS = {
+    "X_WB": 7,
+    "V_WB_B": 6,
+    "covariance": 324,
+    "imu": 6,
+    "dvl": 7,
+    "depth": 3,
+    "compass": 3,
+    "pwm": 8,
+    "status": 10,
+}
+"""Output ports and their sizes, in simulation and on hardware: estimates, readings, commands."""
+
+CHEATS = {
+    "X_WB_cheat": 7,
+    "V_WB_B_cheat": 6,
+    "F_disturbance_cheat": 6,
+    "flow_cheat": 6,
+}
+"""Output ports that only a simulation has: the truth."""
+
+_NEVER = 1e9  # period (s) of noise that is drawn once
+
+
+def station_ports(hardware: bool = False) -> tuple[dict[str, int], dict[str, int]]:
+    """Names and sizes of a station's input and output ports."""
+    return dict(INPUTS), OUTPUTS | ({} if hardware else CHEATS)
+
+
+def make_station(config: StationConfig, hardware: bool = False) -> Diagram:
+    """A diagram with `station_ports(hardware)`.
+
+    In simulation: allocation, thrusters, plant, disturbances, sensors and filter, as subsystems of
+    these names. All noise comes from random sources inside, which `SetRandomContext` seeds.
+
+    Raises:
+        NotImplementedError: hardware is asked for.
+        UserError: a part of the configuration names what can't be read.
+    """
+    if hardware:
+        raise NotImplementedError(
+            "this version has no link to a vehicle; build the station with hardware=False"
+        )
+    return _simulated(config)
+
+
+def add_noise(builder: DiagramBuilder, system: System, name: str, period: float) -> None:
+    """Feed a system's noise port with unit Gaussians drawn every `period` (s), if it takes any."""
+    port = system.GetInputPort(name)
+    if port.size() == 0:
+        return
+    source = RandomSource(RandomDistribution.kGaussian, port.size(), period)
+    builder.AddNamedSystem(f"{system.get_name()}_{name}", source)
+    builder.Connect(source.get_output_port(), port)
+
+
+def _simulated(config: StationConfig) -> Diagram:
+    thrusters = config.load_vehicle().thrusters()
+    X0, V0 = config.initial_state()
+    s = config.sensing
+    builder = DiagramBuilder()
+    add = builder.AddNamedSystem
+    allocation = add("allocation", ThrustAllocation(thrusters, config.voltage))
+    bank = add("thrusters", ThrusterBank(thrusters, config.period))
+    plant = add("plant", LearnedPlant(config.dynamics(), config.period, config.substeps, X0, V0))
+    water = add("disturbances", DisturbanceSource(config.disturbance(), config.period))
+    sensors = add("sensors", SensorSuite(s.imu, s.dvl, s.depth, s.compass))
+    ekf = add("ekf", Ekf(s.imu, s.dvl, s.depth, s.compass, s.ekf, X0, V0))
+
+    def connect(source, output: str, target, name: str | None = None) -> None:
+        builder.Connect(source.GetOutputPort(output), target.GetInputPort(name or output))
+
+    connect(allocation, "pwm", bank)
+    connect(bank, "F_Bo_B", plant)
+    connect(water, "F_disturbance_Bo_B", plant)
+    connect(water, "flow_W", plant)
+    for reader in (water, sensors):
+        connect(plant, "X_WB", reader)
+        connect(plant, "V_WB_B", reader)
+    connect(plant, "A_WB_B", sensors)
+    for reading in ("imu", "dvl", "depth", "compass"):
+        connect(sensors, reading, ekf)
+    if config.voltage is not None:
+        battery = add("battery", ConstantVectorSource([config.voltage]))
+        builder.Connect(battery.get_output_port(), bank.GetInputPort("voltage"))
+
+    add_noise(builder, plant, "noise", config.period)
+    add_noise(builder, water, "noise", config.period)
+    add_noise(builder, sensors, "noise", 1 / s.imu.rate)
+    for system in (water, sensors, ekf):
+        add_noise(builder, system, "initial_noise", _NEVER)
+
+    builder.ExportInput(allocation.GetInputPort("F_Bo_B"), "F_Bo_B")
+    for name in ("X_WB", "V_WB_B", "covariance"):
+        builder.ExportOutput(ekf.GetOutputPort(name), name)
+    for name in ("imu", "dvl", "depth", "compass"):
+        builder.ExportOutput(sensors.GetOutputPort(name), name)
+    builder.ExportOutput(allocation.GetOutputPort("pwm"), "pwm")
+    builder.ExportOutput(ekf.GetOutputPort("status"), "status")
+    builder.ExportOutput(plant.GetOutputPort("X_WB"), "X_WB_cheat")
+    builder.ExportOutput(plant.GetOutputPort("V_WB_B"), "V_WB_B_cheat")
+    builder.ExportOutput(water.GetOutputPort("F_disturbance_Bo_B"), "F_disturbance_cheat")
+    builder.ExportOutput(water.GetOutputPort("flow_W"), "flow_cheat")
+    station = builder.Build()
+    station.set_name("station")
+    return station

@@ -1,0 +1,99 @@
+"""The station in numbers: vehicle, water, sensors, start, seed; a scenario without controller."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ..models.checkpoint import load_model
+from ..models.checks import Vector6, check_numbers, require
+from ..models.disturbances import Combined, Kind, preset
+from ..models.dynamics import Dynamics
+from ..models.sensors import Compass, DepthSensor, Dvl, Imu
+from ..models.vehicle import Vehicle, load_vehicle
+from .filtering.delayed import EkfConfig
+from .obstacles import Pylon
+from .paths import PoseConfig
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """The sensors on board and the filter that fuses them."""
+
+    imu: Imu = field(default_factory=Imu)
+    dvl: Dvl = field(default_factory=Dvl)
+    depth: DepthSensor = field(default_factory=DepthSensor)
+    compass: Compass = field(default_factory=Compass)
+    ekf: EkfConfig = field(default_factory=EkfConfig)
+
+
+@dataclass(frozen=True)
+class StationConfig:
+    """What a controller is put to work in.
+
+    Attributes:
+        vehicle: a preset's name or the path of a vehicle's YAML file: hull, thrusters, physics.
+        model: a checkpoint of the dynamics to simulate; the vehicle's physics if left out.
+        diffusion: b of the physics' process noise (N√s and N·m√s); disturbances are usually better.
+        disturbance_set: a named set (`models.disturbances.preset`).
+        disturbances: more of them, by kind.
+        obstacles: pylons.
+        sensing: sensors and filter.
+        start: pose at t = 0.
+        start_twist: twist at t = 0, in B (m/s, rad/s).
+        voltage: of the battery, without load (V); the vehicle's nominal one if left out.
+        period: of plant, thrusters and disturbances (s).
+        substeps: Lie-group steps of the plant in a period.
+        seed: of everything that is random.
+    """
+
+    vehicle: str = "bluerov2_heavy"
+    model: Path | None = None
+    diffusion: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    disturbance_set: str = "still"
+    disturbances: tuple[Kind, ...] = ()
+    obstacles: tuple[Pylon, ...] = ()
+    sensing: Sensing = field(default_factory=Sensing)
+    start: PoseConfig = field(default_factory=lambda: PoseConfig((0.0, 0.0, -1.5)))
+    start_twist: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    voltage: float | None = None
+    period: float = 0.01
+    substeps: int = 2
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check numbers and the name of the disturbance set."""
+        check_numbers(self)
+        require(min(self.diffusion) >= 0, self, "diffusion", "give six numbers of zero or more")
+        require(self.period > 0, self, "period", "give a time above zero")
+        require(self.substeps >= 1, self, "substeps", "give 1 or more")
+        require(0 <= self.seed < 2**32, self, "seed", "give a whole number from 0 to 4294967295")
+        require(self.voltage is None or self.voltage > 0, self, "voltage", "give a voltage above 0")
+        preset(self.disturbance_set)
+
+    def load_vehicle(self) -> Vehicle:
+        """The vehicle.
+
+        Raises:
+            UserError: there is no such preset or file, or it is no vehicle.
+        """
+        return load_vehicle(self.vehicle)
+
+    def dynamics(self) -> Dynamics:
+        """The dynamics to simulate, in double precision.
+
+        Raises:
+            UserError: the vehicle or the checkpoint can't be read.
+        """
+        if self.model is not None:
+            return load_model(self.model, float)[0]
+        return self.load_vehicle().dynamics(np.array(self.diffusion))
+
+    def disturbance(self) -> Combined:
+        """All disturbances as one."""
+        return Combined((*preset(self.disturbance_set).members, *self.disturbances))
+
+    def initial_state(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6"]]:
+        """X_WB and V_WB_B at t = 0."""
+        return np.asarray(self.start.pose()), np.array(self.start_twist, float)

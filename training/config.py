@@ -1,0 +1,87 @@
+"""Settings of a training run, as YAML (`models.config`) and on the command line."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from ..models.checks import check_numbers, require
+from ..models.spinn import SpinnConfig
+from .losses import Fdm, ObjectiveConfig
+
+
+@dataclass(frozen=True)
+class WindowConfig:
+    """How recordings are cut into windows and what is held out."""
+
+    length_s: float = 4.0
+    stride_s: float = 0.5
+    """Between the starts of training windows; held-out windows don't overlap."""
+    normalise: Literal["heading", "identity", "none"] = "heading"
+    held_out: float = 0.25
+    by: Literal["auto", "time", "run"] = "auto"
+    gap_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+        for name in ("length_s", "stride_s"):
+            require(getattr(self, name) > 0, self, name, "give a time above 0 s")
+        require(0 < self.held_out < 1, self, "held_out", "give a fraction between 0 and 1")
+
+
+@dataclass(frozen=True)
+class PretrainConfig:
+    """Fit of the coefficient networks to the preset before training."""
+
+    steps: int = 200
+    batch: int = 128
+    learning_rate: float = 2e-3
+    speed: float = 1.0
+    """Standard deviation of sampled velocities (m/s and rad/s)."""
+    tolerance: float = 0.01
+    """Mean squared relative error below which there is nothing to fit."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+        require(self.steps >= 0, self, "steps", "give zero or more")
+        require(self.batch >= 1, self, "batch", "give at least 1")
+        for name in ("learning_rate", "speed"):
+            require(getattr(self, name) > 0, self, name, "give a positive number")
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """One training run; the defaults suit some minutes of data of one vehicle on two cores."""
+
+    objective: ObjectiveConfig = field(default_factory=Fdm)
+    model: SpinnConfig = field(default_factory=lambda: SpinnConfig(constant_mass=True))
+    windows: WindowConfig = field(default_factory=WindowConfig)
+    pretrain: PretrainConfig = field(default_factory=PretrainConfig)
+    steps: int = 1000
+    batch: int = 16
+    """Windows a step."""
+    learning_rate: float = 3e-3
+    """Adam's peak rate; the paper's is 1e-4, constant."""
+    schedule: Literal["cosine", "constant"] = "cosine"
+    """After the warm-up: cosine decay to 1 % of the peak, or constant."""
+    warm_up: int = 50
+    """Steps of linear rise to the peak rate."""
+    clip: float = 1.0
+    """Largest norm of a step's gradient; 0 leaves it as it is."""
+    refit_at: tuple[float, ...] = (0.3,)
+    """Fractions of the run at which bandwidths are fitted to the remaining errors anew."""
+    seed: int = 0
+    validate_every: int = 50
+    patience: int = 0
+    """Validations without a better one after which training stops; 0 never does."""
+    checkpoint_every: int = 100
+    max_recoveries: int = 8
+    """Bad steps survived before the run is given up."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+        for name in ("steps", "batch", "validate_every", "checkpoint_every"):
+            require(getattr(self, name) >= 1, self, name, "give at least 1")
+        for name in ("warm_up", "clip", "patience", "max_recoveries", "seed"):
+            require(getattr(self, name) >= 0, self, name, "give zero or more")
+        require(self.learning_rate > 0, self, "learning_rate", "give a positive number")
+        for fraction in self.refit_at:
+            require(0 < fraction < 1, self, "refit_at", "give fractions between 0 and 1")

@@ -1,0 +1,332 @@
+"""Training: minibatches of windows, Adam, checkpoints that resume bit for bit, guarded steps."""
+
+import logging
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..models.checkpoint import save_model
+from ..models.dynamics import Dynamics
+from ..models.errors import UserError
+from .config import TrainingConfig
+from .guard import Diagnosis, TrainingError, diagnose, not_finite
+from .objective import Batch, Objective
+from .provenance import fingerprint, provenance
+from .run_folder import RunFolder, TrainState
+from .step import TrainStep, batch_indices, learning_rate, partition
+from .windows import Windows
+
+Progress = Callable[[int, int, float], None]
+"""Called after every step with steps done, steps in all, and the loss."""
+
+_log = logging.getLogger(__name__)
+_VALIDATION_WINDOWS = 32
+_FLUSH_EVERY = 20
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What a run ends with.
+
+    Attributes:
+        model: the best model on the validation windows, or without those the last.
+        last: the model after the last step.
+        steps: steps done, also those of earlier sessions of a resumed run.
+        best_step: after how many steps `model` was reached.
+        metrics: columns of metrics.csv by name (this process' rows alone without a folder).
+        events: recoveries, each with its step and what happened.
+        seconds: time spent in training.
+        stopped_early: whether `patience` ended it.
+    """
+
+    model: Dynamics
+    last: Dynamics
+    steps: int
+    best_step: int
+    metrics: dict[str, np.ndarray]
+    events: tuple[dict[str, Any], ...]
+    seconds: float
+    stopped_early: bool
+
+
+def fit(
+    config: TrainingConfig,
+    model: Dynamics,
+    windows: Windows,
+    out_dir: str | Path | None = None,
+    *,
+    validation: Windows | None = None,
+    progress: Progress | None = None,
+    resume: bool = False,
+    metadata: dict[str, Any] | None = None,
+) -> TrainingResult:
+    """Train all arrays of `model` that receive a gradient.
+
+    `validation` windows choose the best model; judge the result on yet other ones. With `out_dir`
+    the run leaves checkpoint.npz, metrics.csv, config.yaml, run.json and model.spinn (with
+    `metadata`).
+    With `resume` a checkpoint there is continued, to the same bits as without the break. The first
+    Ctrl-C ends the step at hand, writes a checkpoint and raises KeyboardInterrupt.
+
+    Raises:
+        UserError: the starting model or all windows are not finite, or the checkpoint doesn't fit.
+        TrainingError: more bad steps than `max_recoveries`; the last good state is checkpointed.
+    """
+    return _Run(config, model, windows, out_dir, validation, metadata).go(progress, resume)
+
+
+class _Run:
+    def __init__(
+        self,
+        config: TrainingConfig,
+        model: Dynamics,
+        windows: Windows,
+        out_dir: str | Path | None,
+        validation: Windows | None,
+        metadata: dict[str, Any] | None,
+    ):
+        if broken := not_finite(model):
+            raise UserError(f"model: parameter {', '.join(broken)} is not finite at the start")
+        self.config, self.windows, self.metadata = config, windows, metadata
+        self.folder = None if out_dir is None else RunFolder(out_dir)
+        params, self.static = partition(model)
+        self.train_step = TrainStep(config, self.static)
+        # the step donates its inputs: never the caller's own arrays
+        self.state = TrainState(
+            params=jax.tree.map(jnp.array, params),
+            moments=self.train_step.optimizer.init(params),
+            objective=config.objective.build(model, windows),
+            best=jax.tree.map(jnp.array, params),
+        )
+        self.snapshot = (self.state.arrays(), self.state.plain())
+        self.data = Batch.of(windows)
+        self.data_id = fingerprint(windows)
+        self.validation = (
+            None if validation is None else Batch.of(validation.thin(_VALIDATION_WINDOWS))
+        )
+        self.rows: list[dict[str, Any]] = []
+        self.unwritten: list[dict[str, Any]] = []
+        self.bad_in_a_row = 0
+
+    # the loop
+
+    def go(self, progress: Progress | None, resume: bool) -> TrainingResult:
+        state, config = self.state, self.config
+        if self.folder is not None:
+            if resume and self.folder.checkpoint.exists():
+                self.folder.load(state, config, self.data_id)
+            self.folder.begin(config, provenance(self.windows))
+            self.folder.begin_metrics(state.step)
+        self.snapshot = (state.arrays(), state.plain())
+        began = time.monotonic() - state.seconds
+        stopped = False
+        with _deferred_interrupt() as interrupted:
+            try:
+                while state.step < config.steps and not stopped:
+                    row = self._advance()
+                    stopped = self._validate(row)
+                    state.seconds = time.monotonic() - began
+                    self._note(row)
+                    if state.step % config.checkpoint_every == 0:
+                        self._checkpoint()
+                    if progress is not None:
+                        progress(state.step, config.steps, row["loss"])
+                    if interrupted():
+                        raise KeyboardInterrupt
+            except KeyboardInterrupt:
+                self._checkpoint()
+                raise
+        self._checkpoint()
+        return self._result(stopped)
+
+    def _advance(self) -> dict[str, Any]:
+        state, config = self.state, self.config
+        if state.step in {round(f * config.steps) for f in config.refit_at}:
+            state.objective = state.objective.refit(self._model(state.params), self._usable())
+            state.best_value = float("inf")  # scores before and after can't be compared
+        number = state.step
+        usable = np.setdiff1d(np.arange(len(self.windows)), state.excluded)
+        batch = min(config.batch, usable.size)
+        indices = np.resize(batch_indices(config.seed, number, batch, usable), config.batch)
+        rate = learning_rate(config, number) * state.rate_scale
+        state.params, state.moments, report = self.train_step(
+            state.params,
+            state.moments,
+            state.objective,
+            self.data,
+            indices,
+            config.seed,
+            number,
+            rate,
+        )
+        if bool(report.ok):
+            self.bad_in_a_row = 0
+        else:
+            self._recover(indices, number)
+        state.step = number + 1
+        return {
+            "step": number,
+            "loss": float(report.loss),
+            "gradient_norm": float(report.gradient_norm),
+            "rate": rate,
+            "ok": int(bool(report.ok)),
+            "validation": "",
+            "seconds": "",
+            **{name: float(value) for name, value in report.parts.items()},
+        }
+
+    def _recover(self, indices: np.ndarray, number: int) -> None:
+        """Name what happened; then drop the windows at fault, or go back and shrink the rate."""
+        state = self.state
+        self.bad_in_a_row += 1
+        key = jax.random.fold_in(jax.random.key(np.uint32(self.config.seed)), np.uint32(number))
+        found = diagnose(
+            self._model(state.params), state.objective, self.windows, indices, key, self.windows.dt
+        )
+        broken = bool(not_finite(state.params))
+        if found.data:
+            state.excluded = sorted({*state.excluded, *found.data})
+            remedy = "left out from now on"
+        else:
+            state.rate_scale *= 0.5
+            remedy = f"batch skipped, rate × {state.rate_scale:g}"
+            if broken or self.bad_in_a_row > 1:
+                kept = state.rate_scale, state.excluded, state.events, state.seconds
+                state.fill(*self.snapshot)
+                state.rate_scale, state.excluded, state.events, state.seconds = kept
+                remedy += f", state of step {self.snapshot[1]['step']} restored"
+        text = f"step {number}: {found.text}; {remedy}"
+        state.events = [*state.events, {"step": number, "text": text}]
+        _log.warning(text)
+        self._give_up_if_needed(found, number)
+
+    def _give_up_if_needed(self, found: Diagnosis, number: int) -> None:
+        state = self.state
+        none_left = len(state.excluded) == len(self.windows)
+        if len(state.events) <= self.config.max_recoveries and not none_left:
+            return
+        state.step = number
+        self._checkpoint()
+        kept = (
+            "" if self.folder is None else f"; the last good state is in {self.folder.checkpoint}"
+        )
+        why = (
+            "no window has finite data"
+            if none_left
+            else f"more than {self.config.max_recoveries} bad steps, so training stopped"
+        )
+        raise TrainingError(f"step {number}: {found.text}; {why}{kept}")
+
+    def _validate(self, row: dict[str, Any]) -> bool:
+        """Keep the best parameters; tell whether patience has run out."""
+        state, config = self.state, self.config
+        due = state.step % config.validate_every == 0 or state.step == config.steps
+        if self.validation is None:
+            if state.step == config.steps:
+                state.best, state.best_step = jax.tree.map(jnp.array, state.params), state.step
+            return False
+        if not due:
+            return False
+        value = float(
+            _validation_loss(
+                self._model(state.params), state.objective, self.validation, self.config.seed
+            )
+        )
+        row["validation"] = value
+        if value < state.best_value:
+            state.best, state.best_value = jax.tree.map(jnp.array, state.params), value
+            state.best_step, state.stale = state.step, 0
+        else:
+            state.stale += 1
+        return 0 < config.patience <= state.stale
+
+    # files
+
+    def _note(self, row: dict[str, Any]) -> None:
+        row["seconds"] = round(self.state.seconds, 3)
+        if self.folder is None:
+            self.rows.append(row)
+            return
+        self.unwritten.append(row)
+        if len(self.unwritten) >= _FLUSH_EVERY:
+            self._flush()
+
+    def _flush(self) -> None:
+        if self.folder is not None:
+            self.folder.append_metrics(self.unwritten)
+            self.unwritten = []
+
+    def _checkpoint(self) -> None:
+        self._flush()
+        self.snapshot = (self.state.arrays(), self.state.plain())
+        if self.folder is not None:
+            self.folder.save(self.state, self.config, self.data_id)
+
+    # views
+
+    def _model(self, params: Any) -> Dynamics:
+        return eqx.combine(params, self.static)
+
+    def _usable(self) -> Windows:
+        return self.windows.take(np.setdiff1d(np.arange(len(self.windows)), self.state.excluded))
+
+    def _result(self, stopped: bool) -> TrainingResult:
+        state = self.state
+        if self.validation is None:
+            state.best, state.best_step = state.params, state.step
+        best = self._model(state.best)
+        if self.folder is None:
+            names = list(self.rows[0]) if self.rows else []
+            metrics = {
+                n: np.array([np.nan if r[n] == "" else r[n] for r in self.rows], float)
+                for n in names
+            }
+        else:
+            save_model(self.folder.model, best, self.metadata)
+            metrics = self.folder.read_metrics()
+        return TrainingResult(
+            model=best,
+            last=self._model(state.params),
+            steps=state.step,
+            best_step=state.best_step,
+            metrics=metrics,
+            events=tuple(state.events),
+            seconds=state.seconds,
+            stopped_early=stopped,
+        )
+
+
+@eqx.filter_jit
+def _validation_loss(model: Dynamics, objective: Objective, batch: Batch, seed: int) -> jax.Array:
+    key = jax.random.fold_in(jax.random.key(seed), np.uint32(2**32 - 1))
+    return objective.loss(model, batch, key)[0]
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
+    """Note the first Ctrl-C only, so that it can't split a step; a second one interrupts."""
+    noted: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    previous = signal.getsignal(signal.SIGINT)
+
+    def note(number: int, frame: Any) -> None:
+        noted.append(number)
+        signal.signal(signal.SIGINT, previous)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: bool(noted)
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -1,0 +1,45 @@
+"""What a training step makes small: the interface that every method of training implements.
+
+A method is a frozen dataclass of settings with `build(model, windows) -> Objective`; the settings'
+class stands in the union `losses.ObjectiveConfig`, so YAML names it by its tag.
+"""
+
+import abc
+from typing import ClassVar, NamedTuple, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..models.dynamics import Dynamics
+from .windows import Windows
+
+
+class Batch(NamedTuple):
+    """Windows as arrays on the device: poses and twists at t_0 … t_T, wrenches of the T steps."""
+
+    X: Float[Array, "N 7 W"]
+    V: Float[Array, "N 6 W"]
+    F: Float[Array, "T 6 W"]
+
+    @classmethod
+    def of(cls, windows: Windows) -> Self:
+        """All windows as one batch."""
+        return cls(jnp.asarray(windows.X), jnp.asarray(windows.V), jnp.asarray(windows.F))
+
+
+class Objective(eqx.Module):
+    """A loss with what it needs to know; its array fields are data (bandwidths), never trained."""
+
+    name: ClassVar[str]
+
+    @abc.abstractmethod
+    def loss(
+        self, model: Dynamics, batch: Batch, key: Array
+    ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+        """The mean loss over the batch and its parts by name; all randomness comes from `key`."""
+
+    def refit(self, model: Dynamics, windows: Windows) -> Self:
+        """The objective with its data-driven constants fitted anew to what `model` now misses."""
+        del model, windows
+        return self

@@ -1,0 +1,51 @@
+"""Samples of a model's conditional law for each window."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..models.dynamics import Dynamics
+from ..models.integrate import rollout
+
+
+def predict(
+    model: Dynamics,
+    X_0: Float[Array, "7 W"],
+    V_0: Float[Array, "6 W"],
+    F: Float[Array, "T 6 W"],
+    dt: float,
+    key: Array,
+    samples: int,
+    *,
+    substeps: int = 1,
+    with_path_of_drift: bool = False,
+) -> tuple[Float[Array, "T 7 P W"], Float[Array, "T 6 P W"]]:
+    """Draw `samples` motions from each window's first state and commands, at t_1 … t_T.
+
+    `with_path_of_drift` appends the noise-free motion as one more sample. Increments come from
+    `key` alone.
+    """
+    T, _, W = F.shape
+    count = samples + with_path_of_drift
+    dW = jnp.zeros((T, substeps, 6, 0, W), F.dtype)
+    if samples:
+        scale = jnp.asarray((dt / substeps) ** 0.5, F.dtype)
+        dW = scale * jax.random.normal(key, (T, substeps, 6, samples, W), F.dtype)
+    if with_path_of_drift:
+        dW = jnp.concatenate([dW, jnp.zeros((T, substeps, 6, 1, W), F.dtype)], axis=3)
+    X = jnp.broadcast_to(X_0[:, None], (7, count, W))
+    V = jnp.broadcast_to(V_0[:, None], (6, count, W))
+    return rollout(model, X, V, F[:, :, None], dt, dW)
+
+
+def predict_drift(
+    model: Dynamics,
+    X_0: Float[Array, "7 W"],
+    V_0: Float[Array, "6 W"],
+    F: Float[Array, "T 6 W"],
+    dt: float,
+    *,
+    substeps: int = 1,
+) -> tuple[Float[Array, "T 7 W"], Float[Array, "T 6 W"]]:
+    """The noise-free motion of each window at t_1 … t_T."""
+    return rollout(model, X_0, V_0, F, dt, substeps=substeps)

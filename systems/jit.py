@@ -1,0 +1,70 @@
+"""Compiled calls from Drake events: one flat NumPy vector in, one out."""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from itertools import accumulate, pairwise
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+class VectorFunction:
+    """A pure function of vectors, compiled once for its sizes and called with NumPy arrays.
+
+    All arguments travel as one float64 vector and all results as one: the cost of a call is that of
+    one conversion each way, some 10 µs, whatever the number of ports. What the function closes over
+    (parameters, configurations) becomes constants of the compiled code. Compilation happens at the
+    first call, so that building a diagram is cheap.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Array | tuple[Array, ...]],
+        inputs: Sequence[int],
+        outputs: Sequence[int],
+    ):
+        """`function` takes one vector for each of `inputs` and returns one for each of `outputs`.
+
+        Raises:
+            ValueError: if JAX runs in single precision.
+        """
+        if not jax.config.read("jax_enable_x64"):
+            raise ValueError(
+                "the systems compute in double precision: call "
+                'jax.config.update("jax_enable_x64", True) before building a diagram'
+            )
+        self._function = function
+        self._inputs = tuple(inputs)
+        self._outputs = tuple(outputs)
+        self._slices = [slice(a, b) for a, b in pairwise(accumulate(self._outputs, initial=0))]
+
+    def _packed(self, packed: Array) -> Array:
+        ends = list(accumulate(self._inputs))
+        results = self._function(*jnp.split(packed, ends[:-1]))
+        results = results if isinstance(results, tuple) else (results,)
+        sizes = tuple(result.size for result in results)
+        if sizes != self._outputs:
+            raise ValueError(f"the function returns vectors of sizes {sizes}, not {self._outputs}")
+        return jnp.concatenate([result.reshape(-1) for result in results])
+
+    @cached_property
+    def _compiled(self) -> Any:
+        size = jax.ShapeDtypeStruct((sum(self._inputs),), np.float64)
+        return jax.jit(self._packed).lower(size).compile()
+
+    def flat(self, *parts: Float[np.ndarray, "_"]) -> Float[np.ndarray, "m"]:
+        """Call with one array for each input and return all results in one (read-only) array."""
+        return np.asarray(self._compiled(np.concatenate(parts)))
+
+    def __call__(self, *parts: Float[np.ndarray, "_"]) -> list[Float[np.ndarray, "_"]]:
+        """Call with one array for each input and return one array for each output."""
+        result = self.flat(*parts)
+        return [result[part] for part in self._slices]
+
+
+def value_or_zeros(port: Any, context: Any) -> Float[np.ndarray, "n"]:
+    """Value of a vector input port, zeros while nothing is connected to it."""
+    return port.Eval(context) if port.HasValue(context) else np.zeros(port.size())

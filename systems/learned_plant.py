@@ -1,0 +1,164 @@
+"""The vehicle as a discrete-time system around any model of its dynamics."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+from pydrake.common import RandomDistribution
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from ..models import integrate
+from ..models.dynamics import Dynamics, Flow
+from .jit import VectorFunction, value_or_zeros
+
+
+class LearnedPlant(LeafSystem):
+    """Steps a `Dynamics` (physics or learned) with `substeps` Lie-group steps every `period`.
+
+    One update is `models.integrate.step` repeated: X ← X exp(h ξ), ξ ← ξ + h a + Heun noise, with
+    h = period / substeps and dW = √h · `noise`. Wrenches are held over the period; the water's
+    velocity runs on with its acceleration. `A_WB_B` is the mean rate of the components of `V_WB_B`
+    over the last period, which is what an accelerometer integrates. Unconnected inputs count as
+    zero. The state at time t is the output at t, before that time's update.
+
+    .. pydrake_system::
+
+        name: LearnedPlant
+        input_ports:
+        - F_Bo_B
+        - F_disturbance_Bo_B
+        - flow_W
+        - noise
+        output_ports:
+        - X_WB
+        - V_WB_B
+        - A_WB_B
+        - state
+
+    """
+
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        period: float = 0.01,
+        substeps: int = 2,
+        X0_WB: ArrayLike | None = None,
+        V0_WB_B: ArrayLike | None = None,
+    ):
+        """Start at pose `X0_WB` (the identity) with twist `V0_WB_B` (at rest).
+
+        Raises:
+            ValueError: `period` or `substeps` is not positive, or the start is no state.
+        """
+        super().__init__()
+        if not (np.isfinite(period) and period > 0):
+            raise ValueError(f"period is {period}: give a time above 0 s")
+        if substeps < 1:
+            raise ValueError(f"substeps is {substeps}: give at least 1")
+        self.period = period
+        self.substeps = substeps
+        X0 = np.array([1.0, 0, 0, 0, 0, 0, 0]) if X0_WB is None else X0_WB
+        X0, V0 = check_state(X0, np.zeros(6) if V0_WB_B is None else V0_WB_B)
+
+        self._F = self.DeclareVectorInputPort("F_Bo_B", 6)
+        self._F_disturbance = self.DeclareVectorInputPort("F_disturbance_Bo_B", 6)
+        self._flow = self.DeclareVectorInputPort("flow_W", 6)
+        gaussian = RandomDistribution.kGaussian
+        self._noise = self.DeclareVectorInputPort("noise", 6 * substeps, gaussian)
+        self._X = self.DeclareDiscreteState(X0)
+        self._V = self.DeclareDiscreteState(V0)
+        self._A = self.DeclareDiscreteState(6)
+        self.DeclareStateOutputPort("X_WB", self._X)
+        self.DeclareStateOutputPort("V_WB_B", self._V)
+        self.DeclareStateOutputPort("A_WB_B", self._A)
+        self.DeclareVectorOutputPort("state", 13, self._calc_state, {self.xd_ticket()})
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+        model = integrate.cast(dynamics, jnp.float64)
+        h = period / substeps
+
+        def advance(
+            X: Array,
+            V: Array,
+            F: Array,
+            F_disturbance: Array,
+            noise: Array,
+            flow: Array | None = None,
+        ) -> tuple[Array, Array, Array]:
+            start, F = V, F + F_disturbance
+            dW = h**0.5 * noise.reshape(substeps, 6)
+            for s in range(substeps):
+                water = None if flow is None else Flow(flow[:3] + s * h * flow[3:], flow[3:])
+                X, V = integrate.step(model, X, V, F, h, dW[s], water)
+            return X, V, (V - start) / period
+
+        sizes = [7, 6, 6, 6, 6 * substeps]
+        self._still = VectorFunction(advance, sizes, [7, 6, 6])
+        self._flowing = VectorFunction(advance, [*sizes, 6], [7, 6, 6])
+
+    def set_state(self, context: Context, X_WB: ArrayLike, V_WB_B: ArrayLike) -> None:
+        """Write pose and twist into this system's context.
+
+        Raises:
+            ValueError: not a state.
+        """
+        X, V = check_state(X_WB, V_WB_B)
+        context.SetDiscreteState(self._X, X)
+        context.SetDiscreteState(self._V, V)
+        context.SetDiscreteState(self._A, np.zeros(6))
+
+    def _calc_state(self, context: Context, output: BasicVector) -> None:
+        X, V = context.get_discrete_state(self._X), context.get_discrete_state(self._V)
+        output.SetFromVector(np.concatenate([X.value(), V.value()]))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        X = context.get_discrete_state(self._X).value()
+        V = context.get_discrete_state(self._V).value()
+        parts = [X, V]
+        parts += [value_or_zeros(p, context) for p in (self._F, self._F_disturbance, self._noise)]
+        if self._flow.HasValue(context):
+            parts.append(self._flow.Eval(context))
+            result = self._flowing(*parts)
+        else:
+            result = self._still(*parts)
+        if not all(np.isfinite(part.sum()) for part in result):
+            raise FloatingPointError(self._explain(context.get_time(), parts, result))
+        discrete_state.set_value(self._X, result[0])
+        discrete_state.set_value(self._V, result[1])
+        discrete_state.set_value(self._A, result[2])
+
+    def _explain(self, t: float, parts: list[np.ndarray], result: list[np.ndarray]) -> str:
+        names = ["X_WB", "V_WB_B", "F_Bo_B", "F_disturbance_Bo_B", "noise", "flow_W"]
+        told = dict(zip(names, parts, strict=False))
+        bad = [name for name, part in told.items() if not np.all(np.isfinite(part))]
+        cause = (
+            f"its {' and '.join(bad)} already was not finite"
+            if bad
+            else "the model diverged: take a smaller period, more substeps, or check the model"
+        )
+        with np.printoptions(precision=4, suppress=True):
+            return (
+                f"{self.get_name() or 'LearnedPlant'}: the state is not finite after the step from "
+                f"t = {t:.4f} s; {cause}. Before the step X_WB = {parts[0]}, V_WB_B = {parts[1]}, "
+                f"F_Bo_B = {parts[2]}; after it V_WB_B = {result[1]}."
+            )
+
+
+def check_state(
+    X_WB: ArrayLike, V_WB_B: ArrayLike
+) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6"]]:
+    """Pose with its quaternion brought to unit length, and twist.
+
+    Raises:
+        ValueError: a wrong size, a value that is not finite, or a quaternion far from unit length.
+    """
+    X, V = np.array(X_WB, float), np.array(V_WB_B, float)
+    if X.shape != (7,) or V.shape != (6,):
+        raise ValueError(f"X_WB needs 7 and V_WB_B 6 numbers; got shapes {X.shape} and {V.shape}")
+    if not (np.all(np.isfinite(X)) and np.all(np.isfinite(V))):
+        raise ValueError(f"X_WB and V_WB_B must be finite; got {X} and {V}")
+    norm = float(np.linalg.norm(X[:4]))
+    if abs(norm - 1) > 1e-3:
+        raise ValueError(f"the quaternion of X_WB has length {norm:.4g}: give one of length 1")
+    X[:4] /= norm
+    return X, V

@@ -1,0 +1,54 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pydrake.systems.framework import LeafSystem
+
+from spinndrift.systems.jit import VectorFunction, value_or_zeros
+
+
+def test_arguments_and_results_keep_their_order_and_sizes():
+    f = VectorFunction(lambda a, b: (a * 2, jnp.concatenate([b, a])), [2, 3], [2, 5])
+    a, b = np.array([1.0, 2]), np.array([3.0, 4, 5])
+    first, second = f(a, b)
+    np.testing.assert_array_equal(first, [2, 4])
+    np.testing.assert_array_equal(second, [3, 4, 5, 1, 2])
+    np.testing.assert_array_equal(f.flat(a, b), [2, 4, 3, 4, 5, 1, 2])
+    assert first.dtype == np.float64
+
+
+def test_empty_vectors_are_allowed():
+    (result,) = VectorFunction(lambda a, none: a + none.sum(), [1, 0], [1])(np.ones(1), np.zeros(0))
+    assert result == 1
+
+
+def test_a_wrong_size_of_results_is_told():
+    with pytest.raises(ValueError, match=r"\(2,\), not \(3,\)"):
+        VectorFunction(lambda a: a, [2], [3])(np.zeros(2))
+
+
+def test_nothing_is_compiled_before_the_first_call():
+    calls = []
+    f = VectorFunction(lambda a: calls.append(1) or a, [1], [1])
+    assert calls == []
+    f(np.zeros(1))
+    f(np.zeros(1))
+    assert calls == [1]
+
+
+def test_single_precision_is_refused_with_a_remedy():
+    with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
+        VectorFunction(lambda a: a, [1], [1])
+
+
+def test_an_unconnected_port_counts_as_zero():
+    class Reader(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.port = self.DeclareVectorInputPort("in", 3)
+
+    reader = Reader()
+    context = reader.CreateDefaultContext()
+    np.testing.assert_array_equal(value_or_zeros(reader.port, context), np.zeros(3))
+    reader.port.FixValue(context, [1.0, 2, 3])
+    np.testing.assert_array_equal(value_or_zeros(reader.port, context), [1, 2, 3])

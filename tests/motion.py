@@ -9,10 +9,11 @@ def smooth_motion(t, *, seed=0, speed=1.0):
     frequency = rng.uniform(0.3, 1.5, (6, 2)) * speed
     phase = rng.uniform(0, 6.3, (6, 2))
     size = np.concatenate([np.full((3, 2), 0.5), [[0.2, 0.1], [0.2, 0.1], [0.8, 0.3]]])
-    angle = frequency[..., None] * t + phase[..., None]
-    value = (size[..., None] * np.sin(angle)).sum(axis=1)
-    slope = (size[..., None] * frequency[..., None] * np.cos(angle)).sum(axis=1)
-    p, v_W = value[:3] - np.array([[0.0], [0.0], [5.0]]), slope[:3]
+    angle = np.multiply.outer(frequency, t) + np.add.outer(phase, 0 * t)
+    value = np.einsum("ij,ij...->i...", size, np.sin(angle))
+    slope = np.einsum("ij,ij...->i...", size * frequency, np.cos(angle))
+    value[2] -= 5.0
+    p, v_W = value[:3], slope[:3]
     (roll, pitch, yaw), (droll, dpitch, dyaw) = value[3:], slope[3:]
     cr, cp, cy = np.cos(roll / 2), np.cos(pitch / 2), np.cos(yaw / 2)
     sr, sp, sy = np.sin(roll / 2), np.sin(pitch / 2), np.sin(yaw / 2)

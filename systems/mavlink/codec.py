@@ -67,9 +67,7 @@ def yaw_ned_to_enu(yaw: Field) -> Values:
 # messages and DataFlash fields to SI in W and B
 
 
-def attitude(
-    q1: Field, q2: Field, q3: Field, q4: Field
-) -> Float[np.ndarray, "4 *batch"]:
+def attitude(q1: Field, q2: Field, q3: Field, q4: Field) -> Float[np.ndarray, "4 *batch"]:
     """q_WB from ATTITUDE_QUATERNION or XKQ, normalised."""
     q = quaternion_to_flu_enu(_stack(q1, q2, q3, q4))
     return q / np.linalg.norm(q, axis=0)
@@ -111,30 +109,22 @@ def euler_from_attitude(
     return np.rad2deg(rpy) if degrees else rpy
 
 
-def world_vector(
-    north: Field, east: Field, down: Field
-) -> Float[np.ndarray, "3 *batch"]:
+def world_vector(north: Field, east: Field, down: Field) -> Float[np.ndarray, "3 *batch"]:
     """Position (m) or velocity (m/s) in W from NED fields: LOCAL_POSITION_NED, XKF1."""
     return ned_to_enu(_stack(north, east, down))
 
 
-def body_vector(
-    forward: Field, right: Field, down: Field
-) -> Float[np.ndarray, "3 *batch"]:
+def body_vector(forward: Field, right: Field, down: Field) -> Float[np.ndarray, "3 *batch"]:
     """Vector in B from FRD fields in SI: rates of ATTITUDE (rad/s), IMU of DataFlash."""
     return frd_to_flu(_stack(forward, right, down))
 
 
-def imu_angular_rate(
-    xgyro: Field, ygyro: Field, zgyro: Field
-) -> Float[np.ndarray, "3 *batch"]:
+def imu_angular_rate(xgyro: Field, ygyro: Field, zgyro: Field) -> Float[np.ndarray, "3 *batch"]:
     """ω in B (rad/s) from RAW_IMU or SCALED_IMU fields (mrad/s, FRD)."""
     return body_vector(xgyro, ygyro, zgyro) * 1e-3
 
 
-def imu_specific_force(
-    xacc: Field, yacc: Field, zacc: Field
-) -> Float[np.ndarray, "3 *batch"]:
+def imu_specific_force(xacc: Field, yacc: Field, zacc: Field) -> Float[np.ndarray, "3 *batch"]:
     """Specific force in B (m/s²; +9.8 along z at rest, level) from RAW_IMU fields (mg, FRD)."""
     return body_vector(xacc, yacc, zacc) * (G * 1e-3)
 

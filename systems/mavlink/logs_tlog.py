@@ -20,6 +20,7 @@ from .log_bytes import Progress, no_progress
 from .packets import Packets, message_id, message_name, rows_of, scan
 
 _GROUND_STATION, _NO_AUTOPILOT, _SUBMARINE, _ARDUPILOT = 6, 8, 12, 3
+_CLOCKS = ("ATTITUDE", "ATTITUDE_QUATERNION", "SYSTEM_TIME")
 _REBOOT_S = 5.0
 _BETWEEN_BOOTS_S = 10.0
 _WRAP_US_S = 2**32 * 1e-6
@@ -62,7 +63,7 @@ def read_tlog(
     tables: dict[str, dict[str, np.ndarray]] = {}
     index: dict[str, np.ndarray] = {}
     broken = 0
-    names = sorted(set(wanted) | {"ATTITUDE", "HEARTBEAT"})
+    names = sorted(set(wanted) | set(_CLOCKS))
     for n, name in enumerate(names):
         candidates = np.flatnonzero(own & (packets.message == message_id(name)))
         if candidates.size:

@@ -17,6 +17,7 @@ from .log_bytes import Progress, no_progress
 
 STAMP = struct.Struct(">Q")
 _V2, _V1 = 0xFD, 0xFE
+_MAGICS = (_V2, _V1)
 _MAGIC = re.compile(rb"[\xfd\xfe]")
 _SIGNATURE = 13
 _CODES = {
@@ -75,17 +76,31 @@ def scan(data: bytes, progress: Progress = no_progress) -> Packets:
     append = rows.append
     i, size, skipped = 0, len(data), 0
     report = step = max(size // 50, 1)
-    while i + 16 <= size:
-        packet = _packet(data, i + 8, size)
-        if packet is None or not (_followed(data, packet[5], size) or _sound(data, i + 8, packet)):
-            found = _resync(data, i + 1, size)
-            if found == size and packet is None and i + 400 > size:
-                break  # the last record, cut off
-            skipped += found - i
-            i = found
-            continue
-        append((i, *packet))
-        i = packet[5]
+    while i + 20 <= size:
+        # as `_packet` does, but without a call for each of a million packets
+        magic, length, after = data[i + 8], data[i + 9], 0
+        if magic == _V2:
+            after = i + 20 + length + (_SIGNATURE if data[i + 10] & 1 else 0)
+        elif magic == _V1:
+            after = i + 16 + length
+        if 0 < after < size - 8 and data[after + 8] in _MAGICS:
+            if magic == _V2:
+                message = data[i + 15] | data[i + 16] << 8 | data[i + 17] << 16
+                append((i, i + 18, length, message, data[i + 13], data[i + 14], after))
+            else:
+                append((i, i + 14, length, data[i + 13], data[i + 11], data[i + 12], after))
+            i = after
+        else:
+            packet = _packet(data, i + 8, size)
+            if packet is not None and (packet[5] + 8 >= size or _sound(data, i + 8, packet)):
+                append((i, *packet))
+                i = packet[5]
+            else:
+                found = _resync(data, i + 1, size)
+                if found == size and packet is None and i + 400 > size:
+                    break  # the last record, cut off
+                skipped += found - i
+                i = found
         if i > report:
             report += step
             progress(0.3 + 0.4 * i / size)
@@ -102,10 +117,6 @@ def _packet(data: bytes, at: int, size: int) -> Packet | None:
     if magic == _V1 and at + 8 + length <= size:
         return (at + 6, length, data[at + 5], data[at + 3], data[at + 4], at + 8 + length)
     return None
-
-
-def _followed(data: bytes, end: int, size: int) -> bool:
-    return end + 8 >= size or data[end + 8] in (_V2, _V1)
 
 
 def _sound(data: bytes, at: int, packet: Packet) -> bool:

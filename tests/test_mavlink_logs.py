@@ -1,0 +1,552 @@
+"""Importing logs: known numbers come back, clocks and cuts are right, damage is survived."""
+
+import gzip
+import lzma
+import re
+
+import numpy as np
+import pytest
+from log_writers import (
+    EPOCH_US,
+    PARAMETERS,
+    DataFlash,
+    Tlog,
+    dataflash,
+    dive,
+    heartbeat,
+    outputs,
+    truth,
+)
+from pymavlink import DFReader, mavutil
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from helpers import ROOT, shared_data
+from spinndrift.models.errors import UserError
+from spinndrift.models.kinematics import agreement
+from spinndrift.models.resample import (
+    conjugate,
+    continuous,
+    linear,
+    multiply,
+    rotate,
+    rotation_log,
+    slerp,
+)
+from spinndrift.systems.mavlink import codec
+from spinndrift.systems.mavlink.cut_tlog import cut_tlog
+from spinndrift.systems.mavlink.log_bytes import read_log_bytes
+from spinndrift.systems.mavlink.logs import import_log, load_data
+from spinndrift.systems.mavlink.logs_bin import read_bin
+from spinndrift.systems.mavlink.logs_tlog import read_tlog
+from spinndrift.systems.mavlink.packets import scan
+
+DEMO = ROOT / "sims" / "data" / "sitl_dive.tlog.xz"
+
+
+def imported(tmp_path, data, name="dive.tlog", **options):
+    path = tmp_path / name
+    path.write_bytes(data)
+    return import_log(path, **options)
+
+
+def errors(run, dt):
+    """Rotation (rad), position (m), velocity (m/s), rates (rad/s) of a run against the truth."""
+    t = run.start + dt * np.arange(len(run))
+    X, V, _ = truth(t)
+    turn = rotation_log(multiply(conjugate(X[:4]), run.X_WB[:, :4].T))
+    return [
+        np.abs(e).max()
+        for e in (
+            turn,
+            run.X_WB[:, 4:].T - X[4:],
+            run.V_WB_B[:, :3].T - V[:3],
+            run.V_WB_B[:, 3:].T - V[3:],
+        )
+    ]
+
+
+def check_truth(recording, velocity_step=0.04, rotation_step=0.02):
+    """Within what linear interpolation between samples can give, h²/8 · max|ẍ|, and rounding."""
+    for run in recording.trajectories():
+        turn, position, velocity, rate = errors(run, recording.dt)
+        assert turn < rotation_step**2 / 8 * 2 + 1e-6
+        assert position < 1e-4
+        assert velocity < velocity_step**2 / 8 * 3 + 1e-5
+        assert rate < rotation_step**2 / 8 * 5 + 1e-5
+        t = run.start + recording.dt * np.arange(len(run))
+        middle = outputs(t + recording.dt / 2)
+        assert np.abs(run.commands["pwm"].T - middle).max() < 2.0  # µs: rounding, curvature
+
+
+# telemetry
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_telemetry_gives_back_the_motion(tmp_path, version):
+    recording, report = imported(tmp_path, dive(version=version).bytes())
+    assert recording.scenarios == ("01_MANUAL",)
+    assert recording.vehicle == "bluerov2_heavy"
+    assert recording.missing == {}
+    assert recording.duration > 18
+    check_truth(recording)
+    (run,) = recording.trajectories()
+    t = run.start + recording.dt * np.arange(len(run))
+    np.testing.assert_allclose(run.sensors["voltage"], 16.0 - 0.01 * (t - 100), atol=0.011)
+    np.testing.assert_allclose(run.sensors["pressure_depth"], -truth(t)[0][6], atol=0.01)
+    assert any("ATTITUDE_QUATERNION at 50 Hz" in line for line in report.has)
+    assert any("No DVL" in line for line in report.lacks)
+    assert "01_MANUAL: " in report.text()
+    assert recording.notes == report.notes()
+
+
+def test_a_wrapping_microsecond_counter_and_a_jumping_logger_change_nothing(tmp_path):
+    start = 4285.0  # the 32-bit µs counter wraps at 4294.967 s
+    log = dive(start=start)
+    plain, _ = imported(tmp_path, log.bytes())
+    assert len(plain.scenarios) == 1
+    check_truth(plain)
+    jumped, report = imported(tmp_path, log.bytes(lambda t: t + (3600.0 if t > start + 8 else 0.0)))
+    np.testing.assert_array_equal(jumped.dataset["pwm"].to_numpy(), plain.dataset["pwm"].to_numpy())
+    assert any("clock or link jumped" in line for line in report.done)
+
+
+def test_only_the_vehicle_is_heard(tmp_path):
+    log = dive()
+    for t in 100.0 + np.arange(0, 20, 0.01):  # others say other things, at the same times
+        ms = round(t * 1e3)
+        wrong = dialect.MAVLink_attitude_quaternion_message(ms, 1, 0, 0, 0, 9, 9, 9)
+        log.send(t, wrong, 255, 190)
+        log.send(t, wrong, 1, 100)
+    for t in 100.0 + np.arange(0, 20):
+        log.send(t, heartbeat(kind=6, autopilot=8), 255, 190)
+        log.send(t, heartbeat(mode=0, kind=30, autopilot=8), 1, 100)
+    recording, _ = imported(tmp_path, log.bytes())
+    check_truth(recording)
+    two = dive()
+    for t in 100.0 + np.arange(0, 20):
+        two.send(t, heartbeat(mode=4, kind=2), 7, 1)
+    recording, report = imported(tmp_path, two.bytes())
+    check_truth(recording)
+    assert any("Several autopilots" in line for line in report.done)
+    with pytest.raises(UserError, match="system 9: not an autopilot"):
+        imported(tmp_path, two.bytes(), system=9)
+
+
+def test_cuts_at_modes_arming_and_gaps(tmp_path):
+    def state(t):
+        mode = 19 if t < 110 else 0
+        return t < 120, mode
+
+    log = dive(duration=40, state=state, silent=lambda t: 114 <= t < 115)
+    recording, report = imported(tmp_path, log.bytes(), minimum=3.0)
+    assert recording.scenarios == ("01_MANUAL", "02_STABILIZE", "03_STABILIZE")
+    bounds = [
+        (run.start, run.start + recording.dt * (len(run) - 1)) for run in recording.trajectories()
+    ]
+    for (start, stop), (low, high) in zip(
+        bounds, [(100, 109.1), (110, 114), (115, 119.1)], strict=True
+    ):
+        assert low <= start < low + 0.2
+        assert high - 0.2 < stop <= high
+    check_truth(recording)
+    assert any("disarmed" in line for line in report.dropped)
+    assert any("1 gap of up to" in line for line in report.dropped)
+    everything, _ = imported(tmp_path, log.bytes(), disarmed=True)
+    assert everything.scenarios[-1].endswith("STABILIZE_disarmed")
+
+
+def test_resets_of_the_estimator_cut(tmp_path):
+    recording, report = imported(tmp_path, dive(jump=110.0).bytes())
+    assert len(recording.scenarios) == 2
+    assert any("position reset" in line for line in report.dropped)
+    first, second = recording.trajectories()
+    assert first.start + recording.dt * len(first) < 110 < second.start
+    assert errors(first, recording.dt)[1] < 1e-4
+    assert errors(second, recording.dt)[1] == pytest.approx(2.0, abs=1e-3)
+
+
+def test_a_reboot_starts_a_new_run(tmp_path):
+    log = dive(start=500.0, duration=12.0)
+    again = dive(start=100.0, duration=12.0)
+    later = Tlog()
+    later.records = [(t + 430.0, packed) for t, packed in again.records]
+    joined = Tlog()
+    joined.records = log.records + later.records
+    recording, report = imported(tmp_path, joined.bytes())
+    assert len(recording.scenarios) == 2
+    assert any("booted 1 more time" in line for line in report.done)
+    second = list(recording.trajectories())[1]
+    assert np.abs(second.V_WB_B[5] - truth(100.0 + 5.0)[1]).max() < 2.0  # exists, is finite
+
+
+def test_pass_through_is_a_run_of_its_own_and_keeps_the_wiring(tmp_path):
+    swapped = PARAMETERS | {"SERVO1_FUNCTION": 34.0, "SERVO2_FUNCTION": 33.0}
+    changes = [(110.0, f"SERVO{n}_FUNCTION", 50.0 + n) for n in range(1, 9)]
+    recording, _ = imported(tmp_path, dive(parameters=swapped, changes=changes).bytes())
+    assert recording.scenarios == ("01_MANUAL", "02_MANUAL_passthrough")
+    for run in recording.trajectories():
+        t = run.start + recording.dt * (np.arange(len(run)) + 0.5)
+        expected = outputs(t)[[1, 0, 2, 3, 4, 5, 6, 7]]
+        assert np.abs(run.commands["pwm"].T - expected).max() < 2.0
+
+
+def test_reversed_thrusters_are_mirrored_unless_the_vehicle_has_them_so(tmp_path):
+    reversed_ = PARAMETERS | {"MOT_3_DIRECTION": -1.0}
+    plain, _ = imported(tmp_path, dive().bytes())
+    mirrored, report = imported(tmp_path, dive(parameters=reversed_).bytes())
+    a, b = plain.dataset["pwm"].to_numpy()[0, 0].T, mirrored.dataset["pwm"].to_numpy()[0, 0].T
+    np.testing.assert_allclose(b[2], 3000 - a[2], atol=1e-6)
+    np.testing.assert_allclose(np.delete(b, 2, 0), np.delete(a, 2, 0), atol=1e-6)
+    assert any("Thrusters 3 run the other way" in line for line in report.done)
+
+
+def test_without_a_horizontal_estimate_only_the_vertical_is_kept(tmp_path):
+    recording, report = imported(tmp_path, dive(horizontal=False).bytes())
+    assert recording.missing == {"X_WB": ("x", "y"), "V_WB_B": ("u", "v")}
+    (run,) = recording.trajectories()
+    t = run.start + recording.dt * np.arange(len(run))
+    X, V, v_W = truth(t)
+    assert np.abs(run.X_WB[:, 6] - X[6]).max() < 2e-3  # mm in the message, cm/s in its slope
+    assert np.abs(run.sensors["vertical_velocity"] - v_W[2]).max() < 0.01
+    assert np.abs(run.V_WB_B[:, 3:].T - V[3:]).max() < 1e-3
+    assert any("No horizontal estimate: surge and sway" in line for line in report.lacks)
+
+
+def test_slow_outputs_are_told_to_hide_the_lag(tmp_path):
+    _, report = imported(tmp_path, dive(rates=(50.0, 4.0, 10.0)).bytes())
+    text = " ".join(report.lacks)
+    assert "Thruster outputs at 10.0 Hz: thruster lag" in text
+    assert "Position and velocity at 4.0 Hz only" in text
+
+
+def test_the_gyro_filters_delay_is_taken_off(tmp_path):
+    filtered = PARAMETERS | {"INS_GYRO_FILTER": 20.0}
+    plain, _ = imported(tmp_path, dive().bytes())
+    moved, report = imported(tmp_path, dive(parameters=filtered).bytes())
+    rates = [r.dataset["V_WB_B"].to_numpy()[0, 0, :300, 3:] for r in (plain, moved)]
+    start = next(iter(moved.trajectories())).start
+    later = truth(start + moved.dt * np.arange(300) + codec.filter_delay(20.0))[1][3:].T
+    np.testing.assert_allclose(rates[1], later, atol=1e-3)
+    assert np.abs(rates[0] - later).max() > 3e-3
+    assert any("moved back by 11 ms" in line for line in report.done)
+
+
+def test_water_density_corrects_depth(tmp_path):
+    data = dive().bytes()
+    fresh, _ = imported(tmp_path, data)
+    salt, _ = imported(tmp_path, data, water_density=1025.0)
+    ratio = 9800 / (1025.0 * codec.G)
+    for name, index in (("X_WB", np.s_[..., 6]), ("pressure_depth", np.s_[...])):
+        a, b = (r.dataset[name].to_numpy()[index] for r in (fresh, salt))
+        np.testing.assert_allclose(b, ratio * a, rtol=1e-9)
+
+
+def test_tables_are_those_of_pymavlink(tmp_path):
+    data = dive().bytes()
+    path = tmp_path / "dive.tlog"
+    path.write_bytes(data)
+    reader = mavutil.mavlink_connection(str(path))
+    theirs = {"ATTITUDE_QUATERNION": [], "SERVO_OUTPUT_RAW": [], "PARAM_VALUE": []}
+    while (message := reader.recv_match()) is not None:
+        if message.get_type() in theirs:
+            theirs[message.get_type()].append(message)
+    reader.close()
+    ours = read_tlog(data, theirs.keys())
+    for name, messages in theirs.items():
+        table = ours.tables[name]
+        assert len(messages) == table["t"].size
+        for field in messages[0].get_fieldnames():
+            values = [getattr(m, field) for m in messages]
+            if isinstance(values[0], str):
+                values = [v.encode() for v in values]
+            assert np.array_equal(table[field], np.array(values, table[field].dtype))
+    packets = scan(data)
+    assert packets.stamps(data).min() == pytest.approx(EPOCH_US * 1e-6 + 100, abs=0.1)
+
+
+# DataFlash
+
+
+def test_dataflash_gives_back_the_motion(tmp_path):
+    recording, report = imported(tmp_path, dataflash().bytes(), "dive.BIN")
+    assert recording.scenarios == ("01_MANUAL",)
+    assert recording.duration > 19
+    for run in recording.trajectories():
+        turn, position, velocity, rate = errors(run, recording.dt)
+        assert turn < 0.02**2 / 8 * 2 + 1e-6
+        assert position < 1e-4
+        assert velocity < 0.02**2 / 8 * 3 + 1e-5
+        assert rate < 1e-4  # bias logged in hundredths of a degree per second
+        np.testing.assert_allclose(run.sensors["imu_specific_force"][:, 2], codec.G, rtol=1e-6)
+    assert any("XKQ at 50 Hz" in line for line in report.has)
+
+
+def test_dataflash_states(tmp_path):
+    recording, report = imported(tmp_path, dataflash(disarm=112.0).bytes(), "dive.bin")
+    (run,) = recording.trajectories()
+    assert run.start + recording.dt * len(run) == pytest.approx(112.0, abs=0.1)
+    (idle,) = (re.match(r"(\S+) s disarmed", line) for line in report.dropped if "armed" in line)
+    assert idle is not None
+    assert float(idle[1]) == pytest.approx(8.0, abs=0.1)
+    unaided, report = imported(tmp_path, dataflash(aided=False).bytes(), "dive.bin")
+    assert unaided.missing == {"X_WB": ("x", "y"), "V_WB_B": ("u", "v")}
+
+
+def test_dataflash_writer_and_reader_agree_with_pymavlink(tmp_path):
+    data = dataflash(duration=1.0).bytes()
+    path = tmp_path / "dive.bin"
+    path.write_bytes(data)
+    tables = read_bin(data, ("XKF1", "PARM", "RCOU")).tables
+    reader = DFReader.DFReader_binary(str(path), zero_time_base=True)
+    seen = dict.fromkeys(tables, 0)
+    while (message := reader.recv_match(type=list(tables))) is not None:
+        name = message.get_type()
+        for column in message.get_fieldnames():
+            ours = tables[name][column][seen[name]]
+            theirs = getattr(message, column)
+            if isinstance(ours, bytes):
+                assert ours.decode() == theirs
+            else:
+                assert ours == pytest.approx(theirs, rel=1e-12)
+        seen[name] += 1
+    reader.close()
+    assert seen == {name: table["t"].size for name, table in tables.items()}
+
+
+# files that are not what they should be
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        ("a.tlog", b"", "the file is empty"),
+        ("a.BIN", b"hello, this is no log at all", "neither MAVLink nor DataFlash"),
+        ("a.tlog", b"t,x,y\n1,2,3\n" * 9, "neither MAVLink nor DataFlash"),
+        ("a.log", b"FMT, 128, 89, FMT, BBnNZ, Type,Length", "a text log"),
+        ("a.tlog.xz", lzma.compress(b"x" * 999)[:20], "broken from its start"),
+        ("a.BIN.gz", b"\x1f\x8b" + b"\0" * 30, "broken from its start"),
+        ("a.BIN", DataFlash().bytes(), "no attitude"),
+        ("a.tlog", b"\0" * 8 + b"\xfd" + b"\0" * 60, "no autopilot speaks"),
+    ],
+)
+def test_wrong_files_are_told_in_one_sentence(tmp_path, name, content, sentence):
+    with pytest.raises(UserError, match=sentence) as caught:
+        imported(tmp_path, content, name)
+    assert name in str(caught.value)
+
+
+def test_missing_files_and_folders_and_options(tmp_path):
+    with pytest.raises(UserError, match="no such file"):
+        import_log(tmp_path / "none.tlog")
+    with pytest.raises(UserError, match="is a folder"):
+        import_log(tmp_path)
+    for option in ({"rate": 0.0}, {"minimum": -1.0}, {"water_density": 1.0}):
+        with pytest.raises(UserError, match="must lie between"):
+            imported(tmp_path, b"x", **option)
+    with pytest.raises(UserError, match="no stretch of 60 s"):
+        imported(tmp_path, dive(duration=8).bytes(), minimum=60.0)
+
+
+@pytest.mark.parametrize("kind", ["tlog", "bin"])
+def test_logs_cut_off_anywhere_give_what_is_there_or_one_sentence(tmp_path, kind):
+    data = (dive(duration=9) if kind == "tlog" else dataflash(duration=8)).bytes()
+    for part in np.linspace(0.001, 0.999, 17):
+        try:
+            recording, _ = imported(tmp_path, data[: int(part * len(data))], f"a.{kind}")
+        except UserError:
+            assert part < 0.95
+        else:
+            assert recording.duration < 9 * part
+
+
+@pytest.mark.parametrize("kind", ["tlog", "bin"])
+def test_damaged_logs_lose_only_what_is_damaged(tmp_path, kind):
+    data = bytearray((dive() if kind == "tlog" else dataflash()).bytes())
+    rng = np.random.default_rng(0)
+    for at in rng.integers(2000, len(data) - 100, 12).tolist():
+        data[at : at + 40] = rng.integers(0, 256, 40).astype(np.uint8).tobytes()
+    recording, report = imported(tmp_path, bytes(data), f"a.{kind}", minimum=2.0)
+    assert recording.duration > 12
+    if kind == "tlog":  # checksums: nothing wrong gets through
+        assert any("skipped" in line or "checksum" in line for line in report.done)
+        for run in recording.trajectories():
+            assert max(errors(run, recording.dt)) < 0.01
+
+
+def test_compressed_logs_and_cut_off_ones(tmp_path):
+    data = dive().bytes()
+    for suffix, compress in ((".xz", lzma.compress), (".gz", gzip.compress)):
+        packed = compress(data)
+        recording, _ = imported(tmp_path, packed, f"a.tlog{suffix}")
+        assert recording.duration > 18
+        partly, report = imported(
+            tmp_path, packed[: len(packed) * 3 // 4], f"b.tlog{suffix}", minimum=1.0
+        )
+        assert 0 < partly.duration < recording.duration
+        assert any("cut off" in line for line in report.dropped)
+
+
+def test_progress_runs_from_zero_to_one(tmp_path):
+    told = []
+    path = tmp_path / "a.tlog.xz"
+    path.write_bytes(lzma.compress(dive().bytes()))
+    import_log(path, progress=told.append)
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
+def test_load_data_takes_everything(tmp_path):
+    log = tmp_path / "dive.tlog"
+    log.write_bytes(dive().bytes())
+    recording = load_data(log)
+    recording.save(tmp_path / "dive.nc")
+    again = load_data(tmp_path / "dive.nc", vehicle="bluerov2_wu")
+    assert again.vehicle == "bluerov2_wu"
+    assert again.scenarios == recording.scenarios
+    with pytest.raises(UserError, match="recorded at 20 Hz, not 50"):
+        load_data(tmp_path / "dive.nc", rate=50.0)
+    (tmp_path / "a.csv").write_text("t\n")
+    with pytest.raises(UserError, match="give its folder"):
+        load_data(tmp_path / "a.csv")
+    with pytest.raises(UserError, match=r"no recording\.yaml"):
+        load_data(tmp_path)
+
+
+# the demo log and real ones
+
+
+@pytest.fixture(scope="module")
+def demo():
+    return import_log(DEMO, vehicle="ardusub_sitl")
+
+
+@pytest.mark.smoke
+def test_the_demo_log_has_what_its_readme_says(demo):
+    recording, _ = demo
+    assert DEMO.stat().st_size <= 1_000_000
+    assert recording.scenarios == ("01_MANUAL", "02_MANUAL_passthrough")
+    assert np.all(recording.lengths * recording.dt > 85)
+    assert recording.missing == {}
+    data = read_log_bytes(DEMO).data
+    log = read_tlog(data, ("SERVO_OUTPUT_RAW", "PARAM_VALUE"))
+    assert not [name for name, _, _ in log.heard if name in ("SIM_STATE", "SIMSTATE")]
+    names = set(log.tables["PARAM_VALUE"]["param_id"].tolist())
+    assert {b"MOT_1_DIRECTION", b"SERVO8_FUNCTION", b"INS_GYRO_FILTER"} <= names
+    for run in recording.trajectories():
+        t = recording.dt * np.arange(len(run))
+        for part in agreement(t, run.X_WB.T, run.V_WB_B.T):
+            assert part.explained > 0.998
+            assert part.slope == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_demo_log_obeys_the_simulated_vehicles_laws(demo):
+    """Force, drag and restoring by least squares on differences: within 3 % of the known constants.
+
+    The inertia is left out: differences over 50 ms of so light a body are no fit for it.
+    """
+    recording, _ = demo
+    F = recording.wrench().to_numpy()
+    masses = []
+    for j, run in enumerate(recording.trajectories()):
+        n = len(run)
+        V, q = run.V_WB_B.T, continuous(run.X_WB[:, :4].T)
+        middle = q[:, 1:] + q[:, :-1]
+        middle /= np.linalg.norm(middle, axis=0)
+        v_W = rotate(q, V[:3])
+        acceleration = rotate(conjugate(middle), np.diff(v_W, axis=1) / recording.dt)
+        mean = 0.5 * (V[:, 1:] + V[:, :-1])
+        up = rotate(conjugate(middle), np.tile([[0.0], [0.0], [1.0]], n - 1))
+        drag = (48.28, 62.08, 68.98)
+        for i in range(3):
+            columns = np.stack([F[j, 0, : n - 1, i], -mean[i] * np.abs(mean[i]), up[i]], axis=1)
+            c, *_ = np.linalg.lstsq(columns, acceleration[i], rcond=None)
+            masses.append(1 / c[0])
+            assert c[1] / c[0] == pytest.approx(drag[i], rel=0.03)
+        angular = np.diff(V[3:], axis=1) / recording.dt
+        for i, lever in ((0, -up[1]), (1, up[0])):
+            columns = np.stack(
+                [F[j, 0, : n - 1, 3 + i], -mean[3 + i] * np.abs(mean[3 + i]), lever], 1
+            )
+            c, *_ = np.linalg.lstsq(columns, angular[i], rcond=None)
+            assert c[1] / c[0] == pytest.approx(7.076, rel=0.03)
+            assert c[2] / c[0] == pytest.approx(6.0, rel=0.03)
+    assert masses == pytest.approx([10.5] * 6, rel=0.03)
+
+
+def test_the_cutter_keeps_whole_packets(tmp_path):
+    data = dive(duration=30.0).bytes()
+    for t in (100.0,):
+        log = dive(duration=30.0)
+        for k in range(300):
+            log.send(
+                t + 0.1 * k,
+                dialect.MAVLink_attitude_message(round(1e3 * (t + 0.1 * k)), *[0.0] * 6),
+            )
+        data = log.bytes()
+    cut = cut_tlog(data, [(105.0, 115.0)], {"SERVO_OUTPUT_RAW": 25.0}, always=("HEARTBEAT",))
+    packets = scan(cut)
+    assert packets.skipped == 0
+    assert np.count_nonzero(packets.message == 36) == 250
+    assert np.count_nonzero(packets.message == 0) == 30
+    for i in range(packets.record.size):
+        assert cut[packets.record[i] : packets.end[i]] in data
+    with pytest.raises(UserError, match="none of"):
+        cut_tlog(data, [(500.0, 600.0)])
+
+
+def against(recording, t_q, q, t_v, v_W):
+    """Median attitude error (°) and rms velocity error (m/s) against a truth in W."""
+    turns, misses = [], []
+    for run in recording.trajectories():
+        t = run.start + recording.dt * np.arange(len(run))
+        true = slerp(t, t_q, continuous(q))
+        turns.append(rotation_log(multiply(conjugate(true), run.X_WB[:, :4].T)))
+        v_B = rotate(conjugate(true), linear(t, t_v, v_W))
+        misses.append(run.V_WB_B[:, :3].T - v_B)
+    angle = np.rad2deg(np.linalg.norm(np.concatenate(turns, axis=1), axis=0))
+    return float(np.median(angle)), float(np.sqrt(np.mean(np.concatenate(misses, axis=1) ** 2)))
+
+
+def test_the_whole_dive_agrees_with_the_simulators_truth():
+    path = shared_data("data", "sitl_log", "dive.tlog")
+    recording, _ = import_log(path, vehicle="ardusub_sitl")
+    assert [name[3:] for name in recording.scenarios] == [
+        "MANUAL",
+        "MANUAL_passthrough",
+        "STABILIZE",
+        "ALT_HOLD",
+    ]
+    truth_ = read_tlog(path.read_bytes(), ("SIM_STATE",)).tables["SIM_STATE"]
+    new = np.concatenate([[True], np.diff(truth_["t"]) > 1e-6])
+    s = {name: values[new] for name, values in truth_.items()}
+    q = codec.attitude(s["q1"], s["q2"], s["q3"], s["q4"])
+    angle, miss = against(
+        recording, s["t"], q, s["t"], codec.world_vector(s["vn"], s["ve"], s["vd"])
+    )
+    assert angle < 0.6
+    assert miss < 0.012
+
+
+def test_the_autopilots_own_log_agrees_with_the_simulators_truth():
+    path = shared_data("data", "sitl_log", "dive.BIN.xz")
+    recording, report = import_log(path, vehicle="ardusub_sitl")
+    assert len(recording.scenarios) == 4
+    tables = read_bin(read_log_bytes(path).data, ("SIM", "SIM2")).tables
+    a, b = tables["SIM"], tables["SIM2"]
+    q = codec.attitude(a["Q1"], a["Q2"], a["Q3"], a["Q4"])
+    angle, miss = against(
+        recording, a["t"], q, b["t"], codec.world_vector(b["VN"], b["VE"], b["VD"])
+    )
+    assert angle < 0.6
+    assert miss < 0.012
+    assert any("Thruster outputs at 10.0 Hz" in line for line in report.lacks)
+
+
+@pytest.mark.parametrize("name", ["small.tlog", "small.BIN"])
+def test_logs_of_a_real_vehicle_on_the_bench(name):
+    recording, report = import_log(shared_data("data", "ardusub_logs", name))
+    assert recording.scenarios == ("01_MANUAL",)
+    assert any("run the other way" in line for line in report.done)
+    assert any("Hardly any motion" in line for line in report.lacks)
+    if name == "small.BIN":
+        assert recording.missing == {"X_WB": ("x", "y"), "V_WB_B": ("u", "v")}

@@ -1,0 +1,94 @@
+"""What the figures of all reports share: colours, type, axes."""
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+P = ParamSpec("P")
+
+FLOWN, PLANNED, ESTIMATE = "#14607a", "#d9772b", "#7b5ea7"
+OBSTACLE, GOAL, LIMIT, WATER = "#8b96a1", "#2e8b57", "#b0413e", "#3d8fc4"
+INK, QUIET, GRID = "#1c2733", "#5b6b7a", "#e6ebef"
+AXES = ("#c4473a", "#3b8a4a", "#2f6fb5")  # x, y, z
+WIDTH = 9.6  # in: the width of a page's text
+
+_STYLE = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": "#c4ced6",
+    "axes.grid": True,
+    "axes.labelcolor": QUIET,
+    "axes.labelsize": 9,
+    "axes.linewidth": 0.8,
+    "axes.prop_cycle": matplotlib.cycler(color=[FLOWN, PLANNED, ESTIMATE, GOAL, LIMIT, WATER]),
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlecolor": INK,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10,
+    "figure.facecolor": "white",
+    "font.size": 9,
+    "grid.color": GRID,
+    "grid.linewidth": 0.8,
+    "legend.fontsize": 8.5,
+    "legend.frameon": False,
+    "lines.linewidth": 1.4,
+    "text.color": INK,
+    "xtick.color": "#c4ced6",
+    "xtick.labelcolor": QUIET,
+    "xtick.labelsize": 8.5,
+    "ytick.color": "#c4ced6",
+    "ytick.labelcolor": QUIET,
+    "ytick.labelsize": 8.5,
+}
+
+
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Draw a figure in the reports' style, leaving matplotlib's settings as they were."""
+
+    @wraps(draw)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        with matplotlib.rc_context(_STYLE):
+            return draw(*args, **kwargs)
+
+    return wrapper
+
+
+def panels(rows: int, columns: int, height: float, **options: Any) -> tuple[Figure, np.ndarray]:
+    """A figure of the page's width with an array (rows, columns) of axes."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    return figure, axes
+
+
+def lines(
+    axes: Axes, t: np.ndarray, values: np.ndarray, labels: tuple[str, ...], **options: Any
+) -> None:
+    """One line for each column."""
+    for column, label, color in zip(values.T, labels, AXES, strict=False):
+        axes.plot(t, column, label=label, color=color, **options)
+
+
+def at_least(axes: Axes, half: float) -> None:
+    """Let the vertical axis span ± `half` at least, so that small noise looks small."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, -half), max(high, half))
+
+
+def legend(axes: Axes, **options: Any) -> None:
+    """A legend in one row above the axes, at the right, where it hides nothing."""
+    handles, _ = axes.get_legend_handles_labels()
+    settings = {
+        "loc": "lower right",
+        "bbox_to_anchor": (1.0, 1.0),
+        "ncols": len(handles),
+        "borderaxespad": 0.2,
+        "columnspacing": 1.2,
+        "handlelength": 1.4,
+    }
+    if handles:
+        axes.legend(**(settings | options))

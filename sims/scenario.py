@@ -1,0 +1,169 @@
+"""Scenarios: all that decides a run, in one YAML file."""
+
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..models import config
+from ..models.checks import check_numbers, require
+from ..models.errors import UserError
+from ..models.yaml_text import Tagged, emit, parse
+from ..systems.controllers import ControllerKind, MppiImpedance
+from ..systems.station_config import StationConfig
+from .criteria import FollowPath, ReachGoal, Safety
+
+_FOLDER = Path(__file__).with_name("scenarios")
+_TEXT = "--scenario-text"
+
+
+@dataclass(frozen=True)
+class LogSettings:
+    """What a run's log holds.
+
+    Attributes:
+        rate: samples per second; its period is a multiple of the station's.
+        samples: keep what the planner sampled, for pictures (a few MB a minute).
+    """
+
+    rate: float = 20.0
+    samples: bool = True
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        check_numbers(self)
+        require(self.rate > 0, self, "rate", "give a number above zero")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A run: who is where in which water, who steers, what counts as success.
+
+    Attributes:
+        name: of the run's folder.
+        description: a sentence for the report.
+        duration: the run ends at this time at the latest (s).
+        station: vehicle, water, obstacles, sensors, start, seed.
+        controller: who steers.
+        success: what counts as success.
+        safety: what ends any run.
+        log: what is kept.
+    """
+
+    name: str
+    controller: ControllerKind
+    success: ReachGoal | FollowPath
+    description: str = ""
+    duration: float = 60.0
+    station: StationConfig = field(default_factory=StationConfig)
+    safety: Safety = field(default_factory=Safety)
+    log: LogSettings = field(default_factory=LogSettings)
+
+    def __post_init__(self) -> None:
+        """Check what belongs together."""
+        check_numbers(self)
+        word = re.fullmatch(r"[A-Za-z0-9][\w.-]*", self.name)
+        require(word is not None, self, "name", "give one word of letters, digits, _ . -")
+        require(self.duration > 0, self, "duration", "give a time above zero")
+        steps = 1 / (self.log.rate * self.station.period)
+        require(
+            abs(steps - round(steps)) < 1e-6 and round(steps) >= 1,
+            self.log,
+            "rate",
+            f"give a rate whose period is a multiple of {self.station.period:g} s",
+        )
+        if isinstance(self.success, ReachGoal) and self.goal is None:
+            raise UserError("Scenario.success: ReachGoal needs `goal`: [x, y, z] in m")
+
+    @property
+    def seed(self) -> int:
+        """The seed of everything random."""
+        return self.station.seed
+
+    @property
+    def goal(self) -> Float[np.ndarray, "3"] | None:
+        """Where to go (m, W), None where there is no goal."""
+        if isinstance(self.success, ReachGoal) and self.success.goal is not None:
+            return np.array(self.success.goal)
+        goal = getattr(self.controller, "goal", None)
+        return None if goal is None else np.array(goal.position)
+
+    def with_changes(
+        self, seed: int | None = None, duration: float | None = None, model: Path | None = None
+    ) -> "Scenario":
+        """The same scenario with another seed, duration or model to plan with.
+
+        Raises:
+            UserError: a model is given, and the controller plans with none.
+        """
+        changed = self
+        if seed is not None:
+            changed = replace(changed, station=replace(changed.station, seed=seed))
+        if duration is not None:
+            changed = replace(changed, duration=duration)
+        if model is not None:
+            if not isinstance(changed.controller, MppiImpedance):
+                raise UserError(
+                    f"--model: {self.name} is steered by {type(self.controller).__name__}, which "
+                    "does not plan with a model; choose a scenario with MppiImpedance"
+                )
+            changed = replace(changed, controller=replace(changed.controller, model=model))
+        return changed
+
+
+def scenario_names() -> tuple[str, ...]:
+    """Names of the scenarios that are shipped."""
+    return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
+
+
+def load_scenario(name_or_path: str | Path, text: str = "") -> Scenario:
+    """Read a shipped scenario by its name, or a YAML file by its path (anything with a suffix).
+
+    `text` is YAML laid over the file: mappings merge key by key, anything else replaces, and a
+    value with another `!Tag` than the file's replaces the whole of it.
+
+    Raises:
+        UserError: there is no such scenario, or it is none, or it is none with `text`.
+    """
+    path = Path(name_or_path)
+    if not path.suffix:
+        if str(name_or_path) not in scenario_names():
+            raise UserError(
+                f"scenario `{name_or_path}` is none of those shipped; take one of "
+                f"{', '.join(scenario_names())}, or the path of a .yaml file"
+            )
+        path = _FOLDER / f"{name_or_path}.yaml"
+    scenario = config.load(Scenario, path)
+    return overridden(path.read_text(encoding="utf-8"), text) if text.strip() else scenario
+
+
+def overridden(base: str, text: str) -> Scenario:
+    """The scenario of YAML text `base` with YAML `text` laid over it.
+
+    Raises:
+        UserError: the two together are no scenario.
+    """
+    below, _ = parse(base, "scenario")
+    above, _ = parse(text, _TEXT)
+    if not isinstance(above, dict):
+        raise UserError(f"{_TEXT}: give a mapping, such as 'duration: 5'")
+    try:
+        return config.loads(Scenario, emit(_merged(below, above)), _TEXT)
+    except UserError as error:  # lines of the merged text are of no use to anyone
+        message = re.sub(rf"^{_TEXT}:\d+: ", f"{_TEXT}: ", str(error), flags=re.MULTILINE)
+        raise UserError(message) from error
+
+
+def _merged(below: Any, above: Any) -> Any:
+    if isinstance(above, Tagged):
+        if isinstance(below, Tagged) and below.tag == above.tag:
+            return Tagged(above.tag, _merged(below.value, above.value))
+        return above
+    if isinstance(below, Tagged) and isinstance(above, dict):
+        return Tagged(below.tag, _merged(below.value, above))
+    if isinstance(below, dict) and isinstance(above, dict):
+        return below | {key: _merged(below.get(key), value) for key, value in above.items()}
+    return above

@@ -1,0 +1,152 @@
+"""The state estimator as a system; the filter itself is in `systems.filtering`."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+from numpy.typing import ArrayLike
+from pydrake.common import RandomDistribution
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from ..models import se3
+from ..models.sensors import Compass, DepthSensor, Dvl, Imu
+from .filtering.delayed import SLOT, STATUS, DelayedFilter, EkfConfig, FilterState, Readings
+from .filtering.error_state import ERRORS
+from .jit import VectorFunction, value_or_zeros
+from .learned_plant import check_state
+
+
+class Ekf(LeafSystem):
+    """Error-state Kalman filter on SE(3), driven by the IMU, at a delayed horizon.
+
+    At every IMU period it takes in the sample shown, which is that of one period ago, and fuses
+    DVL, depth and compass `config.horizon` in the past in the order of their times of validity
+    (`systems.filtering.delayed`). At `config.output_rate` it brings the estimate to the present
+    with the samples that wait. The error's order and frame are those of
+    `systems.filtering.error_state`: `covariance` is the 18 × 18 matrix by rows, whose first six
+    rows and columns belong to [δp, δθ] in body axes. Horizontal position is dead reckoning: its
+    variance grows. `status` has the components `STATUS`.
+
+    The estimate starts at the given pose and twist. With `initial_noise` connected (a simulation)
+    it starts with an error drawn from `config`'s standard deviations: δp, δθ, δv.
+
+    .. pydrake_system::
+
+        name: Ekf
+        input_ports:
+        - imu
+        - dvl
+        - depth
+        - compass
+        - initial_noise
+        output_ports:
+        - X_WB
+        - V_WB_B
+        - covariance
+        - status
+
+    """
+
+    def __init__(
+        self,
+        imu: Imu | None = None,
+        dvl: Dvl | None = None,
+        depth: DepthSensor | None = None,
+        compass: Compass | None = None,
+        config: EkfConfig | None = None,
+        X0_WB: ArrayLike | None = None,
+        V0_WB_B: ArrayLike | None = None,
+    ):
+        """Expect the given sensors (their defaults if left out) and start at `X0_WB`, `V0_WB_B`.
+
+        Raises:
+            ValueError: the start is no state, or the output rate is no divisor of the IMU's rate.
+            UserError: the horizon is shorter than the DVL's latency.
+        """
+        super().__init__()
+        config = config or EkfConfig()
+        core = DelayedFilter(
+            imu or Imu(), dvl or Dvl(), depth or DepthSensor(), compass or Compass(), config
+        )
+        ratio = core.imu.rate / config.output_rate
+        if abs(ratio - round(ratio)) > 1e-6 or ratio < 1 - 1e-6:
+            raise ValueError(
+                f"output_rate {config.output_rate} Hz does not divide the IMU's {core.imu.rate} Hz"
+            )
+        self.filter = core
+        X0 = np.array([1.0, 0, 0, 0, 0, 0, 0]) if X0_WB is None else X0_WB
+        X0, V0 = check_state(X0, np.zeros(6) if V0_WB_B is None else V0_WB_B)
+
+        sizes = {"imu": 6, "dvl": 7, "depth": 3, "compass": 3}
+        self._readings = [self.DeclareVectorInputPort(*item) for item in sizes.items()]
+        gaussian = RandomDistribution.kGaussian
+        self._initial_noise = self.DeclareVectorInputPort("initial_noise", 9, gaussian)
+
+        start, unravel = ravel_pytree(core.init(jnp.asarray(X0), jnp.asarray(V0)))
+        n = start.size
+        outputs = {"X_WB": 7, "V_WB_B": 6, "covariance": ERRORS**2, "status": len(STATUS)}
+        self._filter = self.DeclareDiscreteState(np.asarray(start))
+        self._outputs = [self.DeclareDiscreteState(size) for size in outputs.values()]
+        for name, index in zip(outputs, self._outputs, strict=True):
+            self.DeclareStateOutputPort(name, index)
+        self.DeclareInitializationDiscreteUpdateEvent(self._initialise)
+        self.DeclarePeriodicDiscreteUpdateEvent(core.period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(1 / config.output_rate, 0.0, self._put_out)
+
+        def initialise(w: Array) -> tuple[Array, ...]:
+            error = core.deviations()[:9] * w
+            X = se3.retract(jnp.asarray(X0), error[:6])
+            V = jnp.asarray(V0) + jnp.concatenate([error[6:], jnp.zeros(3, w.dtype)])
+            state = core.init(X, V)
+            return ravel_pytree(state)[0], *show(state, jnp.zeros((), w.dtype))
+
+        def advance(
+            flat: Array, imu: Array, dvl: Array, depth: Array, compass: Array, k: Array
+        ) -> tuple[Array, Array, Array]:
+            readings = Readings(imu, jnp.concatenate([dvl[:4], dvl[6:]]), depth, compass)
+            state, slot, due = core.advance(unravel(flat), readings, k[0])
+            return ravel_pytree(state)[0], slot, due.astype(flat.dtype)
+
+        def fuse(flat: Array, slot: Array, k: Array) -> Array:
+            return ravel_pytree(core.fuse(unravel(flat), slot, k[0]))[0]
+
+        def show(state: FilterState, t: Array) -> tuple[Array, Array, Array, Array]:
+            # The newest sample that the previous update took in is two periods old.
+            X, V, P = core.present(state, jnp.minimum(t, 2 * core.period))
+            k = jnp.round(t / core.period) - 2
+            return X, V, P.reshape(-1), core.status(state, k)
+
+        results = list(outputs.values())
+        self._start = VectorFunction(initialise, [9], [n, *results])
+        # Two calls, as XLA runs small programs in line and larger ones on its pool of threads: the
+        # first is small and frequent, the second is needed for some samples only.
+        self._advance = VectorFunction(advance, [n, *sizes.values(), 1], [n, SLOT, 1])
+        self._fuse = VectorFunction(fuse, [n, SLOT, 1], [n])
+        self._show = VectorFunction(lambda x, t: show(unravel(x), t[0]), [n, 1], results)
+
+    def filter_state(self, context: Context) -> FilterState:
+        """The filter's state at its horizon, for inspection."""
+        core = self.filter
+        like = core.init(jnp.zeros(7), jnp.zeros(6))
+        return ravel_pytree(like)[1](jnp.asarray(context.get_discrete_state(self._filter).value()))
+
+    def _initialise(self, context: Context, discrete_state: DiscreteValues) -> None:
+        results = self._start(value_or_zeros(self._initial_noise, context))
+        for index, value in zip([self._filter, *self._outputs], results, strict=True):
+            discrete_state.set_value(index, value)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        readings = [value_or_zeros(port, context) for port in self._readings]
+        state = context.get_discrete_state(self._filter).value()
+        # What is shown was sampled one period ago.
+        k = np.array([round(context.get_time() / self.filter.period) - 1.0])
+        state, slot, due = self._advance(state, *readings, k)
+        if due[0] > 0:
+            state = self._fuse.flat(state, slot, k)
+        discrete_state.set_value(self._filter, state)
+
+    def _put_out(self, context: Context, discrete_state: DiscreteValues) -> None:
+        state = context.get_discrete_state(self._filter).value()
+        results = self._show(state, np.array([context.get_time()]))
+        for index, value in zip(self._outputs, results, strict=True):
+            discrete_state.set_value(index, value)

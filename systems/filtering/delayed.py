@@ -1,0 +1,311 @@
+"""An error-state Kalman filter at a delayed horizon, so that late measurements need no tricks.
+
+A DVL's reading arrives 0.1 to 0.2 s after its time of validity. The filter therefore stands
+`horizon` seconds in the past: inertial samples and readings wait in a ring of slots, one for each
+inertial sample, and a reading goes to the slot of its own time, whenever it arrives. When a slot
+leaves the ring the filter predicts over its sample and fuses its readings, all in their true
+order: the estimate is that of an ordinary Kalman filter without delays. The present follows by
+applying the waiting samples' preintegrated increment (Khosravian et al. 2015 give this predictor).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+from scipy.stats import chi2
+
+from ...models import se3
+from ...models.checks import Vector3, check_numbers, require
+from ...models.sensors import Compass, DepthSensor, Dvl, Imu
+from ...models.sensors.base import velocity_at
+from . import error_state, measurement
+from .error_state import ERRORS, Navigation
+
+SLOT = 15  # has sample, force 3, rate 3 | has dvl, v 3 | has depth, depth | has compass, yaw
+_DVL, _DEPTH, _COMPASS = 7, 11, 13
+_LONGEST = 0.1  # s that the covariance waits at most for a reading
+
+STATUS = (
+    "time",
+    "nis_dvl",
+    "nis_depth",
+    "nis_compass",
+    "rejected_dvl",
+    "rejected_depth",
+    "rejected_compass",
+    "age_dvl",
+    "age_depth",
+    "age_compass",
+)
+"""Components of the status vector: time of the horizon (s), last NIS of each sensor, rejections in
+a row, and time since a reading was last accepted (s)."""
+
+
+@dataclass(frozen=True)
+class EkfConfig:
+    """Alignment and gates of the filter; the sensors' own configurations give their noises.
+
+    Attributes:
+        position_std: of the initial position in body axes (m).
+        attitude_std: of the initial attitude about the body axes (rad).
+        velocity_std: of the initial velocity in body axes (m/s).
+        horizon: how long readings may take to arrive (s).
+        gate: share of good readings that pass the chi-square gate.
+        patience: after so many rejections in a row a sensor's next reading is taken all the same,
+            lest a filter that lost its way shuts its sensors out for good.
+        output_rate: estimates per second (Hz).
+    """
+
+    position_std: Vector3 = (0.02, 0.02, 0.02)
+    attitude_std: Vector3 = (0.01, 0.01, 0.03)
+    velocity_std: Vector3 = (0.02, 0.02, 0.02)
+    horizon: float = 0.25
+    gate: float = 0.999
+    patience: int = 10
+    output_rate: float = 20.0
+
+    def __post_init__(self) -> None:
+        """Check signs and ranges."""
+        check_numbers(self)
+        for field in ("position_std", "attitude_std", "velocity_std"):
+            require(min(getattr(self, field)) >= 0, self, field, "give zero or more")
+        for field in ("horizon", "output_rate"):
+            require(getattr(self, field) > 0, self, field, "give a number above zero")
+        require(0 < self.gate < 1, self, "gate", "give a share between 0 and 1")
+        require(self.patience >= 1, self, "patience", "give at least 1")
+
+
+class FilterState(NamedTuple):
+    """Everything that changes."""
+
+    nominal: Navigation
+    P: Float[Array, "18 18"]
+    ring: Float[Array, "slots 15"]
+    since: Float[Array, "10"]
+    """Since P's time: the time, sums of force · dt and rate · dt, and v_B at its beginning."""
+    rate: Float[Array, "3"]
+    """Newest angular rate (rad/s) in body axes, its bias still in it."""
+    nis: Float[Array, "3"]
+    rejected: Float[Array, "3"]
+    accepted_at: Float[Array, "3"]
+
+
+class Readings(NamedTuple):
+    """What the sensors show at one time; a reading's time tells which slot it belongs to."""
+
+    imu: Float[Array, "6"]
+    """Specific force (m/s²) and angular rate (rad/s) in the sensor's axes."""
+    dvl: Float[Array, "5"]
+    """Velocity (m/s) in the sensor's axes, valid, time of validity (s)."""
+    depth: Float[Array, "3"]
+    """Depth (m), valid, time (s)."""
+    compass: Float[Array, "3"]
+    """Yaw (rad), valid, time (s)."""
+
+
+class DelayedFilter(eqx.Module):
+    """The filter's constants, with pure `init`, `step` and `present`."""
+
+    imu: Imu = eqx.field(static=True)
+    dvl: Dvl = eqx.field(static=True)
+    depth: DepthSensor = eqx.field(static=True)
+    compass: Compass = eqx.field(static=True)
+    config: EkfConfig = eqx.field(static=True)
+
+    def __check_init__(self) -> None:
+        """Check that the DVL's readings arrive in time and that no sensor is perfect."""
+        for sensor in (self.dvl, self.depth, self.compass):
+            require(
+                sensor.noise > 0, sensor, "noise", "give more than zero: a filter divides by it"
+            )
+        longest = self.dvl.latest_latency + 2 * self.period
+        require(
+            self.slots * self.period >= longest - 1e-9,
+            self.config,
+            "horizon",
+            f"give at least the DVL's latest latency and two samples, {longest:.3g} s",
+        )
+
+    @property
+    def period(self) -> float:
+        """Time between inertial samples (s)."""
+        return 1 / self.imu.rate
+
+    @property
+    def slots(self) -> int:
+        """Samples that wait."""
+        return math.ceil(self.config.horizon * self.imu.rate - 1e-9)
+
+    def deviations(self) -> Float[Array, "18"]:
+        """Standard deviations of the initial error."""
+        c = self.config
+        slow = (self.dvl.scale_std, self.depth.offset_std, self.compass.wander)
+        biases = (self.imu.gyroscope_bias,) * 3 + (self.imu.accelerometer_bias,) * 3
+        stds = (*c.position_std, *c.attitude_std, *c.velocity_std, *biases, *slow)
+        return jnp.asarray(stds, jnp.result_type(float))
+
+    def init(self, X_WB: Float[Array, "7"], V_WB_B: Float[Array, "6"]) -> FilterState:
+        """The state at time 0 for an estimated pose and twist, biases unknown."""
+        zero = jnp.zeros_like(V_WB_B[:3])
+        return FilterState(
+            Navigation(X_WB, V_WB_B[:3], zero, zero, zero),
+            jnp.diag(self.deviations() ** 2),
+            jnp.zeros((self.slots, SLOT), V_WB_B.dtype),
+            jnp.concatenate([jnp.zeros(7, V_WB_B.dtype), V_WB_B[:3]]),
+            V_WB_B[3:],
+            zero,
+            zero,
+            zero,
+        )
+
+    def step(self, state: FilterState, readings: Readings, k: Float[Array, ""]) -> FilterState:
+        """Take in sample number k (of time k · period) and advance the horizon by one slot.
+
+        Sample 0 belongs to the start: it moves nothing. Before it, k is negative. The nominal state
+        moves with every sample; the covariance follows, with the samples' mean, where a reading is
+        fused and every 0.1 s.
+        """
+        state, slot, due = self.advance(state, readings, k)
+        return jax.lax.cond(due, lambda s: self.fuse(s, slot, k), lambda s: s, state)
+
+    def advance(
+        self, state: FilterState, readings: Readings, k: Float[Array, ""]
+    ) -> tuple[FilterState, Float[Array, "15"], Bool[Array, ""]]:
+        """The first half of `step`: also the slot that left the ring, and if `fuse` is due."""
+        ring, rate = self._enqueue(state, readings, k)
+        slot = ring[0]
+        dt = slot[0] * self.period
+        x = state.nominal
+        force, omega = slot[1:4] - x.accel_bias, slot[4:7] - x.gyro_bias
+        sample = error_state.sample_increment(force, omega, dt)
+        decay = jnp.exp(-dt / self.compass.wander_time)
+        x = error_state.apply(x, sample, self.imu.gravity)
+        x = x._replace(sensors=jnp.concatenate([x.sensors[:2], decay * x.sensors[2:]]))
+        gone = jnp.concatenate([dt[None], force * dt, omega * dt])
+        since = jnp.concatenate([state.since[:7] + gone, state.since[7:]])
+        state = state._replace(nominal=x, ring=ring[1:], since=since, rate=rate)
+        due = (slot[_DVL] > 0) | (slot[_DEPTH] > 0) | (slot[_COMPASS] > 0)
+        return state, slot, due | (since[0] > _LONGEST - self.period / 2)
+
+    def fuse(
+        self, state: FilterState, slot: Float[Array, "15"], k: Float[Array, ""]
+    ) -> FilterState:
+        """The second half of `step`: bring P up to date and use the slot's readings."""
+        dtype = state.P.dtype
+        state = state._replace(P=self._covariance(state, state.nominal, state.since[:7]))
+        time = (k - self.slots) * self.period
+
+        def dvl(x: Navigation) -> measurement.Innovation:
+            return measurement.dvl_innovation(self.dvl, x, slot[4:7], slot[_DVL + 1 : _DEPTH])
+
+        def depth(x: Navigation) -> measurement.Innovation:
+            return measurement.depth_innovation(self.depth, x, slot[_DEPTH + 1 : _COMPASS])
+
+        def compass(x: Navigation) -> measurement.Innovation:
+            return measurement.compass_innovation(self.compass, x, slot[_COMPASS + 1 :])
+
+        def correct(
+            state: FilterState, i: int, innovation: Callable[[Navigation], measurement.Innovation]
+        ) -> FilterState:
+            found = innovation(state.nominal)
+            limit = jnp.asarray(chi2.ppf(self.config.gate, found.residual.size), dtype)
+            limit = jnp.where(state.rejected[i] >= self.config.patience, jnp.inf, limit)
+            nominal, P, nis, accepted = measurement.update(state.nominal, state.P, found, limit)
+            count = jnp.where(accepted, 0, state.rejected[i] + 1)
+            last = jnp.where(accepted, time, state.accepted_at[i])
+            return state._replace(
+                nominal=nominal,
+                P=P,
+                nis=state.nis.at[i].set(nis),
+                rejected=state.rejected.at[i].set(count),
+                accepted_at=state.accepted_at.at[i].set(last),
+            )
+
+        kinds = ((_DVL, dvl), (_DEPTH, depth), (_COMPASS, compass))
+        for i, (flag, innovation) in enumerate(kinds):
+            use = partial(correct, i=i, innovation=innovation)
+            state = jax.lax.cond(slot[flag] > 0, use, lambda state: state, state)
+        zero = jnp.zeros(7, dtype)
+        return state._replace(since=jnp.concatenate([zero, state.nominal.v_B]))
+
+    def _covariance(
+        self, state: FilterState, after: Navigation, gone: Float[Array, "7"]
+    ) -> Float[Array, "18 18"]:
+        """P after the time and the sums of force · dt and rate · dt of `gone`."""
+        time = gone[0]
+        some = jnp.maximum(time, self.period)
+        before = state.nominal._replace(v_B=state.since[7:])
+        F, Q = error_state.transition(
+            before, after, gone[1:4] / some, gone[4:] / some, time, self.imu, self.compass
+        )
+        P = F @ state.P @ F.T + Q
+        return (P + P.T) / 2
+
+    def _enqueue(
+        self, state: FilterState, readings: Readings, k: Array
+    ) -> tuple[Float[Array, "_ 15"], Float[Array, "3"]]:
+        """The ring with the new slot at its end and every reading in the slot of its time."""
+        dtype, h = state.ring.dtype, self.period
+        X_BS = self.imu.mount(dtype)
+        rate = se3.rotate(X_BS, readings.imu[3:])
+        force = se3.rotate(X_BS, readings.imu[:3])
+        if any(self.imu.position):  # from the sensor's place to Bo
+            r = X_BS[4:]
+            spin = velocity_at(r, jnp.concatenate([jnp.zeros_like(rate), rate]))
+            force = force - se3.cross(rate, spin) - se3.cross((rate - state.rate) / h, r)
+        mean = (rate + state.rate) / 2
+        moves = (k >= 1).astype(dtype)
+        new = jnp.concatenate([moves[None], force, mean, jnp.zeros(8, dtype)])
+        ring = jnp.concatenate([state.ring, new[None]])
+        number = k - self.slots + jnp.arange(self.slots + 1, dtype=dtype)
+
+        def place(reading: Array) -> Array:
+            """Rows [1, value] for the slot of a valid reading, as (mask, row)."""
+            here = (number == jnp.round(reading[-1] / h)) & (reading[-2] > 0)
+            row = jnp.concatenate([jnp.ones(1, dtype), reading[:-2]])
+            return jnp.where(here[:, None], row[None], 0), here
+
+        columns = [ring[:, :_DVL]]
+        ends = (_DVL, _DEPTH, _COMPASS, SLOT)
+        for i, reading in enumerate((readings.dvl, readings.depth, readings.compass)):
+            rows, here = place(reading)
+            columns.append(jnp.where(here[:, None], rows, ring[:, ends[i] : ends[i + 1]]))
+        rate = jnp.where(k >= 0, rate, state.rate)
+        return jnp.concatenate(columns, axis=1), rate
+
+    def status(self, state: FilterState, k: Float[Array, ""]) -> Float[Array, "10"]:
+        """The status vector after `step` number k; see `STATUS`."""
+        time = jnp.maximum(k - self.slots, 0) * self.period
+        age = time - state.accepted_at
+        return jnp.concatenate([time[None], state.nis, state.rejected, age])
+
+    def present(
+        self, state: FilterState, ahead: float | Float[Array, ""]
+    ) -> tuple[Float[Array, "7"], Float[Array, "6"], Float[Array, "18 18"]]:
+        """Pose, twist and error covariance `ahead` seconds after the newest sample.
+
+        The waiting samples are applied to the horizon's state; beyond the newest one the twist is
+        held. The covariance crosses the waiting time in one step.
+        """
+        x, ring = state.nominal, state.ring
+        time = ring[:, 0] * self.period
+        force, omega = ring[:, 1:4].T - x.accel_bias[:, None], ring[:, 4:7].T - x.gyro_bias[:, None]
+        increment = error_state.chain_all(error_state.sample_increment(force, omega, time))
+        now = error_state.apply(x, increment, self.imu.gravity)
+        waiting = jnp.concatenate(
+            [time[:, None], force.T * time[:, None], omega.T * time[:, None]], 1
+        )
+        P = self._covariance(state, now, state.since[:7] + jnp.sum(waiting, axis=0))
+        V = jnp.concatenate([now.v_B, state.rate - x.gyro_bias])
+        return se3.retract(now.X_WB, V * ahead), V, P
+
+
+def unpack_covariance(flat: Float[Array, "324"]) -> Float[Array, "18 18"]:
+    """The error covariance of a flat output."""
+    return flat.reshape(ERRORS, ERRORS)

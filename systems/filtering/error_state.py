@@ -1,0 +1,186 @@
+"""Inertial navigation on SE(3) and how its small errors travel.
+
+Nominal state: pose `X_WB`, velocity v of Bo in W expressed in B, biases of gyroscope and
+accelerometer, and three slow errors of other sensors: scale of the DVL, offset of the depth gauge,
+wander of the compass. The true state is `retract(nominal, δ)` with the error δ in R¹⁸
+
+    δ = [δp 3, δθ 3 | δv 3 | δb_g 3 | δb_a 3 | scale, offset, wander],    X_WB = X̂_WB exp([δp, δθ]),
+
+so the pose's error lives in the body frame (left-invariant; Barrau and Bonnabel 2017) and in the
+order of every twist here; the rest adds. This module handles one state; batches go through `vmap`.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ...models import se3
+from ...models.sensors import Compass, Imu
+
+ERRORS = 18
+POSE, ROTATION = slice(0, 6), slice(3, 6)
+VELOCITY, GYRO_BIAS, ACCEL_BIAS = slice(6, 9), slice(9, 12), slice(12, 15)
+SENSORS = slice(15, 18)
+
+
+class Navigation(NamedTuple):
+    """The nominal state."""
+
+    X_WB: Float[Array, "7"]
+    v_B: Float[Array, "3"]
+    gyro_bias: Float[Array, "3"]
+    accel_bias: Float[Array, "3"]
+    sensors: Float[Array, "3"]
+
+
+class Increment(NamedTuple):
+    """What inertial samples alone say about a time T: rotation, velocity and position in its frame.
+
+    `X` holds ΔR and Δp, the position reached without initial velocity and gravity, `v` is Δv, both
+    expressed in the frame at the interval's start (preintegration, Forster et al. 2017, eq. 33).
+    """
+
+    X: Float[Array, "7 *batch"]
+    v: Float[Array, "3 *batch"]
+    time: Float[Array, "*batch"]
+
+
+def retract(nominal: Navigation, delta: Float[Array, "18"]) -> Navigation:
+    """The state that differs from `nominal` by the error δ."""
+    return Navigation(
+        se3.retract(nominal.X_WB, delta[POSE]),
+        nominal.v_B + delta[VELOCITY],
+        nominal.gyro_bias + delta[GYRO_BIAS],
+        nominal.accel_bias + delta[ACCEL_BIAS],
+        nominal.sensors + delta[SENSORS],
+    )
+
+
+def error(nominal: Navigation, true: Navigation) -> Float[Array, "18"]:
+    """The δ for which `retract(nominal, δ)` is `true`."""
+    rest = [a - b for a, b in zip(true[1:], nominal[1:], strict=True)]
+    return jnp.concatenate([se3.local(nominal.X_WB, true.X_WB), *rest])
+
+
+def sample_increment(
+    force: Float[Array, "3 *batch"], rate: Float[Array, "3 *batch"], time: Float[Array, "*batch"]
+) -> Increment:
+    """Increment of one sample: specific force (m/s²) and mean angular rate (rad/s) over `time`.
+
+    The force is taken in the axes at the end of the interval, which is where it is sampled.
+    """
+    X = se3.exp(jnp.concatenate([jnp.zeros_like(rate), rate * time[None]]))
+    v = se3.rotate(X, force) * time[None]
+    return Increment(jnp.concatenate([X[:4], v * time[None] / 2]), v, time)
+
+
+def chain(first: Increment, second: Increment) -> Increment:
+    """The increment over both intervals, one after the other."""
+    X = se3.compose(first.X, second.X)
+    p = X[4:] + first.v * second.time[None]
+    v = first.v + se3.rotate(first.X, second.v)
+    return Increment(jnp.concatenate([X[:4], p]), v, first.time + second.time)
+
+
+def chain_all(increments: Increment) -> Increment:
+    """The increment over a batch (n,) of intervals in order, by halving: log₂ n operations."""
+    n = increments.time.shape[0]
+    while n > 1:
+        tail = None
+        if n % 2:
+            tail = Increment(increments.X[:, -1:], increments.v[:, -1:], increments.time[-1:])
+        even = Increment(
+            increments.X[:, : n - 1 : 2], increments.v[:, : n - 1 : 2], increments.time[: n - 1 : 2]
+        )
+        odd = Increment(increments.X[:, 1:n:2], increments.v[:, 1:n:2], increments.time[1:n:2])
+        increments = chain(even, odd)
+        if tail is not None:
+            increments = Increment(
+                jnp.concatenate([increments.X, tail.X], axis=1),
+                jnp.concatenate([increments.v, tail.v], axis=1),
+                jnp.concatenate([increments.time, tail.time]),
+            )
+        n = (n + 1) // 2
+    return Increment(increments.X[:, 0], increments.v[:, 0], increments.time[0])
+
+
+def apply(nominal: Navigation, increment: Increment, gravity: float) -> Navigation:
+    """The nominal state after an increment: v_B and X_WB with gravity, the biases as they are."""
+    T = increment.time
+    g_B = se3.rotate_inverse(nominal.X_WB, _gravity(nominal.X_WB, gravity))
+    start = increment.X[4:] + nominal.v_B * T + g_B * T * T / 2
+    X = se3.normalize(se3.compose(nominal.X_WB, jnp.concatenate([increment.X[:4], start])))
+    v = se3.rotate_inverse(increment.X, nominal.v_B + increment.v + g_B * T)
+    return nominal._replace(X_WB=X, v_B=v)
+
+
+def _gravity(like: Array, gravity: float) -> Float[Array, "3"]:
+    return jnp.asarray((0.0, 0.0, -gravity), like.dtype)
+
+
+def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The matrix of v × ."""
+    return se3.ad(jnp.concatenate([jnp.zeros_like(v), v]))[:3, :3]
+
+
+def transition(
+    before: Navigation,
+    after: Navigation,
+    force: Float[Array, "3"],
+    rate: Float[Array, "3"],
+    time: Float[Array, ""],
+    imu: Imu,
+    compass: Compass,
+) -> tuple[Float[Array, "18 18"], Float[Array, "18 18"]]:
+    """F and Q of δ⁺ = F δ + noise over one sample (bias-free `force`, `rate`), first order in δ.
+
+    With φ = rate · time, A = exp(φ)ᵀ and J = J_r(φ):
+
+        δθ⁺ = A δθ − T J δb_g
+        δv⁺ = A δv − T (A v)^ J δb_g + T g_B⁺^ δθ⁺ − T δb_a
+        δp⁺ = A (δp + T δv − T v^ δθ) − T²/2 (f^ δθ⁺ + δb_a).
+    """
+    eye = jnp.eye(3, dtype=force.dtype)
+    zero = jnp.zeros_like(eye)
+    T = time
+    W = skew(rate * T)
+    W2 = W @ W
+    A = eye - W + W2 / 2 - W @ W2 / 6  # exp(φ)ᵀ; the remainder is |φ|⁴/24
+    J = eye - W / 2 + W2 / 6
+    g_B = se3.rotate_inverse(after.X_WB, _gravity(after.X_WB, imu.gravity))
+    G, H = T * skew(g_B), -(T * T / 2) * skew(force)
+    C_v = -(skew(A @ before.v_B) + G) @ J
+    C_p = -H @ J
+    rho = jnp.exp(-T / compass.wander_time)
+    rows = [
+        jnp.concatenate(
+            [A, H @ A - T * A @ skew(before.v_B), T * A, T * C_p, -(T * T / 2) * eye], 1
+        ),
+        jnp.concatenate([zero, A, zero, -T * J, zero], 1),
+        jnp.concatenate([zero, G @ A, A, T * C_v, -T * eye], 1),
+        jnp.concatenate([zero, zero, zero, eye, zero], 1),
+        jnp.concatenate([zero, zero, zero, zero, eye], 1),
+    ]
+    slow = jnp.stack([jnp.ones_like(T), jnp.ones_like(T), rho])
+    F = jnp.concatenate(
+        [
+            jnp.concatenate([jnp.concatenate(rows), jnp.zeros((15, 3), force.dtype)], 1),
+            jnp.concatenate([jnp.zeros((3, 15), force.dtype), jnp.diag(slow)], 1),
+        ]
+    )
+    rest = jnp.zeros((9, 3), force.dtype)
+    N_g = jnp.concatenate([C_p, -J, C_v, rest])
+    N_a = jnp.concatenate([-(T / 2) * eye, zero, -eye, rest])
+    s_g, s_a = imu.gyroscope_density**2 / 2, imu.accelerometer_density**2 / 2
+    Q = s_g * T * (N_g @ N_g.T) + s_a * T * (N_a @ N_a.T)
+    walk = jnp.concatenate(
+        [
+            jnp.zeros(9, force.dtype),
+            jnp.full(3, imu.gyroscope_walk**2, force.dtype) * T,
+            jnp.full(3, imu.accelerometer_walk**2, force.dtype) * T,
+            jnp.zeros(2, force.dtype),
+            compass.wander**2 * (1 - rho * rho)[None],
+        ]
+    )
+    return F, Q + jnp.diag(walk)

@@ -155,6 +155,15 @@ def test_cuts_at_modes_arming_and_gaps(tmp_path):
     assert everything.scenarios[-1].endswith("STABILIZE_disarmed")
 
 
+def test_very_long_stretches_are_cut_into_equal_parts(tmp_path):
+    log = dive(duration=620.0, rates=(5.0, 5.0, 5.0))
+    recording, report = imported(tmp_path, log.bytes(), gap=1.0)
+    assert recording.scenarios == ("01_MANUAL", "02_MANUAL", "03_MANUAL")
+    assert np.ptp(recording.lengths) <= 1
+    assert recording.duration > 615
+    assert any("equal parts" in line for line in report.dropped)
+
+
 def test_resets_of_the_estimator_cut(tmp_path):
     recording, report = imported(tmp_path, dive(jump=110.0).bytes())
     assert len(recording.scenarios) == 2
@@ -384,6 +393,22 @@ def test_compressed_logs_and_cut_off_ones(tmp_path):
         )
         assert 0 < partly.duration < recording.duration
         assert any("cut off" in line for line in report.dropped)
+
+
+def test_messages_without_numbers_are_passed_over(tmp_path):
+    log = dive()
+    zero, none = [0.0] * 4, [float("nan")] * 4
+    for k in range(40):
+        ms = 105_007 + 10 * k
+        log.send(
+            ms * 1e-3,
+            dialect.MAVLink_attitude_quaternion_message(ms, *(zero, none)[k % 2], 0, 0, 0),
+        )
+        log.send(ms * 1e-3, dialect.MAVLink_local_position_ned_message(ms, *none[:3], *none[:3]))
+    recording, _ = imported(tmp_path, log.bytes())
+    assert len(recording.scenarios) == 1
+    for run in recording.trajectories():
+        assert errors(run, recording.dt)[1] < 1e-4
 
 
 def test_progress_runs_from_zero_to_one(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from motion import smooth_motion
 
-from helpers import shared_data
+from helpers import ROOT, shared_data
 from spinndrift.models.errors import UserError
 from spinndrift.models.recording import Recording
 from spinndrift.models.recording_build import Trajectory
@@ -301,3 +301,18 @@ def test_a_real_tank_run_with_uneven_steps_passes(tmp_path):
     made = read_csv(write(tmp_path, columns), rate=10.0)
     assert made.duration == pytest.approx(data["t_s"][-1] - data["t_s"][0], abs=0.2)
     assert not [note for note in made.notes if "explains" in note]
+
+
+def test_the_example_of_the_page_can_be_read(tmp_path):
+    page = (ROOT / "docs" / "recording.md").read_text()
+    table = re.search(r"(?:^    [t\d][^\n]*\n)+(?=\n)", page[page.index("    t,x,y") :], flags=re.M)
+    metadata = re.search(r"```yaml\n(.*?)```", page, flags=re.S)
+    assert table is not None
+    assert metadata is not None
+    for n in (1, 2, 3):
+        (tmp_path / f"run_{n}.csv").write_text(table[0].replace("    ", ""))
+    (tmp_path / "recording.yaml").write_text(metadata[1])
+    made = read_csv(tmp_path)
+    assert made.scenarios == ("surge", "yaw")
+    assert made.lengths.tolist() == [[2, 2], [2, 0]]
+    assert made.commands == ("F_Bo_B",)

@@ -7,6 +7,8 @@ logged outputs: they are samples of something that changes faster, and holding e
 would delay the commands by half a sampling period (50 ms at the 10 Hz of a DataFlash log).
 """
 
+from itertools import pairwise
+
 import numpy as np
 
 from ...models.recording_build import Trajectory
@@ -16,6 +18,7 @@ from .signals import Series, Signals
 from .signals_tlog import UNAIDED
 
 _FAST_HZ, _MEAN_S = 200.0, 0.01
+_LONGEST_S = 300.0
 _STATES = {"disarmed": "disarmed", "pass-through": "passthrough", "outputs off": "outputs-off"}
 
 
@@ -48,6 +51,9 @@ def fuse(
             f"{len(short)} stretch{'es' * (len(short) > 1)} shorter than {minimum:g} s "
             f"({sum(s.duration for s in short):.1f} s together) were left out."
         )
+    if any(s.duration > _LONGEST_S for s in long):
+        dropped.append(f"Stretches longer than {_LONGEST_S:g} s were cut into equal parts.")
+    long = [part for s in long for part in _parts(s)]
     trajectories, lines = [], []
     for number, segment in enumerate(long, 1):
         trajectory = resample(signals, segment, number, 1.0 / rate)
@@ -57,6 +63,13 @@ def fuse(
             f"from {segment.start:.1f} s on the vehicle's clock"
         )
     return trajectories, lines, dropped
+
+
+def _parts(segment: Segment) -> list[Segment]:
+    """Equal parts of at most `_LONGEST_S`: a recording pads all runs to the longest one."""
+    count = int(np.ceil(segment.duration / _LONGEST_S))
+    edges = np.linspace(segment.start, segment.stop, count + 1).tolist()
+    return [Segment(a, b, segment.labels) for a, b in pairwise(edges)]
 
 
 def name_of(segment: Segment, number: int) -> str:

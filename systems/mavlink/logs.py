@@ -60,6 +60,11 @@ def import_log(
         )
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
+    except KeyError as error:
+        raise UserError(
+            f"{path}: a message lacks the field {error}, so this is no log of an ArduPilot version "
+            "that is known (4.0 to 4.6)"
+        ) from error
     if not trajectories:
         raise UserError(
             f"{path}: no stretch of {minimum:g} s with attitude and thruster outputs is left "
@@ -67,9 +72,12 @@ def import_log(
         )
     progress(0.95)
     report = tell(signals, path.name, trajectories, lines, [*raw.notes, *dropped], 1.0 / rate)
-    recording = Recording.from_trajectories(
-        trajectories, 1.0 / rate, vehicle=vehicle, source=path.name, notes=report.notes()
-    )
+    try:
+        recording = Recording.from_trajectories(
+            trajectories, 1.0 / rate, vehicle=vehicle, source=path.name, notes=report.notes()
+        )
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from error
     progress(1.0)
     return recording, report
 
@@ -109,7 +117,7 @@ def load_data(
         )
         return logged
     progress(1.0)
-    if vehicle is None or vehicle == recording.vehicle:
+    if not vehicle or vehicle == recording.vehicle:
         return recording
     return Recording(recording.dataset.assign_attrs(vehicle=vehicle))
 

@@ -68,13 +68,20 @@ class Signals:
 
 
 def series(t: np.ndarray, x: np.ndarray, source: str) -> Series | None:
-    """Make a series: sorted, without repeated times; None if fewer than two samples are left."""
+    """Make a series: sorted, without repeated times; None if fewer than two samples are left.
+
+    Samples with NaN or infinity in a component that has numbers elsewhere are left out.
+    """
+    t, x = np.asarray(t, np.float64), np.asarray(x, np.float64)
+    known = np.isfinite(x).reshape(-1, t.size)
+    good = np.isfinite(t) & (known | ~known.any(axis=1, keepdims=True)).all(axis=0)
+    t, x = t[good], x[..., good]
     order = np.argsort(t, kind="stable")
-    t = np.asarray(t, np.float64)[order]
+    t = t[order]
     new = np.concatenate([[True], np.diff(t) > 1e-6]) if t.size else np.zeros(0, bool)
     if np.count_nonzero(new) < 2:
         return None
-    return Series(t[new], np.asarray(x, np.float64)[..., order][..., new], source)
+    return Series(t[new], x[..., order][..., new], source)
 
 
 def sampled_spans(t: np.ndarray, labels: Sequence[str]) -> Spans:

@@ -151,7 +151,7 @@ def _imu(
 def _rates(tables: Mapping[str, Table], core: int) -> tuple[Series, tuple[str, ...]]:
     gyro = _imu(tables, core, "GYR", ("GyrX", "GyrY", "GyrZ"))
     if gyro is not None:
-        if "XKF1" not in tables:
+        if "XKF1" not in tables or "GX" not in tables["XKF1"]:
             return gyro, ("Body rates are those of the gyro, with its bias left in.",)
         ekf = _of(tables["XKF1"], "C", core)
         bias = series(ekf["t"], np.deg2rad(codec.body_vector(ekf["GX"], ekf["GY"], ekf["GZ"])), "")
@@ -184,7 +184,7 @@ def _motion(
 
 
 def _aiding(tables: Mapping[str, Table], core: int) -> dict[str, Spans]:
-    if "XKF4" not in tables:
+    if "XKF4" not in tables or "SS" not in tables["XKF4"]:
         return {}
     status = _of(tables["XKF4"], "C", core)
     flags = status["SS"].astype(int)
@@ -194,9 +194,10 @@ def _aiding(tables: Mapping[str, Table], core: int) -> dict[str, Spans]:
 
 def _states(tables: Mapping[str, Table], first: float, last: float) -> dict[str, Spans]:
     spans = {}
-    modes = _columns(tables, "MODE", "ModeNum")
+    number = "ModeNum" if "ModeNum" in tables.get("MODE", {}) else "Mode"
+    modes = _columns(tables, "MODE", number)
     if modes:
-        names = [codec.mode_name(int(number)) for _, number in modes]
+        names = [codec.mode_name(int(mode)) for _, mode in modes]
         spans["mode"] = event_spans(np.array([t for t, _ in modes]), names, first, last)
     arming = [(t, bool(state)) for t, state in _columns(tables, "ARM", "ArmState")]
     if not arming:

@@ -464,6 +464,13 @@ def test_the_demo_log_has_what_its_readme_says(demo):
             assert part.slope == pytest.approx(1.0, abs=0.01)
 
 
+def test_the_demo_log_is_what_its_command_makes():
+    source = shared_data("data", "sitl_log", "dive.tlog").read_bytes()
+    assert "--spans 52.8 142.8 148.8 238.8" in (DEMO.parent / "README.md").read_text()
+    made = cut_tlog(source, [(52.8, 142.8), (148.8, 238.8)])
+    assert made == read_log_bytes(DEMO).data
+
+
 def test_the_demo_log_obeys_the_simulated_vehicles_laws(demo):
     """Force, drag and restoring by least squares on differences: within 3 % of the known constants.
 

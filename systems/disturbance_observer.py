@@ -1,5 +1,7 @@
 """Observes the steady wrench that the model doesn't explain: a current, a tether, ballast."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -111,7 +113,7 @@ class DisturbanceObserver(LeafSystem):
         self._V = self.DeclareVectorInputPort("V_WB_B", 6)
         self._F = self.DeclareVectorInputPort("F_Bo_B", 6)
         self._bias = self.DeclareDiscreteState(6)
-        start: Float[np.ndarray, "20"] = np.zeros(20)
+        start: Any = np.zeros(20)
         start[0] = 1.0
         self._memory = self.DeclareDiscreteState(start)
         self.DeclareStateOutputPort("F_bias_Bo_W", self._bias)

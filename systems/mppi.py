@@ -1,5 +1,7 @@
 """The path integral planner in a diagram."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -67,7 +69,7 @@ class Mppi(LeafSystem):
         self._bias = self.DeclareVectorInputPort("F_bias_Bo_W", 6)
         self._noise = self.DeclareVectorInputPort("noise", 4, RandomDistribution.kGaussian)
         first = eqx.filter_jit(MppiPlanner.init)(planner)
-        start: Float[np.ndarray, " n"] = np.asarray(first.F_Bo_B, float).ravel()
+        start: Any = np.asarray(first.F_Bo_B, float).ravel()
         self._nominal = self.DeclareDiscreteState(start)
         self._plan = self.DeclareDiscreteState(self.layout.size)
         self._samples = self.DeclareDiscreteState(self.samples.size)

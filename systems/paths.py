@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ..models import se3
@@ -91,7 +90,7 @@ class Waypoints(Path):
 
     Attributes:
         poses: at least two; the first is where to be at `start`.
-        speed: mean linear speed of a leg (m/s).
+        speed: mean linear speed along a leg (m/s).
         turn_rate: mean angular speed (rad/s) that a leg doesn't exceed.
         pause: time at rest on each pose but the last (s).
         start: when the first pause begins (s).
@@ -111,23 +110,24 @@ class Waypoints(Path):
         require(self.turn_rate > 0, self, "turn_rate", "give a rate above zero")
         require(self.pause >= 0, self, "pause", "give zero or more")
 
-    def times(self) -> tuple[Float[np.ndarray, " legs"], Float[np.ndarray, " legs"]]:
+    def times(
+        self, dtype: jnp.dtype | type = float
+    ) -> tuple[Float[Array, " legs"], Float[Array, " legs"]]:
         """When each leg begins and how long it takes (s)."""
-        X = np.stack([np.asarray(p.pose()) for p in self.poses], axis=1)
-        log = np.asarray(se3.local(jnp.asarray(X[:, :-1]), jnp.asarray(X[:, 1:])))
-        metres = np.linalg.norm(np.diff(X[4:], axis=1), axis=0)
-        length = np.maximum(metres / self.speed, np.linalg.norm(log[3:], axis=0) / self.turn_rate)
-        length = np.maximum(length, 1e-3)
-        ends = self.start + np.cumsum(length + self.pause)
+        X = jnp.stack([p.pose(dtype) for p in self.poses], axis=1)
+        twist = se3.local(X[:, :-1], X[:, 1:])
+        metres, turn = (jnp.linalg.norm(part, axis=0) for part in (twist[:3], twist[3:]))
+        length = jnp.maximum(jnp.maximum(metres / self.speed, turn / self.turn_rate), 1e-3)
+        ends = self.start + jnp.cumsum(length + self.pause)
         return ends - length, length
 
     def pose(self, t: Float[Array, " n"]) -> Float[Array, "7 n"]:
-        begins, lengths = (jnp.asarray(a, t.dtype) for a in self.times())
+        begins, lengths = self.times(t.dtype)
         X = jnp.stack([p.pose(t.dtype) for p in self.poses], axis=1)
         leg = jnp.clip(jnp.searchsorted(begins, t, side="right") - 1, 0, len(self.poses) - 2)
         s = jnp.clip((t - begins[leg]) / lengths[leg], 0, 1)
         s = s**3 * (10 - 15 * s + 6 * s * s)
-        return se3.interpolate(X[:, leg], X[:, leg + 1], s)
+        return se3.interpolate(X[:, leg], X[:, leg + 1], s[None])
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,100 @@
+"""Every system says in its docstring which ports it has, and has them."""
+
+import importlib
+import importlib.util
+import inspect
+import re
+import textwrap
+
+import numpy as np
+import pytest
+import yaml
+from pydrake.systems.framework import LeafSystem
+
+from helpers import ROOT, module_files
+from spinndrift.models.disturbances import Combined
+from spinndrift.models.vehicle import load_vehicle
+from spinndrift.systems.disturbance_observer import MomentumObserver
+from spinndrift.systems.impedance import ImpedanceLaw
+from spinndrift.systems.mppi_config import MppiConfig
+from spinndrift.systems.mppi_core import MppiPlanner
+from spinndrift.systems.obstacles import Cylinders, SphereHull
+from spinndrift.systems.paths import HoldPose, PoseConfig
+from spinndrift.systems.plan import PlanLayout
+from spinndrift.systems.wrench_limits import ThrusterLimits
+
+VEHICLE = load_vehicle("bluerov2_heavy")
+
+
+def arguments() -> dict[str, dict]:
+    """What a system's constructor needs; a system that is not listed is made without arguments."""
+    dynamics, thrusters = VEHICLE.dynamics(), VEHICLE.thrusters()
+    limits = ThrusterLimits.create(thrusters)
+    planner = MppiPlanner(
+        dynamics,
+        limits,
+        Cylinders.create([]),
+        SphereHull.cover(VEHICLE.size),
+        PoseConfig().pose(),
+        config=MppiConfig(horizon=10, sequences=20, knots=(2,)),
+    )
+    return {
+        "LearnedPlant": {"dynamics": dynamics},
+        "DisturbanceSource": {"disturbance": Combined()},
+        "ThrustAllocation": {"thrusters": thrusters},
+        "ThrusterBank": {"thrusters": thrusters},
+        "Mppi": {"planner": planner},
+        "Impedance": {"law": ImpedanceLaw(np.eye(6), np.eye(6), limits), "layout": PlanLayout()},
+        "DisturbanceObserver": {"observer": MomentumObserver(dynamics)},
+        "Reference": {"path": HoldPose()},
+        "PidController": {"vehicle": VEHICLE},
+    }
+
+
+def leaf_systems() -> dict[str, type[LeafSystem]]:
+    """Every LeafSystem that a module of systems/, sims/ or an example defines."""
+    found = {}
+    modules = [importlib.import_module(name) for name in module_files("systems", "sims")]
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        spec = importlib.util.spec_from_file_location(f"example_{path.stem}", path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        modules.append(module)
+    for module in modules:
+        for name, value in vars(module).items():
+            is_leaf = inspect.isclass(value) and issubclass(value, LeafSystem)
+            if is_leaf and value.__module__ == module.__name__:
+                found[name] = value
+    return found
+
+
+def told_ports(cls: type[LeafSystem]) -> dict:
+    """The `.. pydrake_system::` block of a docstring."""
+    match = re.search(r"\.\. pydrake_system::\n\n((?: +.*\n|\n)+)", f"{inspect.getdoc(cls)}\n")
+    assert match, f"{cls.__name__} has no pydrake_system block"
+    return yaml.safe_load(textwrap.dedent(match[1]))
+
+
+def test_every_system_has_the_ports_that_its_docstring_tells():
+    systems = leaf_systems()
+    given = arguments()
+    assert set(given) <= set(systems)
+    assert {"Ekf", "SensorSuite", "Mppi", "LearnedPlant"} <= set(systems)
+    for name, cls in systems.items():
+        system = cls(**given.get(name, {}))
+        told = told_ports(cls)
+        inputs = [system.get_input_port(i).get_name() for i in range(system.num_input_ports())]
+        outputs = [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
+        assert told["name"] == name
+        assert (told.get("input_ports") or []) == inputs, name
+        assert (told.get("output_ports") or []) == outputs, name
+
+
+def test_a_missing_block_is_found():
+    class Silent(LeafSystem):
+        """No ports told."""
+
+    with pytest.raises(AssertionError, match="Silent has no"):
+        told_ports(Silent)

@@ -14,6 +14,7 @@ pytestmark = pytest.mark.smoke
 IMPORT_ALL = """
 import importlib, json, os, random, sys, threading
 import jax, jax.numpy, numpy, pydrake.all, matplotlib.pyplot, xarray
+import rich.style  # draws once from the global generator
 
 def world():
     return {

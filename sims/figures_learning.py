@@ -1,7 +1,9 @@
 """Figures of data, training and held-out errors."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from matplotlib.figure import Figure
 
 from ..models.dynamics import Dynamics
@@ -135,7 +137,8 @@ def bands_figure(
     and the distance of the measurement from it can be compared by eye.
     """
     one = windows.take(np.array([index]))
-    X_0, V_0, F = one.X[0], one.V[0], one.F
+    observed_X, observed_V, F = (jnp.asarray(a) for a in (one.X, one.V, one.F))
+    X_0, V_0 = observed_X[0], observed_V[0]
     X, V = predict(
         learned, X_0, V_0, F, windows.dt, jax.random.key(0), samples,
         substeps=substeps[0], with_path_of_drift=True,
@@ -146,11 +149,11 @@ def bands_figure(
     )  # fmt: skip
     reference = X[:, :, -1:], V[:, :, -1:]
 
-    def seen(X_other: np.ndarray, V_other: np.ndarray) -> np.ndarray:
+    def seen(X_other: Array, V_other: Array) -> np.ndarray:
         return np.asarray(displacement(X_other, V_other, *reference))[..., 0]
 
     sampled = seen(X[:, :, :-1], V[:, :, :-1])
-    measured = seen(one.X[1:, :, None], one.V[1:, :, None])[:, :, 0]
+    measured = seen(observed_X[1:, :, None], observed_V[1:, :, None])[:, :, 0]
     believed = seen(Xp, Vp)[:, :, 0]
     t = windows.dt * np.arange(1, windows.steps + 1)
     figure, axes = panels(4, 3, 8.2, sharex=True)

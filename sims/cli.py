@@ -1,0 +1,56 @@
+"""The console command `spinndrift`."""
+
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Annotated
+
+import tyro
+
+from ..models.errors import UserError
+from .commands.demo import Demo
+from .commands.evaluate import Evaluate
+from .commands.generate import Generate
+from .commands.import_log import Import
+from .commands.run import Run
+from .commands.train import Train
+
+Command = (
+    Annotated[Import, tyro.conf.subcommand("import")]
+    | Annotated[Generate, tyro.conf.subcommand("generate")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Demo, tyro.conf.subcommand("demo")]
+)
+
+_DESCRIPTION = """Learned stochastic dynamics and control for underwater vehicles.
+
+The usual order: `import` a log (or `generate` one), `train` a model on it, `evaluate` the model on
+data it has not seen, `run` a mission with it. `demo` does all of this on a log that comes along.
+`spinndrift COMMAND --help` explains each."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one command; exit code 2 and one sentence for bad input, 130 after Ctrl-C."""
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    if given == ["--version"]:
+        print(version("spinndrift"))  # noqa: T201 - the answer asked for
+        return
+    command = tyro.cli(Command, args=given, prog="spinndrift", description=_DESCRIPTION)
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    try:
+        command.run()
+    except UserError as error:
+        _fail(f"spinndrift: {error}", 2)
+    except KeyboardInterrupt:
+        _fail("spinndrift: interrupted; what is on disk is whole", 130)
+    except BrokenPipeError:
+        sys.exit(141)
+
+
+def _fail(message: str, code: int) -> None:
+    sys.stderr.write(message.rstrip() + "\n")
+    sys.exit(code)

@@ -1,0 +1,1 @@
+"""The subcommands of `spinndrift`: one dataclass each, its fields the options, `run()` the work."""

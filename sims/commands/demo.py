@@ -1,0 +1,33 @@
+"""`spinndrift demo`: the main job from end to end."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Demo:
+    """A log goes in, a learned vehicle comes out and flies a closed-loop dive.
+
+    Imports the log, trains a SPINN from a preset, compares both on the part of the log that was
+    held out, flies the pylon crossing with MPPI on the learned model, and tells it all in one
+    report.html. An interrupted demo goes on where it was.
+    """
+
+    log: Path | None = None
+    """Your own log (.tlog, .BIN), recording (.nc) or CSV folder; by default the one that comes
+    along."""
+    out: Path = Path("runs/demo")
+    """Folder for everything that is made."""
+    vehicle: str | None = None
+    """Preset name or YAML file to start from; by default what the data name, or bluerov2_heavy."""
+    scenario: str = "pylon_crossing_calm"
+    """The dive to fly: a shipped scenario's name or a YAML file."""
+    steps: int | None = None
+    """Training steps, for a shorter or a longer look."""
+
+    def run(self) -> None:
+        """Run the demo and print its summary."""
+        from ..demo import demo
+        from ..progress import console
+
+        console().print(demo(self.log, self.out, self.vehicle, self.scenario, self.steps))

@@ -1,0 +1,62 @@
+"""`spinndrift evaluate`: a model against data it has not seen."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from ...models.errors import UserError
+from ..progress import console, progress_bar
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Compare a learned model and the preset it came from with data.
+
+    Prints errors, coverage of the 50 % and 90 % bands and energy scores over all horizons, and
+    writes them against the horizon. All of DATA is used: give data that training has not seen.
+    """
+
+    model: Positional[Path]
+    """Model file (.spinn)."""
+    data: Positional[Path]
+    """Recording (.nc), log (.tlog, .BIN) or CSV folder."""
+    out: Path | None = None
+    """File for the results: .csv (tidy), .json (overall) or .nc."""
+    length: float = 4.0
+    """Seconds of each window."""
+    vehicle: str | None = None
+    """Preset name or YAML file to compare with; by default what the model names."""
+
+    def run(self) -> None:
+        """Load, predict, compare."""
+        import jax.numpy as jnp
+
+        from ...models.checkpoint import load_model
+        from ...models.vehicle import load_vehicle
+        from ...systems.mavlink.logs import load_data
+        from ...training.start import estimate_diffusion
+        from ...training.windows import make_windows
+        from ..learning import compare
+
+        if self.out is not None and self.out.suffix not in (".csv", ".json", ".nc"):
+            raise UserError(f"--out {self.out}: end the name in .csv, .json or .nc")
+        model, metadata = load_model(self.model, dtype=jnp.float32)
+        name = self.vehicle or metadata.get("vehicle") or "bluerov2_heavy"
+        vehicle = load_vehicle(name)
+        with progress_bar(f"reading {self.data.name}") as update:
+            recording = load_data(self.data, vehicle=self.vehicle, progress=update)
+        windows = make_windows(
+            recording, vehicle, length_s=self.length, stride_s=self.length, normalise="heading"
+        )
+        preset = vehicle.dynamics(dtype=jnp.float32)
+        preset = vehicle.dynamics(estimate_diffusion(preset, windows), jnp.float32)
+        with progress_bar("evaluating"):
+            found = compare(model, preset, windows, int(metadata.get("substeps", 1)))
+        if self.out is not None:
+            found.save(self.out)
+        shown = console()
+        shown.print(f"{len(windows)} windows of {self.length:g} s")
+        shown.print(found.summary())
+        if self.out is not None:
+            shown.print(f"wrote {self.out}")

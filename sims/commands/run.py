@@ -1,0 +1,76 @@
+"""`spinndrift run`: a scenario is flown in closed loop."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from ..progress import console, progress_bar
+
+
+@dataclass(frozen=True)
+class Run:
+    """Fly a scenario: plant, water, sensors, filter, planner and controller in one loop.
+
+    SCENARIO is the path of a YAML file, or the name of a scenario that is shipped: station_keeping,
+    trajectory_tracking or pylon_crossing, each with the ending _calm or _harbour.
+
+    Writes a folder: report.html (look at this first), meshcat.html (3-D replay), log.nc (a
+    Recording of all that happened), metrics.json, and scenario.yaml with every default written out,
+    which can be changed and run again. The same scenario and seed give the same run. After Ctrl-C
+    the folder holds what was flown until then.
+    """
+
+    scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
+    """Name of a shipped scenario, or a YAML file."""
+    seed: int | None = None
+    """Seed of everything random; by default that of the scenario."""
+    out: Path | None = None
+    """Folder to write, which must not exist yet; by default runs/<name>-<seed>."""
+    scenario_text: str = ""
+    """YAML laid over the scenario, such as 'station: {disturbance_set: calm}'."""
+    model: Path | None = None
+    """Learned model (.spinn) for the planner; by default what the scenario says."""
+    duration: float | None = None
+    """Longest simulated time (s); by default that of the scenario."""
+    report: bool = True
+    """Write report.html and meshcat.html."""
+    quiet: Annotated[bool, FlagCreatePairsOff, arg(help="Show no progress and no summary.")] = False
+
+    def run(self) -> None:
+        """Simulate, write, summarise."""
+        from ..run_folder import check_free, free_folder, write_run
+        from ..run_loop import simulate
+        from ..scenario import load_scenario
+
+        scenario = load_scenario(self.scenario, self.scenario_text)
+        scenario = scenario.with_changes(self.seed, self.duration, self.model)
+        out = free_folder("runs", scenario) if self.out is None else self.out
+        check_free(out)
+        if self.quiet:
+            flown = simulate(scenario)
+        else:
+            with progress_bar(f"flying {scenario.name}") as update:
+                flown = simulate(scenario, update)
+        values = write_run(flown, out, self.report)
+        if not self.quiet:
+            self._summary(values, out)
+        if flown.outcome.reason == "interrupted":
+            raise KeyboardInterrupt
+
+    def _summary(self, values: dict, out: Path) -> None:
+        shown, path, timing = console(), values["path"], values["timing"]
+        shown.print(values["outcome"]["words"])
+        told = [f"path {path['length_m']:.1f} m"]
+        for name, block, key in (
+            ("least clearance", path, "min_clearance_m"),
+            ("off the plan", values["tracking"], "position_rms_m"),
+            ("estimate off", values["estimate"], "position_rms_m"),
+        ):
+            if block.get(key) is not None:
+                told.append(f"{name} {block[key]:.2f} m")
+        if timing["real_time_factor"] is not None:
+            told.append(f"{timing['real_time_factor']:.1f} × real time")
+        shown.print(", ".join(told))
+        shown.print(f"wrote {out}" + (f"; open {out / 'report.html'}" if self.report else ""))

@@ -1,0 +1,66 @@
+"""`spinndrift train`: a learned model from data."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from ...models.errors import UserError
+from ..progress import console, progress_bar
+
+
+@dataclass(frozen=True)
+class Train:
+    """Learn a stochastic model of a vehicle from data, starting at a preset.
+
+    The last part of the data (or whole runs, where a scenario has several) is held out; the
+    summary and report.html compare preset and learned model on it. Ctrl-C leaves a checkpoint;
+    the same command with `--resume` goes on to the same bits.
+    """
+
+    data: Positional[Path]
+    """Recording (.nc), log (.tlog, .BIN) or CSV folder."""
+    out: Path = Path("runs/train")
+    """Folder for model.spinn, metrics.csv, evaluation.csv, report.html."""
+    config: Path | None = None
+    """Training settings (YAML); the run's own config.yaml shows all of them with their defaults."""
+    vehicle: str | None = None
+    """Preset name or YAML file to start from; by default what the data name."""
+    steps: int | None = None
+    """Number of training steps, instead of the settings' own."""
+    seed: int | None = None
+    """Seed of the start and of all noise, instead of the settings' own."""
+    resume: bool = False
+    """Continue the run in `--out`."""
+
+    def run(self) -> None:
+        """Train, evaluate, report."""
+        from ...models.config import load
+        from ...models.vehicle import load_vehicle
+        from ...systems.mavlink.logs import load_data
+        from ...training.config import TrainingConfig
+        from ..learning import learn
+        from ..learning_report import add_data, add_evaluation, add_training
+        from ..pages import Page
+
+        config = TrainingConfig() if self.config is None else load(TrainingConfig, self.config)
+        changes = {"steps": self.steps, "seed": self.seed}
+        config = replace(config, **{k: v for k, v in changes.items() if v is not None})
+        if (self.out / "checkpoint.npz").exists() and not self.resume:
+            raise UserError(
+                f"--out {self.out}: holds a training run; continue it with --resume or name "
+                "another folder"
+            )
+        with progress_bar(f"reading {self.data.name}") as update:
+            recording = load_data(self.data, vehicle=self.vehicle, progress=update)
+        vehicle = load_vehicle(recording.vehicle or "bluerov2_heavy")
+        with progress_bar("training") as update:
+            learned = learn(
+                recording, vehicle, config, self.out, resume=self.resume, progress=update
+            )
+        page = Page("Training", f"{self.data.name}, from the preset `{vehicle.name}`")
+        add_evaluation(add_training(add_data(page, recording), learned), learned)
+        page.write(self.out / "report.html")
+        shown = console()
+        shown.print(learned.evaluation.summary())
+        shown.print(f"wrote {self.out / 'model.spinn'} and {self.out / 'report.html'}")

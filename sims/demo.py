@@ -1,0 +1,156 @@
+"""The main job in one go: log, learned model, held-out error, closed-loop dive, one report."""
+
+import json
+import shutil
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ..models.errors import UserError
+from ..models.files import atomic_path
+from ..models.recording import Recording
+from ..models.vehicle import Vehicle, load_vehicle
+from ..systems.mavlink.logs import load_data
+from ..training.config import TrainingConfig
+from .figures_path import path_figure, samples_figure
+from .figures_time import progress_figure, tracking_figure
+from .learning import Learned, learn
+from .learning_report import add_data, add_evaluation, add_training
+from .metrics import clearance
+from .pages import Page
+from .progress import progress_bar
+from .run_folder import scene, write_run
+from .run_loop import Run, simulate
+from .scenario import load_scenario
+
+EMBEDDED = Path(__file__).with_name("data") / "sitl_dive.tlog.xz"
+_NORMS = ("position", "rotation", "linear_velocity", "angular_velocity")
+_UNITS = ("m", "rad", "m/s", "rad/s")
+
+
+def demo(
+    log: Path | None,
+    out: Path,
+    vehicle_name: str | None = None,
+    scenario_name: str = "pylon_crossing_calm",
+    steps: int | None = None,
+) -> str:
+    """Do it all, write it into `out` and return the summary.
+
+    Files: recording.nc, training/ (as `spinndrift train`), dive/ (as `spinndrift run`),
+    report.html, summary.json. Training that an earlier demo of the same log began is continued.
+
+    Raises:
+        UserError: the log can't be used; the sentence says why.
+    """
+    began = time.monotonic()
+    source = EMBEDDED if log is None else log
+    scenario = load_scenario(scenario_name)
+    config = TrainingConfig()
+    if steps is not None:
+        config = replace(config, steps=steps)
+    with progress_bar(f"1/4 reading {source.name}") as update:
+        recording = load_data(source, vehicle=vehicle_name, progress=update)
+    vehicle = load_vehicle(recording.vehicle or "bluerov2_heavy")
+    recording.save(out / "recording.nc")
+    with progress_bar("2/4 training") as update:
+        learned = _learn(recording, vehicle, config, out / "training", update)
+    model = out / "training" / "model.spinn"
+    scenario = scenario.with_changes(model=model)
+    station = replace(scenario.station, vehicle=vehicle.name, model=model)
+    scenario = replace(scenario, station=station)
+    with progress_bar("3/4 flying") as update:
+        run = simulate(scenario, update)
+    with progress_bar("4/4 writing the report"):
+        shutil.rmtree(out / "dive", ignore_errors=True)
+        values = write_run(run, out / "dive")
+        _page(source, recording, vehicle, learned, run, values).write(out / "report.html")
+    found = _summary(learned, values, time.monotonic() - began)
+    with atomic_path(out / "summary.json") as partial:
+        partial.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    return _words(found, out)
+
+
+def _learn(
+    recording: Recording, vehicle: Vehicle, config: TrainingConfig, out: Path, update: Any
+) -> Learned:
+    """Continue the training in `out` if it is one of these data and settings, else begin anew."""
+    try:
+        return learn(recording, vehicle, config, out, resume=True, progress=update)
+    except UserError:
+        if not (out / "checkpoint.npz").exists():
+            raise
+        shutil.rmtree(out)
+        return learn(recording, vehicle, config, out, progress=update)
+
+
+def _page(
+    source: Path,
+    recording: Recording,
+    vehicle: Vehicle,
+    learned: Learned,
+    run: Run,
+    values: dict[str, Any],
+) -> Page:
+    overall = learned.evaluation.overall()
+    ratio = {n: overall["learned"][f"rmse_{n}"] / overall["preset"][f"rmse_{n}"] for n in _NORMS}
+    outcome = values["outcome"]
+    better = all(r < 1 for r in ratio.values())
+    page = Page("From a log to a dive", f"`{source.name}`, from the preset `{vehicle.name}`")
+    page.verdict(
+        f"On motion it has not seen the learned model misses position by {ratio['position']:.0%} "
+        f"and velocity by {ratio['linear_velocity']:.0%} of the preset's error. {outcome['words']}",
+        better and outcome["success"],
+    )
+    page.tiles(
+        [
+            (f"{norm.replace('_', ' ')} error", f"{overall['learned'][f'rmse_{norm}']:.3f} {unit}",
+             f"preset {overall['preset'][f'rmse_{norm}']:.3f} {unit}")
+            for norm, unit in zip(_NORMS, _UNITS, strict=True)
+        ]
+    )  # fmt: skip
+    add_evaluation(add_training(add_data(page, recording), learned), learned)
+    page.section(
+        "The dive",
+        "The learned model is the vehicle, and MPPI plans with it: from (0, 0, −1.5) m to the goal "
+        "between the pylons, on estimates of a Kalman filter, at 5 plans a second. The run's own "
+        "[report](dive/report.html) and [3-D replay](dive/meshcat.html) show more.",
+    )
+    around = scene(run.scenario)
+    page.figure(path_figure(run.log, around), "Planned, flown and estimated path.")
+    obstacles = run.scenario.station.obstacles
+    room = clearance(run.log, vehicle, obstacles)
+    for figure, caption in (
+        (progress_figure(run.log, room, around.goal, around.goal_radius), "The way to the goal."),
+        (samples_figure(run.log, around), "Paths that the planner sampled, at six moments."),
+        (tracking_figure(run.log), "Plan minus truth, seen from the vehicle."),
+    ):
+        if figure is not None:
+            page.figure(figure, caption)
+    return page
+
+
+def _summary(learned: Learned, values: dict[str, Any], seconds: float) -> dict[str, Any]:
+    return {
+        "held_out": learned.evaluation.overall(),
+        "training": {"steps": learned.result.steps, "seconds": learned.result.seconds},
+        "dive": values["outcome"] | {"min_clearance_m": values["path"].get("min_clearance_m")},
+        "seconds": seconds,
+    }
+
+
+def _words(found: dict[str, Any], out: Path) -> str:
+    lines = ["held-out error (RMS over 4 s)       preset    learned"]
+    for norm, unit in zip(_NORMS, _UNITS, strict=True):
+        preset, learned = (found["held_out"][m][f"rmse_{norm}"] for m in ("preset", "learned"))
+        label = f"{norm.replace('_', ' ')} ({unit})"
+        lines.append(f"  {label:<32}{preset:>8.3f}{learned:>11.3f}")
+    inside = found["held_out"]["learned"]
+    lines.append(
+        f"  of held-out motion {inside['coverage_0.5']:.0%} lie in the 50 % band and "
+        f"{inside['coverage_0.9']:.0%} in the 90 % band"
+    )
+    lines.append(f"dive: {found['dive']['words']}")
+    lines.append(f"{found['seconds']:.0f} s in all; open {out / 'report.html'}")
+    return "\n".join(lines)

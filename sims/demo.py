@@ -22,19 +22,20 @@ from .pages import Page
 from .progress import progress_bar
 from .run_folder import scene, write_run
 from .run_loop import Run, simulate
-from .scenario import load_scenario
+from .scenario import Scenario
 
 EMBEDDED = Path(__file__).with_name("data") / "sitl_dive.tlog.xz"
+"""The log that comes along."""
 _NORMS = ("position", "rotation", "linear_velocity", "angular_velocity")
 _UNITS = ("m", "rad", "m/s", "rad/s")
 
 
 def demo(
-    log: Path | None,
+    source: Path,
     out: Path,
+    scenario: Scenario,
+    config: TrainingConfig,
     vehicle_name: str | None = None,
-    scenario_name: str = "pylon_crossing_calm",
-    steps: int | None = None,
 ) -> str:
     """Do it all, write it into `out` and return the summary.
 
@@ -45,11 +46,6 @@ def demo(
         UserError: the log can't be used; the sentence says why.
     """
     began = time.monotonic()
-    source = EMBEDDED if log is None else log
-    scenario = load_scenario(scenario_name)
-    config = TrainingConfig()
-    if steps is not None:
-        config = replace(config, steps=steps)
     with progress_bar(f"1/4 reading {source.name}") as update:
         recording = load_data(source, vehicle=vehicle_name, progress=update)
     vehicle = load_vehicle(recording.vehicle or "bluerov2_heavy")

@@ -1,6 +1,6 @@
 """`spinndrift demo`: the main job from end to end."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 
@@ -27,7 +27,13 @@ class Demo:
 
     def run(self) -> None:
         """Run the demo and print its summary."""
-        from ..demo import demo
+        from ...training.config import TrainingConfig
+        from ..demo import EMBEDDED, demo
         from ..progress import console
+        from ..scenario import load_scenario
 
-        console().print(demo(self.log, self.out, self.vehicle, self.scenario, self.steps))
+        config = TrainingConfig()
+        if self.steps is not None:
+            config = replace(config, steps=self.steps)
+        source = EMBEDDED if self.log is None else self.log
+        console().print(demo(source, self.out, load_scenario(self.scenario), config, self.vehicle))

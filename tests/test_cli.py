@@ -1,0 +1,150 @@
+"""The console command: it teaches, it refuses bad input in one sentence, it leaves whole files."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from helpers import run_python
+from spinndrift.models import config as yaml
+from spinndrift.models.checkpoint import load_model
+from spinndrift.models.recording import Recording
+from spinndrift.models.spinn import Spinn, SpinnConfig
+from spinndrift.sims.cli import main
+from spinndrift.sims.demo import EMBEDDED
+from spinndrift.training.config import PretrainConfig, TrainingConfig, WindowConfig
+from spinndrift.training.losses import Mse
+
+TINY = TrainingConfig(
+    objective=Mse(),
+    model=SpinnConfig(width=4, depth=1, constant_mass=True),
+    windows=WindowConfig(length_s=0.5, stride_s=0.5, gap_s=0.25),
+    pretrain=PretrainConfig(steps=2, batch=8),
+    steps=4,
+    batch=2,
+    validate_every=2,
+    checkpoint_every=2,
+    refit_at=(),
+)
+
+
+def called(*arguments):
+    """Exit code of the command; None is success."""
+    try:
+        main([str(a) for a in arguments])
+    except SystemExit as end:
+        return end.code
+    return None
+
+
+@pytest.fixture(scope="module")
+def generated(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("generated")
+    path = folder / "tiny.nc"
+    code = called(
+        "generate", "--out", path, "--maneuvers", "surge-forward", "yaw-left", "--trajectories", "3",
+        "--duration", "2", "--substeps", "2", "--disturbances", "calm",
+    )  # fmt: skip
+    assert code is None
+    return path
+
+
+@pytest.mark.smoke
+def test_help_names_every_command(capsys):
+    assert called("--help") == 0
+    told = capsys.readouterr().out
+    for command in ("import", "generate", "train", "evaluate", "run", "demo"):
+        assert re.search(rf"\b{command}\b", told)
+
+
+@pytest.mark.parametrize("command", ["import", "generate", "train", "evaluate", "run", "demo"])
+def test_every_option_is_explained(command, capsys):
+    assert called(command, "--help") == 0
+    told = capsys.readouterr().out
+    for option in re.findall(r"^│ (?:-\w, )?(--[\w-]+)", told, re.MULTILINE):
+        after = told.split(option, 1)[1]
+        words = re.sub(r"[│\s]+", " ", after.split("│ --")[0])
+        assert len(words.split()) > 4, f"{command} {option} has no explanation"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("import", "missing.tlog"), ("missing.tlog", "no such file")),
+        (("import", EMBEDDED, "--out", "x.csv"), ("x.csv", ".nc")),
+        (("import", EMBEDDED, "--rate", "0"), ("rate",)),
+        (("import", EMBEDDED, "--vehicle", "submarine"), ("submarine", "bluerov2_heavy")),
+        (("train", "garbage.nc"), ("garbage.nc",)),
+        (("train", EMBEDDED, "--config", "garbage.yaml"), ("garbage.yaml", "stepz")),
+        (("evaluate", "garbage.spinn", EMBEDDED), ("garbage.spinn",)),
+        (("run", "no_such_scenario"), ("no_such_scenario", "pylon_crossing_calm")),
+        (("run", "station_keeping_calm", "--scenario-text", "duration: -1"), ("duration",)),
+        (("demo", "--log", "empty.tlog"), ("empty.tlog",)),
+        (("generate", "--maneuvers", "loop"), ("loop", "surge")),
+    ],
+)
+def test_bad_input_is_refused_in_one_sentence(arguments, words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "garbage.nc").write_bytes(b"no recording")
+    (tmp_path / "garbage.spinn").write_bytes(b"no model")
+    (tmp_path / "garbage.yaml").write_text("stepz: 3\n")
+    (tmp_path / "empty.tlog").write_bytes(b"")
+    before = {p.name for p in tmp_path.iterdir()}
+    assert called(*arguments) == 2
+    told = capsys.readouterr().err
+    for word in words:
+        assert word in told
+    assert "Traceback" not in told
+    left = {p.name for p in tmp_path.rglob("*") if p.is_file()}
+    assert left == before, "something half written was left"
+
+
+def test_an_error_in_a_fresh_process_has_exit_code_two():
+    code = (
+        "import subprocess, sys\n"
+        "done = subprocess.run([sys.executable, '-c', 'from spinndrift.sims.cli import main; "
+        'main(["import", "missing.BIN"])\'], capture_output=True, text=True)\n'
+        "print(done.returncode, len(done.stderr.strip().splitlines()))"
+    )
+    assert run_python(code).split() == ["2", "1"]
+
+
+def test_import_writes_a_recording(tmp_path, capsys):
+    out = tmp_path / "dive.nc"
+    assert called("import", EMBEDDED, "--out", out, "--rate", "10") is None
+    recording = Recording.load(out)
+    assert recording.dt == pytest.approx(0.1)
+    assert recording.commands == ("pwm",)
+    assert "Thruster outputs" in capsys.readouterr().err
+
+
+def test_generate_writes_what_was_asked_for(generated):
+    recording = Recording.load(generated)
+    assert recording.scenarios == ("surge-forward", "yaw-left")
+    assert recording.lengths.shape == (2, 3)
+    surge = recording.select("surge-forward").dataset["V_WB_B"].to_numpy()[..., -1, 0]
+    assert np.all(surge > 0.1)
+
+
+def test_train_resume_and_evaluate(generated, tmp_path, capsys):
+    settings, out = tmp_path / "tiny.yaml", tmp_path / "run"
+    settings.write_text(yaml.dump(TINY))
+    assert called("train", generated, "--config", settings, "--out", out) is None
+    model, metadata = load_model(out / "model.spinn")
+    assert isinstance(model, Spinn)
+    assert metadata["vehicle"] == "bluerov2_heavy"
+    report = (out / "report.html").read_text()
+    assert "Held-out error" in report
+    assert "data:image" in report
+    assert called("train", generated, "--config", settings, "--out", out) == 2
+    assert "--resume" in capsys.readouterr().err
+    more = ("--resume", "--steps", "6")
+    assert called("train", generated, "--config", settings, "--out", out, *more) is None
+    assert len((out / "metrics.csv").read_text().splitlines()) == 7
+    results = tmp_path / "results.json"
+    arguments = (out / "model.spinn", generated, "--length", "0.5", "--out", results)
+    assert called("evaluate", *arguments) is None
+    overall = json.loads(results.read_text())
+    assert set(overall) == {"preset", "learned"}
+    assert 0 < overall["learned"]["rmse_position"] < 1

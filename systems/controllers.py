@@ -208,6 +208,7 @@ class MppiImpedance(Controller):
             SphereHull.cover(vehicle.size),
             self.goal.pose(),
             config=self.planner,
+            tracking=self.tracking.gains.matrices(model) if self.planner.tracked else None,
         )
         c = self.planner
         return self.tracking.build(station, Mppi(planner), c.layout, model, c.period)

@@ -18,7 +18,8 @@ class MppiConfig:
         dt: length of a step (s).
         period: time between calls (s), a multiple of `dt`: the warm start shifts by it.
         sequences: control sequences sampled in a call.
-        realisations: noise paths each of them meets; 1 plans with the model's drift alone.
+        realisations: noise paths each of them meets, an even number (pairs of opposite sign); 1
+            plans with the model's drift alone.
             `sequences` × `realisations` is the number of rollouts.
         pose_weight: diagonal of L in ‖log(g⁻¹ g_goal)‖²_L (1/m² and 1/rad²).
         twist_weight: diagonal of Q in ‖ξ_goal − ξ‖²_Q (s²/m² and s²/rad²).
@@ -46,6 +47,8 @@ class MppiConfig:
             by which the clearance would have to grow.
         clearance_std: least standard deviation (m) of the clearance; stands for what the model's
             noise leaves out (state estimate, obstacle positions).
+        tracked: the noise paths are held to the plan by the tracking controller's gains, as the
+            vehicle will be; false lets them stray over the whole horizon.
         shown_paths: sampled paths in the output for reports.
     """
 
@@ -72,7 +75,8 @@ class MppiConfig:
     cvar_part: float = 0.5
     collision_risk: float | None = 0.05
     risk_weight: float = 300.0
-    clearance_std: float = 0.05
+    clearance_std: float = 0.08
+    tracked: bool = True
     shown_paths: int = 48
 
     def __post_init__(self) -> None:
@@ -80,6 +84,8 @@ class MppiConfig:
         check_numbers(self)
         for name in ("horizon", "sequences", "realisations", "shown_paths"):
             require(getattr(self, name) >= 1, self, name, "give a whole number of 1 or more")
+        even = self.realisations == 1 or self.realisations % 2 == 0
+        require(even, self, "realisations", "give 1 or an even number")
         positive = (
             "dt",
             "period",

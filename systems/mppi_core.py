@@ -5,6 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..models import se3
@@ -65,6 +66,11 @@ class MppiPlanner(eqx.Module):
     mean, best sample and last plan the one of least cost is taken: a mean of passing left and of
     passing right of a pylon is never flown. The plan's states are the model's drift under it.
 
+    With `tracking` gains the noise paths are those of a vehicle that is held to the plan, as it
+    will be: the two paths of a pair are drawn to their middle, which stands for the path without
+    noise, by K_p log(g⁻¹ g_mid) + K_d (ξ_mid − ξ). Without them a path strays ever further, as the
+    problem above has it, and the plan shuns gaps that the tracked vehicle passes safely.
+
     `F_bias_W` is a wrench about Bo with axes of W that acts besides the model's (an observed
     current, say); the plan's wrenches then contain what counters it.
     """
@@ -77,6 +83,7 @@ class MppiPlanner(eqx.Module):
     V_goal: Float[Array, "6"]
     axes: Float[Array, "6"]
     bases: tuple[Float[Array, "horizon _"], ...]
+    tracking: tuple[Float[Array, "6 6"], Float[Array, "6 6"]] | None
     config: MppiConfig = eqx.field(static=True)
 
     def __init__(
@@ -88,9 +95,13 @@ class MppiPlanner(eqx.Module):
         X_WG: Float[Array, "7"],
         V_goal: Float[Array, "6"] | None = None,
         config: MppiConfig | None = None,
+        tracking: tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, "6 6"]] | None = None,
         dtype: jnp.dtype | type = jnp.float32,
     ):
-        """`X_WG` is the goal's pose, `V_goal` its twist in B; all arrays are cast to `dtype`."""
+        """`X_WG` is the goal's pose, `V_goal` its twist in B, `tracking` K_p and K_d (or None).
+
+        All arrays are cast to `dtype`.
+        """
         self.config = MppiConfig() if config is None else config
         self.dynamics = cast(dynamics, dtype)
         self.limits = cast(limits, dtype)
@@ -99,6 +110,9 @@ class MppiPlanner(eqx.Module):
         self.X_WG = jnp.asarray(X_WG, dtype)
         self.V_goal = jnp.zeros(6, dtype) if V_goal is None else jnp.asarray(V_goal, dtype)
         self.axes = eqx.filter_jit(type(limits).axes)(limits).astype(dtype)
+        self.tracking = None
+        if tracking is not None:
+            self.tracking = jnp.asarray(tracking[0], dtype), jnp.asarray(tracking[1], dtype)
         self.bases = tuple(
             jnp.asarray(spline_basis(self.config.horizon, k), dtype) for k in self.config.knots
         )
@@ -212,18 +226,29 @@ class MppiPlanner(eqx.Module):
     def _process_noise(self, key: Array) -> Float[Array, "horizon 6 r"] | None:
         """Brownian increments (√s) for the realisations; None for a single one.
 
-        Pairs have opposite signs, so the mean is that without noise, and each axis is scaled to the
-        mean square that its Brownian path has over the horizon: a handful of realisations then
-        spreads as much as many would.
+        Pairs have opposite signs, so the mean is that without noise. Where paths stray freely, each
+        axis is scaled to the mean square that its Brownian path has over the horizon: a handful of
+        them then spreads as much as many would.
         """
         c = self.config
         if c.realisations == 1:
             return None
-        half = (c.realisations + 1) // 2
-        dW = jax.random.normal(key, (c.horizon, 6, half), self.V_goal.dtype) * c.dt**0.5
-        sampled = jnp.mean(jnp.cumsum(dW, axis=0) ** 2, axis=(0, 2))
-        dW = dW * jnp.sqrt(c.dt * (c.horizon + 1) / 2 / sampled)[None, :, None]
-        return jnp.concatenate([dW, -dW], axis=2)[:, :, : c.realisations]
+        shape = (c.horizon, 6, c.realisations // 2)
+        dW = jax.random.normal(key, shape, self.V_goal.dtype) * c.dt**0.5
+        if self.tracking is None:
+            sampled = jnp.mean(jnp.cumsum(dW, axis=0) ** 2, axis=(0, 2))
+            dW = dW * jnp.sqrt(c.dt * (c.horizon + 1) / 2 / sampled)[None, :, None]
+        return jnp.concatenate([dW, -dW], axis=2)
+
+    def _pull(self, X: Array, V: Array, n: int) -> Array:
+        """What tracking adds for n sequences: it draws each path to the middle of its pair."""
+        assert self.tracking is not None
+        K_p, K_d = self.tracking
+        half = self.config.realisations // 2 * n
+        first, second = slice(0, half), slice(half, 2 * half)
+        to_middle = se3.local(X[:, first], X[:, second]) / 2
+        pull = K_p @ to_middle + K_d @ ((V[:, second] - V[:, first]) / 2)
+        return jnp.concatenate([pull, -pull, jnp.zeros_like(V[:, 2 * half :])], axis=1)
 
     def _cut(self, F: Array) -> Array:
         """Wrenches (horizon, 6, …) cut to the feasible set."""
@@ -254,6 +279,8 @@ class MppiPlanner(eqx.Module):
             X, V, cost, least = carry
             F, dW, terminal = inputs
             wrench = jnp.tile(F, (1, r)) + _in_body(X, bias)
+            if self.tracking is not None and dW is not None:
+                wrench = wrench + self._pull(X, V, n)
             X, V = step(
                 self.dynamics, X, V, wrench, c.dt, None if dW is None else jnp.repeat(dW, n, 1)
             )

@@ -11,6 +11,7 @@ from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, RandomSource
+from scipy.linalg import solve_discrete_lyapunov
 
 from spinndrift.models import se3
 from spinndrift.models.errors import UserError
@@ -133,6 +134,7 @@ def among(diffusion=0.0, pylons=PYLON, config=AMONG, **more):
         HULL,
         more.pop("goal", at(2.0)),
         config=config,
+        **more,
     )
 
 
@@ -193,6 +195,30 @@ def test_noise_paths_have_the_brownian_mean_and_spread():
     np.testing.assert_allclose(jnp.mean(W, axis=2), 0, atol=1e-6)
     times = 0.1 * np.arange(1, 41)
     np.testing.assert_allclose(jnp.mean(W**2, axis=(0, 2)), np.mean(times), rtol=1e-5)
+
+
+def test_a_tracked_vehicle_may_pass_closer_than_one_left_to_the_noise():
+    """Spread with feedback is that of the linear closed loop, so less room is asked for."""
+    w, b = 1.5, 3.0
+    gains = (np.diag(w**2 * np.diag(MASS)), np.diag(2 * w * np.diag(MASS)))
+    config = replace(AMONG, horizon=120, realisations=40, sequences=50)
+    spreads = []
+    for tracking in (None, gains):
+        planner = among(b, pylons=[], config=config, tracking=tracking)
+        dW = planner._process_noise(jax.random.key(7))
+        F = jnp.zeros((120, 6, 1), jnp.float32)
+        zero = jnp.zeros(6, jnp.float32)
+        roll = jax.jit(
+            lambda p, dW, F=F, zero=zero: p._rollouts(
+                at(0.0).astype("f4"), zero, F, zero, dW, lambda X, V: (X[4:],)
+            )
+        )
+        spreads.append(jnp.var(roll(planner, dW).kept[0][60:, 0], axis=1).mean())
+    h, drag = 0.1, 0.5  # x'' + (2w + drag) x' + w² x = (b/m) white noise, in the planner's steps
+    A = np.array([[1.0, h], [-h * w**2, 1 - h * (2 * w + drag)]])
+    expected = solve_discrete_lyapunov(A, np.diag([0.0, h * (b / 20.0) ** 2]))[0, 0]
+    assert float(spreads[1]) == pytest.approx(expected, rel=0.35)  # 40 paths, 10 correlation times
+    assert float(spreads[0]) > 20 * float(spreads[1])
 
 
 def test_a_start_inside_a_pylon_gives_finite_numbers_and_a_way_out():

@@ -1,0 +1,15 @@
+"""Every example runs as a script and does what it says."""
+
+import re
+import runpy
+
+from helpers import ROOT
+
+
+def test_own_controller_holds_station_in_the_harbour(capsys):
+    runpy.run_path(str(ROOT / "examples" / "own_controller.py"), run_name="__main__")
+    out = capsys.readouterr().out
+    found = re.search(r"largest error ([\d.]+) m, after 20 s ([\d.]+) m", out)
+    assert found, out
+    assert float(found[1]) < 0.5
+    assert float(found[2]) < 0.3

@@ -1,0 +1,203 @@
+"""The station, the controllers that plug into it, and the closed loop."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pydrake.common import RandomGenerator
+from pydrake.systems.analysis import MonteCarloSimulation, Simulator
+from pydrake.systems.framework import System
+
+from helpers import ROOT
+from spinndrift.models.config import dump, loads
+from spinndrift.models.disturbances import GaussMarkovCurrent
+from spinndrift.models.errors import UserError
+from spinndrift.models.vehicle import load_vehicle
+from spinndrift.systems.closed_loop import build_diagram, logged, seeded
+from spinndrift.systems.controllers import MppiImpedance, Own, Tracking, TrackReference
+from spinndrift.systems.mppi_config import MppiConfig
+from spinndrift.systems.obstacles import BoxHull, Cylinders, Pylon
+from spinndrift.systems.paths import HoldPose, PoseConfig
+from spinndrift.systems.station import make_station, station_ports
+from spinndrift.systems.station_config import StationConfig
+
+START = PoseConfig((0.0, 0.0, -1.5))
+HARBOUR = StationConfig(disturbance_set="harbour", seed=3)
+HOLD = TrackReference(HoldPose(START))
+PID = f"{ROOT / 'examples' / 'own_controller.py'}:PidController"
+
+
+def ports(system: System) -> tuple[dict[str, int], dict[str, int]]:
+    inputs = [system.get_input_port(i) for i in range(system.num_input_ports())]
+    outputs = [system.get_output_port(i) for i in range(system.num_output_ports())]
+    return (
+        {p.get_name(): p.size() for p in inputs},
+        {p.get_name(): p.size() for p in outputs},
+    )
+
+
+def run(station, controller, seconds):
+    return fly(build_diagram(station, controller), seconds, station.seed)
+
+
+def fly(diagram, seconds, seed):
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    seeded(diagram, context, seed)
+    simulator.AdvanceTo(seconds)
+    return logged(diagram, context)
+
+
+@pytest.fixture(scope="module")
+def diagram():
+    """Holds a pose in the harbour; compiled once for all tests."""
+    return build_diagram(HARBOUR, HOLD)
+
+
+@pytest.fixture(scope="module")
+def harbour_hold(diagram):
+    return fly(diagram, 12.0, HARBOUR.seed)
+
+
+def test_the_simulated_station_has_the_ports_of_the_hardware_and_its_cheats():
+    inputs, outputs = station_ports(hardware=True)
+    more = station_ports()[1]
+    assert set(more) - set(outputs) == {
+        "X_WB_cheat",
+        "V_WB_B_cheat",
+        "F_disturbance_cheat",
+        "flow_cheat",
+    }
+    assert ports(make_station(StationConfig())) == (inputs, more)
+
+
+def test_hardware_says_that_it_is_not_there():
+    with pytest.raises(NotImplementedError, match="hardware=False"):
+        make_station(StationConfig(), hardware=True)
+
+
+def test_it_holds_a_pose_in_the_harbour(harbour_hold):
+    X = harbour_hold["X_WB_cheat"]
+    late = X.time > 6.0
+    error = np.linalg.norm(X.value[late, 4:] - np.array(START.position), axis=1)
+    assert np.max(error) < 0.35
+    assert np.max(np.abs(harbour_hold["flow_cheat"].value[:, :3])) > 0.1
+
+
+def test_the_observer_sees_the_currents_push():
+    """Steady state: in a current alone the observer says its drag, D v + D^f v², in W."""
+    current = GaussMarkovCurrent(mean_speed=0.3, std_speed=0.0, direction=0.7, std_direction=0.0)
+    bias = run(StationConfig(disturbances=(current,)), HOLD, 12.0)["F_bias_Bo_W"]
+    drag = load_vehicle("bluerov2_heavy").dynamics().drag_wrench
+    v = 0.3 * np.array([np.cos(0.7), np.sin(0.7), 0.0])
+    expected = drag(jnp.asarray([*v, 0.0, 0.0, 0.0]))
+    push = bias.value[bias.time > 8.0].mean(axis=0)
+    np.testing.assert_allclose(push[:2], -expected[:2], rtol=0.15)
+
+
+def test_every_signal_is_logged_at_its_rate(harbour_hold):
+    _, outputs = station_ports()
+    for name, size in {**outputs, "F_Bo_B": 6, "plan": 400}.items():
+        signal = harbour_hold[name]
+        if name != "plan":
+            assert signal.value.shape[1] == size
+        assert signal.value.shape[0] == signal.time.size
+        assert np.all(np.isfinite(signal.value))
+    np.testing.assert_allclose(np.diff(harbour_hold["X_WB"].time), 0.05, atol=1e-9)
+    np.testing.assert_allclose(np.diff(harbour_hold["plan"].time), 0.2, atol=1e-9)
+
+
+def test_equal_seeds_give_equal_runs_bit_for_bit(diagram, harbour_hold):
+    other = fly(diagram, 1.0, HARBOUR.seed + 1)
+    again = fly(diagram, 1.0, HARBOUR.seed)
+    for name, signal in again.items():
+        n = signal.time.size - 1  # the first run goes on at its last time
+        np.testing.assert_array_equal(signal.value[:n], harbour_hold[name].value[:n])
+    assert not np.array_equal(other["X_WB_cheat"].value, again["X_WB_cheat"].value)
+
+
+def test_it_runs_in_drakes_monte_carlo_simulation(diagram):
+    station: Any = diagram.GetSubsystemByName("station")
+
+    def output(system, root):
+        context = station.GetMyContextFromRoot(root)
+        return float(station.GetOutputPort("X_WB_cheat").Eval(context)[4])
+
+    samples = MonteCarloSimulation(
+        lambda generator: Simulator(diagram),
+        output,
+        0.3,
+        3,
+        RandomGenerator(1),
+    )
+    values = [sample.output for sample in samples]
+    assert len(set(values)) == 3
+
+
+def test_the_planner_crosses_between_pylons_and_keeps_clear():
+    """A short crossing in the harbour; `sims` flies the long one over many seeds."""
+    pylons = (Pylon(1.0, -0.1), Pylon(1.0, 1.4), Pylon(1.0, -1.6))
+    station = StationConfig(disturbance_set="harbour", obstacles=pylons, seed=2)
+    planner = MppiConfig(horizon=40, dt=0.1, sequences=120, realisations=4, shown_paths=8)
+    logs = run(station, MppiImpedance(PoseConfig((2.0, -0.2, -1.5)), planner), 9.0)
+    X = logs["X_WB_cheat"].value
+    hull = BoxHull.create(load_vehicle(station.vehicle).size)
+    clearance = jax.jit(lambda X: hull.clearance(X, Cylinders.create(pylons)))(jnp.asarray(X.T))
+    assert np.min(clearance) > 0
+    assert np.linalg.norm(X[-1, 4:] - np.array([2.0, -0.2, -1.5])) < 0.5
+    assert logs["samples"].value.shape[1] == 1 + (3 * 40 + 1) * 8
+    assert np.all(logs["figures"].value[1:, -1] == 1)
+
+
+def test_a_controller_of_ones_own_plugs_in_with_its_parameters():
+    own: Any = Own(PID, {"x": 0.2, "z": -1.4}).build(StationConfig(vehicle="bluerov2_heavy_ng"))
+    np.testing.assert_array_equal(own.goal, [0.2, 0.0, -1.4])
+    mass = load_vehicle("bluerov2_heavy_ng")
+    np.testing.assert_allclose(own.P, 2 * (mass.mass + np.array(mass.added_mass[:3])))
+
+
+def test_wrong_controllers_are_refused_with_a_remedy(tmp_path):
+    (tmp_path / "wrong.py").write_text(
+        "from pydrake.systems.primitives import PassThrough\n"
+        "class Wrong(PassThrough):\n"
+        "    def __init__(self):\n"
+        "        super().__init__(3)\n"
+        "number = 3\n"
+    )
+    cases = {
+        "nowhere": "file.py:ClassName",
+        "nowhere.py:A": "no file",
+        "no_such_module:A": "no module",
+        f"{tmp_path / 'wrong.py'}:number": "no Drake system",
+        f"{tmp_path / 'wrong.py'}:Wrong": "`X_WB` of size 7",
+    }
+    for system, message in cases.items():
+        with pytest.raises(UserError, match=message):
+            build_diagram(StationConfig(), Own(system))
+    with pytest.raises(UserError, match="colour"):
+        build_diagram(StationConfig(), Own(PID, {"colour": "red"}))
+
+
+def test_configurations_come_back_from_yaml():
+    text = """
+    vehicle: bluerov2_heavy
+    disturbance_set: calm
+    disturbances:
+      - !GaussMarkovCurrent {mean_speed: 0.3}
+    obstacles: [{x: 1.0, y: 2.0, diameter: 0.4}]
+    start: {position: [0, 0, -2], rpy_deg: [0, 0, 90]}
+    seed: 7
+    """
+    station = loads(StationConfig, text)
+    assert loads(StationConfig, dump(station)) == station
+    assert len(station.disturbance().members) == 2
+    controller = MppiImpedance(PoseConfig((1.0, 0.0, -1.0)), tracking=Tracking(observer=None))
+    assert loads(MppiImpedance, dump(controller)) == controller
+    with pytest.raises(UserError, match="disturbance"):
+        loads(StationConfig, "disturbance_set: typhoon")
+    with pytest.raises(UserError, match="seed"):
+        loads(StationConfig, "seed: -1")
+    with pytest.raises(UserError, match="voltage"):
+        loads(StationConfig, "voltage: 0.0")

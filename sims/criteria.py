@@ -115,6 +115,7 @@ class Monitor:
         self._spinning_since: float | None = None
         self._near = 0.0
         self._best, self._best_time = np.inf, 0.0
+        self._first, self._nearest = 0.0, np.inf
         self._before: float | None = None
 
     def check(
@@ -140,7 +141,18 @@ class Monitor:
             return self._towards(self.success, t, step, float(np.linalg.norm(X_WB[4:] - self.goal)))
         return None
 
+    @property
+    def progress(self) -> float:
+        """Part of the way to the goal that is behind the vehicle, 0 to 1; 0 without a goal."""
+        if not isinstance(self.success, ReachGoal) or not self._first > self.success.radius:
+            return 0.0
+        left = (self._nearest - self.success.radius) / (self._first - self.success.radius)
+        return float(np.clip(1 - left, 0, 1))
+
     def _towards(self, rule: ReachGoal, t: float, step: float, distance: float) -> Outcome | None:
+        if not np.isfinite(self._nearest):
+            self._first = distance
+        self._nearest = min(self._nearest, distance)
         if distance <= rule.radius:
             return Outcome("goal", t, f"The vehicle reached the goal after {t:.1f} s.")
         if distance <= rule.near_radius:

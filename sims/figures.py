@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, ParamSpec
+from typing import Any, ParamSpec, TypeVar
 
 import matplotlib
 import numpy as np
@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 P = ParamSpec("P")
+F = TypeVar("F")
 
 FLOWN, PLANNED, ESTIMATE = "#14607a", "#d9772b", "#7b5ea7"
 OBSTACLE, GOAL, LIMIT, WATER = "#8b96a1", "#2e8b57", "#b0413e", "#3d8fc4"
@@ -47,11 +48,11 @@ _STYLE = {
 }
 
 
-def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+def styled(draw: Callable[P, F]) -> Callable[P, F]:
     """Draw a figure in the reports' style, leaving matplotlib's settings as they were."""
 
     @wraps(draw)
-    def wrapper(*args: P.args, **kwargs: P.kwargs) -> Figure:
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> F:
         with matplotlib.rc_context(_STYLE):
             return draw(*args, **kwargs)
 

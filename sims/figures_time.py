@@ -11,7 +11,6 @@ from .figures import (
     GOAL,
     LIMIT,
     OBSTACLE,
-    PLANNED,
     WATER,
     at_least,
     legend,
@@ -124,7 +123,7 @@ def pwm_figure(log: RunLog, dead_band: tuple[float, float] = (1475.0, 1525.0)) -
 
 @styled
 def disturbance_figure(log: RunLog) -> Figure | None:
-    """Motion of the water at the vehicle, and the wrench that pushes besides; None if not logged."""
+    """The water's motion at the vehicle, and the wrench besides; None if not logged."""
     if "flow_W" not in log and "F_disturbance_Bo_B" not in log:
         return None
     figure, axes = panels(3, 1, 5.2, sharex=True)
@@ -138,9 +137,9 @@ def disturbance_figure(log: RunLog) -> Figure | None:
     F = log["F_disturbance_Bo_B"] if "F_disturbance_Bo_B" in log else np.zeros((log.time.size, 6))
     lines(axes[1, 0], log.time, F[:, :3], _XYZ, lw=0.9)
     lines(axes[2, 0], log.time, F[:, 3:], _ANGLES, lw=0.9)
-    axes[1, 0].set_title("Force besides the water's, in B")
+    axes[1, 0].set_title("Other pushes: force, in B")
     axes[1, 0].set_ylabel("N")
-    axes[2, 0].set_title("Moment, in B")
+    axes[2, 0].set_title("Other pushes: moment, in B")
     axes[2, 0].set_ylabel("N m")
     axes[2, 0].set_xlabel(_TIME)
     for ax in axes[:, 0]:
@@ -178,16 +177,15 @@ def progress_figure(
 
 @styled
 def planner_figure(log: RunLog) -> Figure | None:
-    """How sure the planner was: cost, risk, clearance it expected, samples that count."""
+    """How sure the planner was: cost, risk, clearance it expected."""
     plans = log.plans
     if plans is None or plans.figures is None or plans.time.size < 2:
         return None
-    figure, axes = panels(1, 4, 2.2, sharex=True)
+    figure, axes = panels(1, 3, 2.2, sharex=True)
     shown = (
         ("cost", "Cost of the plan", 1.0, FLOWN),
         ("collision_probability", "Collision risk / %", 100.0, LIMIT),
         ("clearance", "Expected clearance / m", 1.0, OBSTACLE),
-        ("effective_samples", "Samples that count", 1.0, PLANNED),
     )
     for ax, (name, title, scale, color) in zip(axes[0], shown, strict=True):
         values = scale * plans.figures[:, FIGURES.index(name)]

@@ -29,12 +29,12 @@ from .run_log import Plans, RunLog
 FRAMES = 20  # per second
 _PIECE = 0.5  # s of flown path that appear at once
 _PLANS = 120  # shown at most
-_PATHS, _STEPS = 24, 10  # of the sampled ones
+_PATHS, _STEPS = 20, 10  # of the sampled ones
 
 _WATER, _BED = Rgba(0.30, 0.62, 0.78, 0.22), Rgba(0.78, 0.72, 0.58, 1.0)
 _PYLON, _GOAL = Rgba(0.45, 0.42, 0.38, 1.0), Rgba(0.18, 0.62, 0.38, 0.30)
 _FLOWN, _PLANNED = Rgba(0.98, 0.83, 0.25, 1.0), Rgba(0.95, 0.42, 0.10, 1.0)
-_SAMPLED = Rgba(1.0, 1.0, 1.0, 0.45)
+_SAMPLED = Rgba(0.72, 0.82, 0.86, 0.4)
 _FRAME, _FLOAT = Rgba(0.13, 0.14, 0.16, 1.0), Rgba(0.10, 0.42, 0.75, 1.0)
 _TUBE, _RING = Rgba(0.80, 0.82, 0.85, 1.0), Rgba(0.07, 0.07, 0.08, 1.0)
 
@@ -148,7 +148,7 @@ def _flown(meshcat: Meshcat, log: RunLog) -> None:
     size = max(1, round(_PIECE / log.dt))
     for k in range(0, max(len(p) - 1, 0), size):
         path = f"flown/{k:05d}"
-        meshcat.SetLine(path, p[k : k + size + 1].T, 4.0, _FLOWN)
+        _tube(meshcat, path, p[k : k + size + 1 : max(1, size // 4)], 0.014, _FLOWN)
         _visible(meshcat, path, float(log.time[min(k + size, len(p) - 1)]), None)
 
 
@@ -159,13 +159,31 @@ def _planned(meshcat: Meshcat, plans: Plans, end: float) -> None:
     ends = [*(float(plans.time[k]) for k in shown[1:]), end + 1]
     for k, until in zip(shown, ends, strict=True):
         start = float(plans.time[k])
-        meshcat.SetLine(f"plan/{k:05d}", plans.X_WB[k][:, 4:].T, 5.0, _PLANNED)
+        _tube(meshcat, f"plan/{k:05d}", plans.X_WB[k][:, 4:], 0.03, _PLANNED)
         _visible(meshcat, f"plan/{k:05d}", start, until)
         if plans.p_WB is None:
             continue
         first, last = _segments(plans.p_WB[k], plans.X_WB[k][0, 4:])
         meshcat.SetLineSegments(f"samples/{k:05d}", first, last, 1.0, _SAMPLED)
         _visible(meshcat, f"samples/{k:05d}", start, until)
+
+
+def _tube(meshcat: Meshcat, path: str, p: np.ndarray, radius: float, rgba: Rgba) -> None:
+    """A polyline (n, 3) as a square tube: browsers draw lines one pixel thin."""
+    if len(p) < 2:
+        p = np.repeat(p, 2, axis=0) + np.array([[0.0, 0, 0], [1e-4, 0, 0]])
+    along = np.gradient(p, axis=0)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    side = np.cross(along, [0.0, 0.0, 1.0])
+    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+    up = np.cross(side, along)
+    corners = [p + radius * (a * side + b * up) for a, b in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+    vertices = np.stack(corners, axis=1).reshape(-1, 3)
+    k = 4 * np.arange(len(p) - 1)[:, None]
+    i, j = np.arange(4)[None], (np.arange(4)[None] + 1) % 4
+    faces = [np.stack([k + i, k + j, k + 4 + i]), np.stack([k + j, k + 4 + j, k + 4 + i])]
+    triangles = np.concatenate([face.reshape(3, -1) for face in faces], axis=1)
+    meshcat.SetTriangleMesh(path, vertices.T, triangles.astype(np.int32), rgba)
 
 
 def _segments(p: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

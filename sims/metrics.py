@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from ..models import se3
 from ..models.vehicle import Vehicle
+from ..systems.mppi import FIGURES
 from ..systems.obstacles import BoxHull, Cylinders, Pylon
 from .criteria import FollowPath, Outcome, ReachGoal
 from .run_log import RunLog
@@ -56,7 +57,8 @@ def verdict(
     if rms <= success.position_rms:
         return True, f"The vehicle followed its reference to {rms:.2f} m RMS over the whole run."
     return False, (
-        f"The vehicle was {rms:.2f} m RMS off its reference; {success.position_rms:g} m are allowed."
+        f"The vehicle was {rms:.2f} m RMS off its reference; {success.position_rms:g} m are "
+        "allowed."
     )
 
 
@@ -206,12 +208,12 @@ def _planner(log: RunLog) -> dict[str, Any]:
     plans = log.plans
     if plans is None or plans.figures is None:
         return {}
-    valid = plans.figures[:, 5] > 0.5
+    figures = {name: plans.figures[:, i] for i, name in enumerate(FIGURES)}
     return {
-        "calls": int(plans.time.size),
-        "without_plan": int(np.count_nonzero(~valid)),
-        "mean_effective_samples": float(plans.figures[:, 3].mean()),
-        "max_collision_probability": float(plans.figures[:, 1].max()),
+        "plans": int(plans.time.size),
+        "mean_collision_probability": float(figures["collision_probability"].mean()),
+        "max_collision_probability": float(figures["collision_probability"].max()),
+        "mean_effective_samples": float(figures["effective_samples"].mean()),
     }
 
 

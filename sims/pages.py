@@ -72,6 +72,7 @@ class Table:
     rows: Sequence[Sequence[object]]
     header: Sequence[str] = ()
     caption: str = ""
+    width: Literal["full", "half"] = "full"
     kind: str = "table"
 
     @property
@@ -169,10 +170,11 @@ class Page:
         rows: Mapping[str, object] | Iterable[Sequence[object]],
         header: Sequence[str] = (),
         caption: str = "",
+        width: Literal["full", "half"] = "full",
     ) -> "Page":
         """Add a table of rows, or of a mapping's keys and values."""
         pairs = rows.items() if isinstance(rows, Mapping) else rows
-        return self._add(Table([tuple(row) for row in pairs], tuple(header), caption))
+        return self._add(Table([tuple(row) for row in pairs], tuple(header), caption, width))
 
     def tiles(self, tiles: Iterable[Sequence[object]]) -> "Page":
         """Add key figures: (label, value) or (label, value, remark)."""

@@ -26,7 +26,17 @@ _NAMES = {
     "time_to_goal_s": "time to the goal (s)",
     "time_near_goal_s": "time near the goal (s)",
     "min_clearance_m": "least clearance (m)",
-    "length_m": "length of the path (m)",
+    "length_m": "length (m)",
+    "max_speed_m_s": "highest speed (m/s)",
+    "max_turn_rate_rad_s": "highest turn rate (rad/s)",
+    "position_within_3_sigma": "position within 3σ",
+    "attitude_within_3_sigma": "attitude within 3σ",
+    "velocity_within_3_sigma": "velocity within 3σ",
+    "position_nees": "position, mean of (error/σ)²",
+    "attitude_nees": "attitude, mean of (error/σ)²",
+    "velocity_nees": "velocity, mean of (error/σ)²",
+    "planner_median_ms": "one call of the planner, median (ms)",
+    "planner_p95_ms": "one call of the planner, 95 % below (ms)",
 }
 
 
@@ -63,7 +73,8 @@ def run_page(
     page.section("Commands", "The wrench that the controller asked for, and what it took.")
     page.figure(
         wrench_figure(log, limits),
-        "Commanded wrench in B. Dashed: what the thrusters can give along that axis alone.",
+        "Commanded wrench in B. The limit (dashed where it is near) is what the thrusters can give "
+        "along that axis alone.",
     )
     pwm = pwm_figure(log)
     if pwm is not None:
@@ -73,7 +84,10 @@ def run_page(
         page.section("Disturbances", "What the water did; the vehicle is told none of this.")
         page.figure(water, "Waves and currents act through the water's velocity at the vehicle.")
     page.section("Numbers")
-    page.table(_rows(values), header=("", "", ""))
+    for group, block in values.items():
+        if isinstance(block, dict) and block:
+            rows = [(_NAMES.get(k, _words(k)), v) for k, v in block.items() if k != "words"]
+            page.table(rows, caption=group.capitalize(), width="half")
     if scenario_text:
         page.section("Scenario").details("The whole scenario, defaults written out", scenario_text)
     return page.footer(_versions_line())
@@ -142,20 +156,6 @@ def _tiles(values: dict[str, Any]) -> list[tuple[str, str, str]]:
     return tiles
 
 
-def _rows(values: dict[str, Any]) -> list[tuple[str, str, object]]:
-    rows = []
-    for group, block in values.items():
-        if not isinstance(block, dict):
-            continue
-        first = True
-        for name, value in block.items():
-            if name == "words":
-                continue
-            rows.append((group if first else "", _NAMES.get(name, _words(name)), value))
-            first = False
-    return rows
-
-
 _UNITS = {
     "_m_s": "m/s",
     "_rad_s": "rad/s",
@@ -172,7 +172,7 @@ _UNITS = {
 def _words(name: str) -> str:
     for ending, unit in _UNITS.items():
         if name.endswith(ending):
-            return f"{name.removesuffix(ending).replace('_', ' ')} ({unit})"
+            return f"{name.removesuffix(ending).replace('_', ' ').replace('rms', 'RMS')} ({unit})"
     return name.replace("_", " ")
 
 

@@ -8,21 +8,17 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, Diagram, System
+from pydrake.systems.framework import Diagram
 
-from ..systems.closed_loop import Signal, build_diagram, logged, seeded
-from ..systems.filtering.error_state import ERRORS
+from ..systems.closed_loop import build_diagram, logged, seeded
 from .criteria import Monitor, Outcome
-from .run_log import Plans, RunLog
+from .run_log import RunLog
+from .run_signals import PlanTap, collect, log_periods
 from .scenario import Scenario
 
 Progress = Callable[[float, str], None]
-_PLAN_STEP = 0.2  # s between the states of a plan that are kept
 _WARM_UP = 0.45  # s: beyond the filter's delay, so that every event has occurred
 
 
@@ -79,16 +75,19 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Run:
     """
     tell = progress or (lambda fraction, remark: None)
     tell(0.0, "building")
-    diagram = build_diagram(scenario.station, scenario.controller, log_periods=_periods(scenario))
+    diagram = build_diagram(
+        scenario.station, scenario.controller, log_periods=log_periods(scenario)
+    )
     simulator = Simulator(diagram)
     context = simulator.get_mutable_context()
     seeded(diagram, context, scenario.seed)
     vehicle = scenario.station.load_vehicle()
     obstacles = scenario.station.obstacles
     monitor = Monitor(vehicle, obstacles, scenario.success, scenario.goal, scenario.safety)
+    tap = PlanTap(diagram, context, scenario.log.samples)
     with _stop_on_interrupt() as stopped:
-        outcome, timing = _fly(scenario, diagram, simulator, monitor, tell, stopped)
-    log = _collect(scenario, diagram, context, outcome)
+        outcome, timing = _fly(scenario, diagram, simulator, monitor, tap, tell, stopped)
+    log = collect(scenario, logged(diagram, context), tap, outcome.time)
     return Run(scenario, log, outcome, timing)
 
 
@@ -97,6 +96,7 @@ def _fly(
     diagram: Diagram,
     simulator: Simulator,
     monitor: Monitor,
+    tap: PlanTap,
     tell: Progress,
     stopped: threading.Event,
 ) -> tuple[Outcome, Timing]:
@@ -105,15 +105,14 @@ def _fly(
     station = diagram.GetSubsystemByName("station")
     own = station.GetMyContextFromRoot(context)
     ports = [station.GetOutputPort(name) for name in ("X_WB_cheat", "V_WB_B_cheat")]
-    planned_every = _planner_period(scenario, diagram)
     dt = 1 / scenario.log.rate
     timing = Timing(dt=dt)
     steps = max(1, round(scenario.duration / dt))
-    tell(0.0, "compiling")
     started = time.perf_counter()
-    _warm_up(diagram, min(scenario.duration, _WARM_UP))
+    with _ticking(tell, "compiling"):
+        _warm_up(diagram, min(scenario.duration, _WARM_UP))
     timing.compilation = time.perf_counter() - started
-    k = 0
+    k, done, outcome = 0, 0.0, None
     try:
         simulator.Initialize()
         outcome = monitor.check(0.0, *(port.Eval(own) for port in ports))
@@ -122,18 +121,22 @@ def _fly(
             simulator.AdvanceTo((k + 1) * dt)
             spent = time.perf_counter() - started
             k += 1
-            t = k * dt
-            phase = ((k - 1) * dt + 1e-9) % (planned_every or 1.0)
-            timing.add(spent, planned_every is not None and phase < dt - 1e-9)
+            t = round(k * dt, 9)
+            phase = ((k - 1) * dt + 1e-9) % (tap.period or 1.0)
+            timing.add(spent, tap.period is not None and phase < dt - 1e-9)
+            tap.read(t - dt)
             outcome = monitor.check(t, *(port.Eval(own) for port in ports))
             if outcome is None and k >= steps:
                 outcome = Outcome("duration", t, f"The time was over after {t:.1f} s.")
             if outcome is None and stopped.is_set():
                 outcome = Outcome("interrupted", t, f"Stopped by hand after {t:.1f} s.")
             if k % 5 == 0:
-                tell(k / steps, f"{t:.0f} s, {timing.speed(200):.1f} × real time")
+                done = max(done, k / steps, monitor.progress)
+                tell(done, f"{t:.0f} s, {timing.speed(200):.1f} × real time")
+        # one period more, in which the filter has its say on the last sample
+        simulator.AdvanceTo(k * dt + scenario.station.period)
     except FloatingPointError as error:  # the plant names what was not finite
-        outcome = Outcome("not finite", k * dt, str(error))
+        outcome = outcome or Outcome("not finite", round(k * dt, 9), str(error))
     return outcome, timing
 
 
@@ -145,34 +148,22 @@ def _warm_up(diagram: Diagram, duration: float) -> None:
         simulator.AdvanceTo(duration)
 
 
-def _planner_period(scenario: Scenario, diagram: Diagram) -> float | None:
-    """How often the controller plans (s), None if it doesn't."""
-    source = _plan_source(diagram)
-    planner = getattr(source, "planner", None)
-    return None if planner is None else float(planner.config.period)
+@contextmanager
+def _ticking(tell: Progress, remark: str) -> Iterator[None]:
+    """Report every second that nothing is finished yet, while the block runs."""
+    over = threading.Event()
 
+    def tick() -> None:
+        while not over.wait(1.0):
+            tell(0.0, remark)
 
-def _plan_source(diagram: Diagram) -> System | None:
-    """The controller's subsystem that makes plans, if there is one."""
-    controller = diagram.GetSubsystemByName("controller")
-    if isinstance(controller, Diagram) and controller.HasSubsystemNamed("source"):
-        return controller.GetSubsystemByName("source")
-    return None
-
-
-def _periods(scenario: Scenario) -> dict[str, float]:
-    """How often each port is logged (s)."""
-    dt = 1 / scenario.log.rate
-    names = ("pwm", "X_WB_cheat", "V_WB_B_cheat", "F_disturbance_cheat", "flow_cheat", "plan")
-    periods = dict.fromkeys(names, dt)
-    fine = ("X_WB", "V_WB_B", "covariance", "F_Bo_B")
-    periods |= dict.fromkeys(fine, scenario.station.period)
-    planner = getattr(scenario.controller, "planner", None)
-    if planner is not None:
-        periods["figures"] = planner.period
-        if scenario.log.samples:
-            periods["samples"] = planner.period
-    return periods
+    thread = threading.Thread(target=tick, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 @contextmanager
@@ -193,111 +184,3 @@ def _stop_on_interrupt() -> Iterator[threading.Event]:
         yield event
     finally:
         signal.signal(signal.SIGINT, former)
-
-
-# ------------------------------------------------------------------------ from signals to the log
-
-
-def _collect(scenario: Scenario, diagram: Diagram, context: Context, outcome: Outcome) -> RunLog:
-    """One log on the uniform time grid of the run."""
-    signals = logged(diagram, context)
-    dt = 1 / scenario.log.rate
-    n = min(round(outcome.time / dt) + 1, len(signals["X_WB_cheat"].time))
-    finite = np.all(np.isfinite(signals["X_WB_cheat"].value[:n]), axis=1)
-    n = n if finite.all() else max(1, int(np.argmin(finite)))
-    grid = dt * np.arange(n)
-    # A log sees outputs before the updates of its time: what the filter says of t comes one period
-    # later. The truth of t is there at t.
-    told = np.searchsorted(signals["X_WB"].time, grid + 1.5 * scenario.station.period) - 1
-    variables = {
-        "X_WB": signals["X_WB_cheat"].value[:n],
-        "V_WB_B": signals["V_WB_B_cheat"].value[:n],
-        "F_Bo_B": _mean_over(signals["F_Bo_B"], grid, dt),
-        "pwm": signals["pwm"].value[:n],
-        "X_WB_estimate": signals["X_WB"].value[told],
-        "V_WB_B_estimate": signals["V_WB_B"].value[told],
-        "error_std": _deviations(signals["covariance"].value[told]),
-        "F_disturbance_Bo_B": signals["F_disturbance_cheat"].value[:n],
-        "flow_W": signals["flow_cheat"].value[:n],
-    }
-    source = _plan_source(diagram)
-    plans = None
-    if source is not None and "plan" in signals:
-        vectors = signals["plan"].value[:n]
-        variables |= _setpoints(source.layout, vectors, grid)
-        plans = _plans(source, vectors, signals)
-    return RunLog.create(
-        scenario.name,
-        dt,
-        variables,
-        plans,
-        vehicle=scenario.station.vehicle,
-        source=f"simulation of scenario {scenario.name}, seed {scenario.seed}",
-        notes=(
-            "X_WB and V_WB_B are the simulation's truth, not an estimate.",
-            "F_Bo_B is the mean of the commanded wrench over each step; the thrusters' lag is not "
-            "in it. pwm is the command at the sample.",
-            "flow_W and F_disturbance_Bo_B are known in simulation only.",
-        ),
-    )
-
-
-def _mean_over(
-    signal: Signal, grid: Float[np.ndarray, " n"], dt: float
-) -> Float[np.ndarray, "n size"]:
-    """Mean of a finer signal over [t, t + dt) for every t of the grid."""
-    index = np.clip(np.floor(signal.time / dt + 1e-6).astype(int), 0, None)
-    inside = index < grid.size
-    total = np.zeros((grid.size, signal.value.shape[1]))
-    count = np.zeros(grid.size)
-    np.add.at(total, index[inside], signal.value[inside])
-    np.add.at(count, index[inside], 1)
-    return total / np.maximum(count, 1)[:, None]
-
-
-def _deviations(covariance: Float[np.ndarray, "n flat"]) -> Float[np.ndarray, "n errors"]:
-    return np.sqrt(np.maximum(covariance[:, :: ERRORS + 1], 0))
-
-
-def _setpoints(
-    layout, vectors: Float[np.ndarray, "n size"], grid: Float[np.ndarray, " n"]
-) -> dict[str, np.ndarray]:
-    """The plan at every time of the grid, as the tracking controller reads it."""
-    wanted = jax.jit(jax.vmap(layout.at))(jnp.asarray(vectors), jnp.asarray(grid))
-    valid = np.asarray(wanted.valid)
-    rest = np.array([1.0, 0, 0, 0, 0, 0, 0])
-    return {
-        "X_WB_plan": np.where(valid[:, None], np.asarray(wanted.X_WB), rest),
-        "V_WB_B_plan": np.where(valid[:, None], np.asarray(wanted.V_WB_B), 0.0),
-        "plan_valid": valid.astype(float),
-    }
-
-
-def _plans(source, vectors: Float[np.ndarray, "n size"], signals) -> Plans | None:
-    """Every distinct plan, thinned."""
-    layout = source.layout
-    valid = vectors[:, 1] != 0  # the first quaternion of a plan of zeros has length zero
-    times, first = np.unique(vectors[valid, 0], return_index=True)
-    if times.size == 0:
-        return None
-    stride = max(1, round(_PLAN_STEP / layout.dt))
-    states = vectors[valid][first][:, 1 : 1 + 13 * (layout.horizon + 1)]
-    X = states.reshape(times.size, layout.horizon + 1, 13)[:, ::stride, :7]
-    extra = {}
-    if "samples" in signals:
-        sampled = signals["samples"].value
-        rows = _rows(sampled[:, 0], times, np.any(sampled[:, 1:] != 0, axis=1))
-        paths, steps = source.samples.paths, source.samples.horizon
-        split = 1 + 3 * steps * paths
-        p = sampled[rows, 1:split].reshape(times.size, steps, 3, paths)
-        extra["p_WB"] = p[:, stride - 1 :: stride].astype(np.float32)
-        extra["weights"] = sampled[rows, split:]
-        extra["figures"] = signals["figures"].value[rows]
-    return Plans(times, stride * layout.dt, X, **extra)
-
-
-def _rows(t0: np.ndarray, times: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """For each plan the row of the sample log that was made with it (the nearest earlier one)."""
-    kept = np.flatnonzero(usable)
-    index = np.searchsorted(t0[kept], times + 1e-9, side="right") - 1
-    return kept[np.clip(index, 0, kept.size - 1)]

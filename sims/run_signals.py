@@ -1,0 +1,159 @@
+"""From a flown diagram's signals to one log on a uniform grid."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from pydrake.systems.framework import Context, Diagram
+
+from ..systems.closed_loop import Signal
+from ..systems.filtering.error_state import ERRORS
+from .run_log import Plans, RunLog
+from .scenario import Scenario
+
+_PLAN_STEP = 0.2  # s between the states of a plan that are kept
+_NOTES = (
+    "X_WB and V_WB_B are the simulation's truth, not an estimate.",
+    "F_Bo_B is the mean of the commanded wrench over each step; the thrusters' lag is not in it. "
+    "pwm is the command at the sample.",
+    "flow_W and F_disturbance_Bo_B are known in simulation only.",
+)
+
+
+def log_periods(scenario: Scenario) -> dict[str, float]:
+    """How often each port of station and controller is logged (s)."""
+    coarse = ("pwm", "X_WB_cheat", "V_WB_B_cheat", "F_disturbance_cheat", "flow_cheat")
+    fine = ("X_WB", "V_WB_B", "covariance", "F_Bo_B")
+    return dict.fromkeys(coarse, 1 / scenario.log.rate) | dict.fromkeys(
+        fine, scenario.station.period
+    )
+
+
+class PlanTap:
+    """Keeps every plan that a controller makes, and what its planner sampled for it.
+
+    A controller whose diagram has a subsystem `source` with a `layout` makes plans; any other has
+    none, and nothing is kept.
+    """
+
+    def __init__(self, diagram: Diagram, root: Context, samples: bool = True):
+        controller = diagram.GetSubsystemByName("controller")
+        self.source: Any = None
+        self.kept: list[dict[str, np.ndarray]] = []
+        if isinstance(controller, Diagram) and controller.HasSubsystemNamed("source"):
+            source = controller.GetSubsystemByName("source")
+            if hasattr(source, "layout") and source.HasOutputPort("plan"):
+                self.source = source
+                self._context = source.GetMyContextFromRoot(root)
+                names = ("plan", "samples", "figures") if samples else ("plan", "figures")
+                self._ports = {
+                    name: source.GetOutputPort(name) for name in names if source.HasOutputPort(name)
+                }
+
+    @property
+    def period(self) -> float | None:
+        """How often a planner is called (s), None where there is none."""
+        planner = getattr(self.source, "planner", None)
+        return None if planner is None else float(planner.config.period)
+
+    def read(self, t: float) -> None:
+        """Keep the plan at hand if it is a new one; `t` (s) is the last time it may be of."""
+        if self.source is None:
+            return
+        plan = self._ports["plan"].Eval(self._context)
+        if self.kept and np.array_equal(plan, self.kept[-1]["plan"], equal_nan=True):
+            return
+        found = {name: port.Eval(self._context).copy() for name, port in self._ports.items()}
+        valid = np.isfinite(plan).all() and plan[1:5] @ plan[1:5] > 0.25
+        self.kept.append(found | {"time": np.array(plan[0] if valid else t), "valid": valid})
+
+    def setpoints(self, grid: Float[np.ndarray, " n"]) -> dict[str, np.ndarray]:
+        """The plan at every time of the grid, as the tracking controller reads it.
+
+        A plan made at t is there for those who read after t.
+        """
+        if self.source is None:
+            return {}
+        X, V = np.tile([1.0, 0, 0, 0, 0, 0, 0], (grid.size, 1)), np.zeros((grid.size, 6))
+        valid = np.zeros(grid.size)
+        if self.kept:
+            times = np.array([call["time"] for call in self.kept])
+            index = np.searchsorted(times, grid - 1e-9) - 1
+            vectors = np.stack([call["plan"] for call in self.kept])[np.maximum(index, 0)]
+            wanted = jax.jit(jax.vmap(self.source.layout.at))(
+                jnp.asarray(vectors), jnp.asarray(grid)
+            )
+            there = np.asarray(wanted.valid) & (index >= 0)
+            X = np.where(there[:, None], np.asarray(wanted.X_WB), X)
+            V = np.where(there[:, None], np.asarray(wanted.V_WB_B), V)
+            valid = there.astype(float)
+        return {"X_WB_plan": X, "V_WB_B_plan": V, "plan_valid": valid}
+
+    def plans(self, end: float) -> Plans | None:
+        """Every valid plan made before `end` (s), thinned."""
+        calls = [call for call in self.kept if call["valid"] and call["time"] < end + 1e-9]
+        if not calls:
+            return None
+        layout = self.source.layout
+        stride = max(1, min(round(_PLAN_STEP / layout.dt), layout.horizon))
+        stop = 1 + 13 * (layout.horizon + 1)
+        states = np.stack([call["plan"][1:stop].reshape(-1, 13)[::stride, :7] for call in calls])
+        extra = {}
+        if "samples" in calls[0]:
+            unpacked = [self.source.samples.unpack(jnp.asarray(call["samples"])) for call in calls]
+            sampled = [np.asarray(s.p_WB, np.float32)[stride - 1 :: stride] for s in unpacked]
+            extra["p_WB"] = np.stack(sampled)
+            extra["weights"] = np.stack([np.asarray(s.weights) for s in unpacked])
+        if "figures" in calls[0]:
+            extra["figures"] = np.stack([call["figures"] for call in calls])
+        times = np.array([float(call["time"]) for call in calls])
+        return Plans(times, stride * layout.dt, states, **extra)
+
+
+def collect(scenario: Scenario, signals: Mapping[str, Signal], tap: PlanTap, end: float) -> RunLog:
+    """One log of all signals from 0 to `end` (s)."""
+    dt, period = 1 / scenario.log.rate, scenario.station.period
+    n = min(round(end / dt) + 1, len(signals["X_WB_cheat"].time))
+    finite = np.all(np.isfinite(signals["X_WB_cheat"].value[:n]), axis=1)
+    n = n if finite.all() else max(1, int(np.argmin(finite)))
+    grid = dt * np.arange(n)
+    # A log sees outputs before the updates of its time: what the filter says of t comes one period
+    # later. The truth of t is there at t.
+    told = np.searchsorted(signals["X_WB"].time, grid + 1.5 * period) - 1
+    variance = signals["covariance"].value[told][:, :: ERRORS + 1]
+    variables = {
+        "X_WB": signals["X_WB_cheat"].value[:n],
+        "V_WB_B": signals["V_WB_B_cheat"].value[:n],
+        "F_Bo_B": mean_over(signals["F_Bo_B"], grid, dt),
+        "pwm": signals["pwm"].value[:n],
+        "X_WB_estimate": signals["X_WB"].value[told],
+        "V_WB_B_estimate": signals["V_WB_B"].value[told],
+        "error_std": np.sqrt(np.maximum(variance, 0)),
+        "F_disturbance_Bo_B": signals["F_disturbance_cheat"].value[:n],
+        "flow_W": signals["flow_cheat"].value[:n],
+    }
+    return RunLog.create(
+        scenario.name,
+        dt,
+        variables | tap.setpoints(grid),
+        tap.plans(float(grid[-1])),
+        vehicle=scenario.station.vehicle,
+        source=f"simulation of scenario {scenario.name}, seed {scenario.seed}",
+        notes=_NOTES,
+    )
+
+
+def mean_over(
+    signal: Signal, grid: Float[np.ndarray, " n"], dt: float
+) -> Float[np.ndarray, "n size"]:
+    """Mean of what is finite of a finer signal over [t, t + dt) for every t of the grid."""
+    index = np.clip(np.floor(signal.time / dt + 1e-6).astype(int), 0, None)
+    inside = (index < grid.size) & np.all(np.isfinite(signal.value), axis=1)
+    total = np.zeros((grid.size, signal.value.shape[1]))
+    count = np.zeros(grid.size)
+    np.add.at(total, index[inside], signal.value[inside])
+    np.add.at(count, index[inside], 1)
+    return total / np.maximum(count, 1)[:, None]

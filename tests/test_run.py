@@ -1,0 +1,192 @@
+"""Runs repeat themselves, end as they should, and leave whole folders."""
+
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from spinndrift.models import config
+from spinndrift.models.errors import UserError
+from spinndrift.models.recording import Recording
+from spinndrift.sims import run_folder
+from spinndrift.sims.cli import main
+from spinndrift.sims.run_folder import atomic_folder, free_folder, write_run
+from spinndrift.sims.run_log import RunLog
+from spinndrift.sims.run_loop import simulate
+from spinndrift.sims.run_signals import mean_over
+from spinndrift.sims.scenario import Scenario, load_scenario, overridden
+from spinndrift.systems.closed_loop import Signal
+
+CROSSING = """
+duration: 0.6
+controller:
+  planner: {horizon: 10, sequences: 16, realisations: 1, knots: [2], effective_samples: 4,
+    shown_paths: 4}
+"""
+HOLD = """
+name: hold
+duration: 0.5
+controller: !TrackReference
+  path: !HoldPose {at: {position: [0, 0, -1.5]}}
+success: !FollowPath {}
+"""
+
+
+@pytest.fixture(name="crossing", scope="module")
+def _crossing():
+    return simulate(load_scenario("pylon_crossing_harbour", CROSSING))
+
+
+def test_same_seed_same_log_bit_for_bit(crossing):
+    again = simulate(crossing.scenario)
+    first, second = crossing.log.recording.dataset, again.log.recording.dataset
+    assert set(first) == set(second)
+    for name in first:
+        np.testing.assert_array_equal(first[name].to_numpy(), second[name].to_numpy(), str(name))
+    assert again.outcome == crossing.outcome
+
+
+def test_another_seed_is_another_run(crossing):
+    other = simulate(crossing.scenario.with_changes(seed=crossing.scenario.seed + 1))
+    for name in ("X_WB", "X_WB_estimate", "flow_W", "F_Bo_B", "sample_p_WB"):
+        one, two = (r.log.recording.dataset[name].to_numpy() for r in (crossing, other))
+        assert not np.array_equal(one[..., -1, :], two[..., -1, :]), name
+
+
+def test_log_holds_what_happened(crossing):
+    log, n = crossing.log, 13
+    assert log.time.size == n
+    assert log["error_std"].shape == (n, 18)
+    assert log["error_std"].min() >= 0
+    assert log["pwm"].shape == (n, 8)
+    plans = log.plans
+    assert plans is not None
+    np.testing.assert_allclose(plans.time, [0.0, 0.2, 0.4])
+    assert plans.X_WB.shape == (3, 3, 7)
+    assert plans.p_WB.shape == (3, 2, 3, 4)
+    # a plan starts where the filter thinks the vehicle is (float32 in the planner)
+    at = np.searchsorted(log.time, plans.time[1:] - 1e-9)
+    for k, n in enumerate(at, start=1):
+        gap = plans.X_WB[k, 0, 4:] - log["X_WB_estimate"][n - 1, 4:]
+        assert np.linalg.norm(gap) < 1e-5
+
+
+def test_folder_is_whole(crossing, tmp_path):
+    values = write_run(crossing, tmp_path / "run")
+    names = {"scenario.yaml", "log.nc", "metrics.json", "report.html", "meshcat.html"}
+    assert {path.name for path in (tmp_path / "run").iterdir()} == names
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    text = (tmp_path / "run" / "scenario.yaml").read_text(encoding="utf-8")
+    assert config.loads(Scenario, text) == crossing.scenario
+    told = json.loads((tmp_path / "run" / "metrics.json").read_text(encoding="utf-8"))
+    assert told == values
+    assert told["seed"] == crossing.scenario.seed
+    assert told["outcome"]["reason"] == "duration"
+    assert told["timing"]["real_time_factor"] > 0
+    assert Recording.load(tmp_path / "run" / "log.nc").vehicle == "bluerov2_heavy"
+    assert (tmp_path / "run" / "report.html").stat().st_size < 5e6
+    with pytest.raises(UserError, match="not empty"):
+        write_run(crossing, tmp_path / "run")
+    assert RunLog.load(tmp_path / "run" / "log.nc").plans is not None
+
+
+def test_a_failure_leaves_nothing(crossing, tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_folder, "write_replay", fail)
+    with pytest.raises(KeyboardInterrupt):
+        write_run(crossing, tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folders_count_up(tmp_path):
+    scenario = overridden(HOLD, "{}")
+    for name in ("hold-0", "hold-0-2", "hold-0-3"):
+        folder = free_folder(tmp_path, scenario)
+        assert folder.name == name
+        with atomic_folder(folder) as partial:
+            (partial / "a").write_text("a")
+            assert not folder.exists()
+        assert (folder / "a").read_text() == "a"
+
+
+def test_interrupt_keeps_what_was_flown():
+    def press(fraction: float, remark: str) -> None:
+        if fraction > 0.3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.getsignal(signal.SIGINT)
+    run = simulate(overridden(HOLD, "duration: 2"), press)
+    assert signal.getsignal(signal.SIGINT) is before
+    assert run.outcome.reason == "interrupted"
+    assert 0.6 < run.outcome.time < 1.0
+    assert run.log.time[-1] == pytest.approx(run.outcome.time)
+
+
+def test_collision_ends_the_run():
+    pylon = "obstacles: [{x: 0.2, y: 0.0, name: the post}], start: {position: [0, 0, -1.5]}"
+    run = simulate(overridden(HOLD, f"station: {{{pylon}}}"))
+    assert run.outcome.reason == "collision"
+    assert "the post" in run.outcome.sentence
+    assert run.log.time.size == 1
+
+
+def test_a_controller_of_nan_ends_the_run(tmp_path):
+    (tmp_path / "bad.py").write_text(
+        "import numpy as np\n"
+        "from pydrake.systems.framework import LeafSystem\n"
+        "class Bad(LeafSystem):\n"
+        "    def __init__(self):\n"
+        "        super().__init__()\n"
+        "        self.DeclareVectorInputPort('X_WB', 7)\n"
+        "        self.DeclareVectorInputPort('V_WB_B', 6)\n"
+        "        self.DeclareVectorOutputPort('F_Bo_B', 6, self.calc)\n"
+        "    def calc(self, context, output):\n"
+        "        late = context.get_time() > 0.22\n"
+        "        output.SetFromVector(np.full(6, np.nan if late else 0.0))\n"
+    )
+    run = simulate(overridden(HOLD, f"controller: !Own {{system: '{tmp_path}/bad.py:Bad'}}"))
+    assert run.outcome.reason == "not finite"
+    assert "not finite" in run.outcome.sentence
+    assert run.log.time[-1] == pytest.approx(0.2)
+    assert np.isfinite(run.log["F_Bo_B"]).all()
+    assert run.log.plans is None
+
+
+def test_commands_are_averaged_over_the_steps_of_the_log():
+    t = 0.01 * np.arange(11)
+    signal = Signal(t, np.stack([np.arange(11.0), np.ones(11)], axis=1))
+    found = mean_over(signal, np.array([0.0, 0.05, 0.1]), 0.05)
+    np.testing.assert_allclose(found, [[2, 1], [7, 1], [10, 1]])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["storm"],
+        ["station_keeping_calm", "--scenario-text", "durations: 3"],
+        ["station_keeping_calm", "--model", "none.spinn"],
+        ["pylon_crossing_calm", "--model", "none.spinn"],
+        ["station_keeping_calm", "--seed", "-1"],
+        ["station_keeping_calm", "--out", __file__],
+    ],
+)
+def test_bad_input_exits_with_two_and_a_sentence(arguments, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(["run", *arguments])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith("spinndrift: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_command(tmp_path, capsys):
+    (tmp_path / "hold.yaml").write_text(HOLD)
+    out = tmp_path / "flown"
+    main(["run", str(tmp_path / "hold.yaml"), "--seed", "4", "--out", str(out), "--no-report"])
+    assert {path.name for path in out.iterdir()} == {"scenario.yaml", "log.nc", "metrics.json"}
+    assert json.loads((out / "metrics.json").read_text())["seed"] == 4
+    assert "wrote" in capsys.readouterr().err

@@ -1,0 +1,123 @@
+"""Scenarios load, merge with what is laid over them, and fly."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spinndrift.models import config
+from spinndrift.models.errors import UserError
+from spinndrift.sims.criteria import FollowPath, ReachGoal
+from spinndrift.sims.run_loop import simulate
+from spinndrift.sims.scenario import Scenario, load_scenario, overridden, scenario_names
+from spinndrift.systems.controllers import MppiImpedance, TrackReference
+
+SMALL = """
+planner: {horizon: 10, sequences: 16, realisations: 1, knots: [2], effective_samples: 4,
+    shown_paths: 4}
+"""
+BASE = """
+name: base
+duration: 5
+station: {vehicle: bluerov2_heavy, seed: 3}
+controller: !TrackReference
+  path: !HoldPose {at: {position: [0, 0, -1]}}
+success: !FollowPath {position_rms: 0.2}
+"""
+
+
+def test_what_is_shipped():
+    kinds = ("pylon_crossing", "station_keeping", "trajectory_tracking")
+    assert set(scenario_names()) == {f"{k}_{water}" for k in kinds for water in ("calm", "harbour")}
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_shipped_scenarios_are_whole(name):
+    scenario = load_scenario(name)
+    assert scenario.name == name
+    assert scenario.description
+    assert config.loads(Scenario, config.dump(scenario)) == scenario
+    assert scenario.station.disturbance_set in name
+
+
+def test_pylon_crossing_is_the_papers_task():
+    for name in ("pylon_crossing_calm", "pylon_crossing_harbour"):
+        scenario = load_scenario(name)
+        assert scenario.station.start.position == (0.0, 0.0, -1.5)
+        np.testing.assert_array_equal(scenario.goal, [4.5, -2.0, -1.5])
+        assert isinstance(scenario.success, ReachGoal)
+        assert (scenario.success.radius, scenario.success.near_time) == (0.5, 15.0)
+        # the straight way is closed: some pylon stands nearer to it than half the hull
+        start, goal = np.zeros(2), np.array([4.5, -2.0])
+        ahead = (goal - start) / np.linalg.norm(goal - start)
+        gaps = [
+            abs(ahead[0] * p.y - ahead[1] * p.x) - p.diameter / 2
+            for p in scenario.station.obstacles
+        ]
+        assert min(gaps) < scenario.station.load_vehicle().size[1] / 2
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_every_scenario_flies(name):
+    text = "{duration: 0.1}"
+    if isinstance(load_scenario(name).controller, MppiImpedance):
+        text = f"{{duration: 0.1, controller: {{{SMALL.strip()}}}}}"
+    run = simulate(load_scenario(name, text))
+    assert run.outcome.reason == "duration"
+    assert run.log.time[-1] == pytest.approx(0.1)
+    np.testing.assert_array_equal(run.log["X_WB"][0], run.scenario.station.initial_state()[0])
+    assert run.log["plan_valid"][-1] == 1
+
+
+def test_text_is_laid_over_key_by_key():
+    scenario = overridden(BASE, "{duration: 2, station: {seed: 7}, success: {settle: 1}}")
+    assert (scenario.duration, scenario.seed, scenario.station.vehicle) == (2, 7, "bluerov2_heavy")
+    assert scenario.success == FollowPath(0.2, 1.0)
+    same = overridden(BASE, "controller: !TrackReference {feedforward: false}").controller
+    assert isinstance(same, TrackReference)
+    assert same.feedforward is False
+    assert same.path == overridden(BASE, "{}").controller.path
+    other = overridden(BASE, "success: !ReachGoal {goal: [1, 0, -1]}")
+    assert other.success == ReachGoal(goal=(1.0, 0.0, -1.0))
+    np.testing.assert_array_equal(other.goal, [1, 0, -1])
+
+
+def test_changes():
+    scenario = overridden(BASE, "{}")
+    changed = scenario.with_changes(seed=9, duration=1.5)
+    assert (changed.seed, changed.duration) == (9, 1.5)
+    assert scenario.with_changes() == scenario
+    with pytest.raises(UserError, match="TrackReference, which does not plan"):
+        scenario.with_changes(model=Path("a.spinn"))
+    crossing = load_scenario("pylon_crossing_calm").with_changes(model=Path("a.spinn"))
+    assert crossing.controller.model == Path("a.spinn")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("durations: 3", r"^--scenario-text: durations: is no key .*did you mean `duration`"),
+        ("{station: {disturbance_set: storm}}", "storm.*unknown"),
+        ("[1, 2]", "give a mapping"),
+        ("{duration: -1}", "duration"),
+        ("{name: a b}", "one word"),
+        ("{log: {rate: 30}}", "multiple of 0.01"),
+        ("success: !ReachGoal {}", "needs `goal`"),
+        ("{station: {seed: -1}}", "seed"),
+        ("{station: {vehicle: 3}}", "text"),
+        ("{", "--scenario-text"),
+    ],
+)
+def test_faults_are_told(text, message):
+    with pytest.raises(UserError, match=message):
+        overridden(BASE, text)
+
+
+def test_unknown_scenarios_are_told(tmp_path):
+    with pytest.raises(UserError, match="take one of pylon_crossing_calm"):
+        load_scenario("storm")
+    with pytest.raises(UserError, match="no such file"):
+        load_scenario(tmp_path / "mine.yaml")
+    (tmp_path / "mine.yaml").write_text(BASE.replace("duration", "durtion"))
+    with pytest.raises(UserError, match=r"mine\.yaml:3: durtion"):
+        load_scenario(tmp_path / "mine.yaml")

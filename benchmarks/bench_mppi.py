@@ -1,0 +1,46 @@
+"""One planner call, 1000 rollouts of 80 steps among pylons: physics and SPINN (`make bench`)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from spinndrift.models.spinn import Spinn, SpinnConfig
+from spinndrift.models.vehicle import load_vehicle
+from spinndrift.systems.impedance import ImpedanceGains
+from spinndrift.systems.mppi_config import MppiConfig
+from spinndrift.systems.mppi_core import MppiPlanner
+from spinndrift.systems.obstacles import Cylinders, Pylon, SphereHull
+from spinndrift.systems.paths import PoseConfig
+from spinndrift.systems.wrench_limits import ThrusterLimits
+
+VEHICLE = load_vehicle("bluerov2_heavy")
+PYLONS = [Pylon(1.5, y) for y in (-2.25, -0.65, 0.95)] + [Pylon(3.1, y) for y in (-3.0, -1.4, 0.2)]
+
+
+def model(kind: str):
+    physics = VEHICLE.dynamics(np.array([3.0, 3.0, 3.0, 0.2, 0.2, 0.2]))
+    if kind == "physics":
+        return physics
+    config = SpinnConfig(constant_mass=kind == "spinn, constant mass")
+    return Spinn.create(config, physics, jax.random.key(0))
+
+
+@pytest.mark.parametrize("sequences", [1000, 250])
+@pytest.mark.parametrize("kind", ["physics", "spinn", "spinn, constant mass"])
+def test_mppi_call(benchmark, kind, sequences):
+    config = MppiConfig(sequences=sequences, realisations=1000 // sequences)
+    planner = MppiPlanner(
+        model(kind),
+        ThrusterLimits.create(VEHICLE.thrusters(), fraction=config.wrench_fraction),
+        Cylinders.create(PYLONS),
+        SphereHull.cover(VEHICLE.size),
+        PoseConfig((4.5, -2.0, -1.5)).pose(),
+        config=config,
+        tracking=ImpedanceGains().matrices(VEHICLE.dynamics()),
+    )
+    X = PoseConfig((0.0, 0.0, -1.5)).pose(jnp.float32)
+    call = jax.jit(lambda state, key: planner.step(state, key, X, jnp.zeros(6, jnp.float32)))
+    arguments = planner.init(), jax.random.key(1)
+    call = call.lower(*arguments).compile()
+    benchmark(lambda: jax.block_until_ready(call(*arguments)))

@@ -10,7 +10,7 @@ applying the waiting samples' preintegrated increment (Khosravian et al. 2015 gi
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -29,6 +29,7 @@ from .error_state import ERRORS, Navigation
 
 SLOT = 15  # has sample, force 3, rate 3 | has dvl, v 3 | has depth, depth | has compass, yaw
 _DVL, _DEPTH, _COMPASS = 7, 11, 13
+_FEW = 5  # samples whose mean force is held beyond the newest one
 _LONGEST = 0.1  # s that the covariance waits at most for a reading
 
 STATUS = (
@@ -55,16 +56,20 @@ class EkfConfig:
         position_std: of the initial position in body axes (m).
         attitude_std: of the initial attitude about the body axes (rad).
         velocity_std: of the initial velocity in body axes (m/s).
+        imu_factor: the IMU's noise densities times this are the filter's, for what samples at
+            100 Hz leave out of a motion between them.
         horizon: how long readings may take to arrive (s).
         gate: share of good readings that pass the chi-square gate.
-        patience: after so many rejections in a row a sensor's next reading is taken all the same,
-            lest a filter that lost its way shuts its sensors out for good.
+        patience: after so many rejections in a row what the sensor measures counts as unknown, by
+            the size of the residual, and its reading is taken: a filter that lost its way must not
+            shut its sensors out for good.
         output_rate: estimates per second (Hz).
     """
 
     position_std: Vector3 = (0.02, 0.02, 0.02)
     attitude_std: Vector3 = (0.01, 0.01, 0.03)
     velocity_std: Vector3 = (0.02, 0.02, 0.02)
+    imu_factor: float = 1.5
     horizon: float = 0.25
     gate: float = 0.999
     patience: int = 10
@@ -75,7 +80,7 @@ class EkfConfig:
         check_numbers(self)
         for field in ("position_std", "attitude_std", "velocity_std"):
             require(min(getattr(self, field)) >= 0, self, field, "give zero or more")
-        for field in ("horizon", "output_rate"):
+        for field in ("imu_factor", "horizon", "output_rate"):
             require(getattr(self, field) > 0, self, field, "give a number above zero")
         require(0 < self.gate < 1, self, "gate", "give a share between 0 and 1")
         require(self.patience >= 1, self, "patience", "give at least 1")
@@ -141,6 +146,15 @@ class DelayedFilter(eqx.Module):
     def slots(self) -> int:
         """Samples that wait."""
         return math.ceil(self.config.horizon * self.imu.rate - 1e-9)
+
+    @property
+    def _noisy_imu(self) -> Imu:
+        f, imu = self.config.imu_factor, self.imu
+        return replace(
+            imu,
+            accelerometer_density=f * imu.accelerometer_density,
+            gyroscope_density=f * imu.gyroscope_density,
+        )
 
     def deviations(self) -> Float[Array, "18"]:
         """Standard deviations of the initial error."""
@@ -211,12 +225,19 @@ class DelayedFilter(eqx.Module):
             return measurement.compass_innovation(self.compass, x, slot[_COMPASS + 1 :])
 
         def correct(
-            state: FilterState, i: int, innovation: Callable[[Navigation], measurement.Innovation]
+            state: FilterState,
+            i: int,
+            own: slice,
+            innovation: Callable[[Navigation], measurement.Innovation],
         ) -> FilterState:
             found = innovation(state.nominal)
             limit = jnp.asarray(chi2.ppf(self.config.gate, found.residual.size), dtype)
-            limit = jnp.where(state.rejected[i] >= self.config.patience, jnp.inf, limit)
-            nominal, P, nis, accepted = measurement.update(state.nominal, state.P, found, limit)
+            # A filter that lost its way: what the sensor measures counts as unknown from here on.
+            H = found.H[:, own]
+            lost = state.rejected[i] >= self.config.patience
+            doubt = jnp.where(lost, found.residual**2, 0)
+            P = state.P.at[own, own].add(H.T @ (doubt[:, None] * H))
+            nominal, P, nis, accepted = measurement.update(state.nominal, P, found, limit)
             count = jnp.where(accepted, 0, state.rejected[i] + 1)
             last = jnp.where(accepted, time, state.accepted_at[i])
             return state._replace(
@@ -227,9 +248,13 @@ class DelayedFilter(eqx.Module):
                 accepted_at=state.accepted_at.at[i].set(last),
             )
 
-        kinds = ((_DVL, dvl), (_DEPTH, depth), (_COMPASS, compass))
-        for i, (flag, innovation) in enumerate(kinds):
-            use = partial(correct, i=i, innovation=innovation)
+        kinds = (
+            (_DVL, error_state.VELOCITY, dvl),
+            (_DEPTH, error_state.POSITION, depth),
+            (_COMPASS, error_state.ROTATION, compass),
+        )
+        for i, (flag, own, innovation) in enumerate(kinds):
+            use = partial(correct, i=i, own=own, innovation=innovation)
             state = jax.lax.cond(slot[flag] > 0, use, lambda state: state, state)
         zero = jnp.zeros(7, dtype)
         return state._replace(since=jnp.concatenate([zero, state.nominal.v_B]))
@@ -242,7 +267,7 @@ class DelayedFilter(eqx.Module):
         some = jnp.maximum(time, self.period)
         before = state.nominal._replace(v_B=state.since[7:])
         F, Q = error_state.transition(
-            before, after, gone[1:4] / some, gone[4:] / some, time, self.imu, self.compass
+            before, after, gone[1:4] / some, gone[4:] / some, time, self._noisy_imu, self.compass
         )
         P = F @ state.P @ F.T + Q
         return (P + P.T) / 2
@@ -265,17 +290,18 @@ class DelayedFilter(eqx.Module):
         ring = jnp.concatenate([state.ring, new[None]])
         number = k - self.slots + jnp.arange(self.slots + 1, dtype=dtype)
 
-        def place(reading: Array) -> Array:
-            """Rows [1, value] for the slot of a valid reading, as (mask, row)."""
+        def place(old: Array, reading: Array) -> Array:
+            """The columns with [1, value] in the slot of a valid reading's time."""
             here = (number == jnp.round(reading[-1] / h)) & (reading[-2] > 0)
             row = jnp.concatenate([jnp.ones(1, dtype), reading[:-2]])
-            return jnp.where(here[:, None], row[None], 0), here
+            return jnp.where(here[:, None], row[None], old)
 
-        columns = [ring[:, :_DVL]]
-        ends = (_DVL, _DEPTH, _COMPASS, SLOT)
-        for i, reading in enumerate((readings.dvl, readings.depth, readings.compass)):
-            rows, here = place(reading)
-            columns.append(jnp.where(here[:, None], rows, ring[:, ends[i] : ends[i + 1]]))
+        columns = [
+            ring[:, :_DVL],
+            place(ring[:, _DVL:_DEPTH], readings.dvl),
+            place(ring[:, _DEPTH:_COMPASS], readings.depth),
+            place(ring[:, _COMPASS:], readings.compass),
+        ]
         rate = jnp.where(k >= 0, rate, state.rate)
         return jnp.concatenate(columns, axis=1), rate
 
@@ -290,8 +316,9 @@ class DelayedFilter(eqx.Module):
     ) -> tuple[Float[Array, "7"], Float[Array, "6"], Float[Array, "18 18"]]:
         """Pose, twist and error covariance `ahead` seconds after the newest sample.
 
-        The waiting samples are applied to the horizon's state; beyond the newest one the twist is
-        held. The covariance crosses the waiting time in one step.
+        The waiting samples are applied to the horizon's state; beyond the newest one its rate and
+        the mean force of the last few hold on. The covariance crosses the waiting time in one step;
+        it does not know what pushes the vehicle during `ahead`.
         """
         x, ring = state.nominal, state.ring
         time = ring[:, 0] * self.period
@@ -302,8 +329,12 @@ class DelayedFilter(eqx.Module):
             [time[:, None], force.T * time[:, None], omega.T * time[:, None]], 1
         )
         P = self._covariance(state, now, state.since[:7] + jnp.sum(waiting, axis=0))
-        V = jnp.concatenate([now.v_B, state.rate - x.gyro_bias])
-        return se3.retract(now.X_WB, V * ahead), V, P
+        rate = state.rate - x.gyro_bias
+        few = ring[-_FEW:, 0]
+        mean = jnp.sum(force[:, -_FEW:] * few[None], axis=1) / jnp.maximum(jnp.sum(few), 1)
+        beyond = error_state.sample_increment(mean, rate, ahead * ring[-1, 0])
+        now = error_state.apply(now, beyond, self.imu.gravity)
+        return now.X_WB, jnp.concatenate([now.v_B, rate]), P
 
 
 def unpack_covariance(flat: Float[Array, "324"]) -> Float[Array, "18 18"]:

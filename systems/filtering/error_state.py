@@ -19,7 +19,7 @@ from ...models import se3
 from ...models.sensors import Compass, Imu
 
 ERRORS = 18
-POSE, ROTATION = slice(0, 6), slice(3, 6)
+POSE, POSITION, ROTATION = slice(0, 6), slice(0, 3), slice(3, 6)
 VELOCITY, GYRO_BIAS, ACCEL_BIAS = slice(6, 9), slice(9, 12), slice(12, 15)
 SENSORS = slice(15, 18)
 

@@ -85,7 +85,19 @@ class Dynamics(eqx.Module):
         flow: Flow | None = None,
         coefficients: Coefficients | None = None,
     ) -> Float[Array, "6 *#batch"]:
-        """The drift of ξ: the time derivative of the components of `V_WB_B`, without noise.
+        """The drift of ξ: the time derivative of the components of `V_WB_B`, without noise."""
+        mass, wrench = self.balance(X_WB, V_WB_B, F_Bo_B, flow, coefficients)
+        return mass.solve(wrench)
+
+    def balance(
+        self,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        F_Bo_B: Float[Array, "6 *#batch"],
+        flow: Flow | None = None,
+        coefficients: Coefficients | None = None,
+    ) -> tuple[Spd, Float[Array, "6 *#batch"]]:
+        """M and the wrench M dξ/dt of all forces and of the turning frame, without noise.
 
         In moving water drag and added mass act through ξ_r = ξ - ξ_c and its rate, and the water's
         own pressure gradient through ρ∇ a_c at the centre of buoyancy (Fossen 2011, eq. 8.3;
@@ -95,8 +107,7 @@ class Dynamics(eqx.Module):
         if flow is None:
             c = self.coefficients(V) if coefficients is None else coefficients
             wrench = se3.coad_apply(V, c.mass.matvec(V)) + self.drag_wrench(V, c)
-            wrench = wrench + self.potential_wrench(X_WB) + F_Bo_B
-            return c.mass.solve(wrench)
+            return c.mass, wrench + self.potential_wrench(X_WB) + F_Bo_B
         v_c = se3.rotate_inverse(X_WB, flow.v_WC_W)
         a_c = se3.rotate_inverse(X_WB, flow.a_WC_W)
         zero = jnp.zeros_like(v_c)
@@ -113,7 +124,7 @@ class Dynamics(eqx.Module):
         wrench = wrench + se3.coad_apply(V_r, added(V_r)) + added(dV_c)
         wrench = wrench + jnp.concatenate([pressure, se3.cross(r, pressure)])
         wrench = wrench + self.drag_wrench(V_r, c) + self.potential_wrench(X_WB) + F_Bo_B
-        return c.mass.solve(wrench)
+        return c.mass, wrench
 
     def noise_acceleration(
         self,

@@ -35,13 +35,21 @@ def step(
     the water's motion at Bo.
     """
     h = jnp.asarray(dt, V_WB_B.dtype)
-    c = None if flow is not None else dynamics.coefficients(V_WB_B)
-    dV = h * dynamics.acceleration(X_WB, V_WB_B, F_Bo_B, flow, c)
-    if dW is not None and dynamics.stochastic:
-        stage = None if c is None else (c.mass, c.diffusion)
-        first = dynamics.noise_acceleration(V_WB_B, dW, stage)
+    if dW is None or not dynamics.stochastic:
+        dV = h * dynamics.acceleration(X_WB, V_WB_B, F_Bo_B, flow)
+    elif flow is None:
+        c = dynamics.coefficients(V_WB_B)
+        mass, wrench = dynamics.balance(X_WB, V_WB_B, F_Bo_B, coefficients=c)
+        b, dW = se3.align(c.diffusion, dW)
+        both = jnp.stack(jnp.broadcast_arrays(wrench, b * dW), axis=1)
+        drift, first = jnp.unstack(mass.solve(both), axis=1)
         second = dynamics.noise_acceleration(V_WB_B + first, dW)
-        dV = dV + (first + second) / 2
+        dV = h * drift + (first + second) / 2
+    else:
+        drift = dynamics.acceleration(X_WB, V_WB_B, F_Bo_B, flow)
+        first = dynamics.noise_acceleration(V_WB_B, dW)
+        second = dynamics.noise_acceleration(V_WB_B + first, dW)
+        dV = h * drift + (first + second) / 2
     return se3.retract(X_WB, V_WB_B * h), V_WB_B + dV
 
 

@@ -33,20 +33,24 @@ _SERIES_BELOW = 1.0  # squared angle; at one radian the closed forms lose no dig
 def _bernoulli(n: int) -> Fraction:
     numbers: list[Fraction] = [Fraction(1)]
     for m in range(1, n + 1):
-        numbers.append(-sum(comb(m + 1, k) * numbers[k] for k in range(m)) / (m + 1))
+        total = sum((comb(m + 1, k) * numbers[k] for k in range(m)), Fraction(0))
+        numbers.append(-total / (m + 1))
     return numbers[n]
 
 
-_SIN_HALF = [(-1) ** k / (2.0 ** (2 * k + 1) * factorial(2 * k + 1)) for k in range(9)]
-_COS_HALF = [(-1) ** k / (2.0 ** (2 * k) * factorial(2 * k)) for k in range(9)]
-_ONE_MINUS_COS = [(-1) ** k / factorial(2 * k + 2) for k in range(9)]
-_X_MINUS_SIN = [(-1) ** k / factorial(2 * k + 3) for k in range(9)]
+_EXP_TERMS = 9
+_SIN_HALF = [(-1) ** k / (2.0 ** (2 * k + 1) * factorial(2 * k + 1)) for k in range(_EXP_TERMS)]
+_COS_HALF = [(-1) ** k / (2.0 ** (2 * k) * factorial(2 * k)) for k in range(_EXP_TERMS)]
+_ONE_MINUS_COS = [(-1) ** k / factorial(2 * k + 2) for k in range(_EXP_TERMS)]
+_X_MINUS_SIN = [(-1) ** k / factorial(2 * k + 3) for k in range(_EXP_TERMS)]
 _ONE_MINUS_X_COT = [float(abs(_bernoulli(2 * k)) / factorial(2 * k)) for k in range(1, 13)]
 _ATAN = [(-1) ** k / (2 * k + 1) for k in range(14)]
 _ATAN_SERIES_BELOW = 0.0625
 
 
 def _polynomial(coefficients: list[float], x: Array) -> Array:
+    if x.dtype == jnp.float32 and len(coefficients) == _EXP_TERMS:
+        coefficients = coefficients[:5]  # the rest is below 2e-9 for x < 1
     result = jnp.full_like(x, coefficients[-1])
     for c in reversed(coefficients[:-1]):
         result = result * x + c

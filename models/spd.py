@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from . import se3, symmetric
+from . import symmetric
 
 N = 6
 PACKED = N * (N + 1) // 2
@@ -54,7 +54,10 @@ class Operator(eqx.Module):
 
 
 class Spd(Operator):
-    """A symmetric positive definite operator, which can be inverted."""
+    """A symmetric positive definite operator, which can be inverted.
+
+    Several vectors for each batch entry stand on an axis ahead of the batch: (6, k, *batch).
+    """
 
     @abc.abstractmethod
     def solve(self, y: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
@@ -93,34 +96,87 @@ class ConstantSpd(Spd):
         return self.dense
 
 
-class CholeskySpd(Spd):
-    """A = S L Lᵀ S with L lower triangular (positive diagonal) and S = diag(scale)."""
+class ScaledSpd(Spd):
+    """A = S B(raw) Sᵀ with a fixed S that gives the magnitudes and B of order one.
+
+    The products with S are matrix products over the whole batch. They also part what the compiler
+    would otherwise fuse, and with it compute again for each of the six components.
+    """
+
+    scale: eqx.AbstractVar[Float[Array, "6 6"]]
+    unscale: eqx.AbstractVar[Float[Array, "6 6"]]
+
+    @classmethod
+    @abc.abstractmethod
+    def from_raw(
+        cls,
+        raw: Float[Array, "21 *batch"],
+        scale: Float[Array, "6 6"],
+        unscale: Float[Array, "6 6"],
+    ) -> "ScaledSpd":
+        """The operator of 21 unconstrained (packed) numbers, S and S⁻¹; zeros give S Sᵀ."""
+
+    @abc.abstractmethod
+    def _inner_matvec(self, x: Array) -> Array: ...
+
+    @abc.abstractmethod
+    def _inner_solve(self, y: Array) -> Array: ...
+
+    def matvec(self, x: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+        return jnp.tensordot(self.scale, self._inner_matvec(jnp.tensordot(self.scale.T, x, 1)), 1)
+
+    def solve(self, y: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+        inner = self._inner_solve(jnp.tensordot(self.unscale, y, 1))
+        return jnp.tensordot(self.unscale.T, inner, 1)
+
+    def matrix(self) -> Float[Array, "6 6 *batch"]:
+        batch = self._batch_shape()
+        columns = [
+            self.matvec(jnp.broadcast_to(e.reshape((N,) + (1,) * len(batch)), (N, *batch)))
+            for e in jnp.eye(N, dtype=self.scale.dtype)
+        ]
+        return jnp.stack(columns, axis=1)
+
+    @abc.abstractmethod
+    def _batch_shape(self) -> tuple[int, ...]: ...
+
+
+class CholeskySpd(ScaledSpd):
+    """A = S L Lᵀ Sᵀ with L lower triangular and its diagonal positive."""
 
     diagonal: Float[Array, "6 *batch"]
     below: Float[Array, "15 *batch"]
-    scale: Float[Array, "6"]
+    scale: Float[Array, "6 6"]
+    unscale: Float[Array, "6 6"]
 
     @classmethod
-    def from_raw(cls, raw: Float[Array, "21 *batch"], scale: Float[Array, "6"]) -> "CholeskySpd":
-        """The operator of 21 unconstrained numbers (packed L); zeros give S²."""
+    def from_raw(
+        cls,
+        raw: Float[Array, "21 *batch"],
+        scale: Float[Array, "6 6"],
+        unscale: Float[Array, "6 6"],
+    ) -> "CholeskySpd":
         diagonal, below = jnp.split(raw, [N])
-        return cls(squareplus(diagonal), below, scale)
+        return cls(squareplus(diagonal), below, scale, unscale)
 
-    def _rows(self) -> list[list[Array]]:
-        """L as rows of entries, each an array over the batch."""
-        diagonal, below = jnp.unstack(self.diagonal), jnp.unstack(self.below)
+    def _rows(self, like: Array) -> list[list[Array]]:
+        """L as rows of entries, each an array that broadcasts against a component of `like`."""
+        ahead = (1,) * (like.ndim - self.diagonal.ndim)
+        diagonal = jnp.unstack(self.diagonal.reshape((N, *ahead, *self.diagonal.shape[1:])))
+        below = jnp.unstack(self.below.reshape((-1, *ahead, *self.below.shape[1:])))
         return [[*below[i * (i - 1) // 2 : i * (i + 1) // 2], diagonal[i]] for i in range(N)]
 
-    def matvec(self, x: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
-        L, s = self._rows(), jnp.unstack(self.scale)
-        z = [a * b for a, b in zip(s, jnp.unstack(x), strict=True)]
-        t = [_sum(L[i][j] * z[i] for i in range(j, N)) for j in range(N)]
-        return jnp.stack([s[i] * _sum(L[i][j] * t[j] for j in range(i + 1)) for i in range(N)])
+    def _batch_shape(self) -> tuple[int, ...]:
+        return self.diagonal.shape[1:]
 
-    def solve(self, y: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
-        L, s = self._rows(), jnp.unstack(self.scale)
+    def _inner_matvec(self, x: Array) -> Array:
+        L, z = self._rows(x), jnp.unstack(x)
+        t = [_sum(L[i][j] * z[i] for i in range(j, N)) for j in range(N)]
+        return jnp.stack([_sum(L[i][j] * t[j] for j in range(i + 1)) for i in range(N)])
+
+    def _inner_solve(self, y: Array) -> Array:
+        L, rest = self._rows(y), list(jnp.unstack(y))
         pivot = [1 / L[i][i] for i in range(N)]
-        rest = [a / b for a, b in zip(jnp.unstack(y), s, strict=True)]
         for i in range(N):
             rest[i] = rest[i] * pivot[i]
             for j in range(i + 1, N):
@@ -129,45 +185,40 @@ class CholeskySpd(Spd):
             rest[i] = rest[i] * pivot[i]
             for j in range(i):
                 rest[j] = rest[j] - L[i][j] * rest[i]
-        return jnp.stack([a / b for a, b in zip(rest, s, strict=True)])
-
-    def matrix(self) -> Float[Array, "6 6 *batch"]:
-        L, s = self._rows(), jnp.unstack(self.scale)
-        rows = [
-            [s[i] * s[j] * _sum(L[i][k] * L[j][k] for k in range(min(i, j) + 1)) for j in range(N)]
-            for i in range(N)
-        ]
-        return jnp.stack([jnp.stack(row) for row in rows])
+        return jnp.stack(rest)
 
 
-class EigenSpd(Spd):
-    """A = S f(P) S with P symmetric, f positive on its eigenvalues and S = diag(scale)."""
+class EigenSpd(ScaledSpd):
+    """A = S f(P) Sᵀ with P symmetric and f positive on its eigenvalues."""
 
     value: Float[Array, "6 6 *batch"]
     inverse: Float[Array, "6 6 *batch"]
-    scale: Float[Array, "6"]
+    scale: Float[Array, "6 6"]
+    unscale: Float[Array, "6 6"]
 
     @classmethod
-    def from_raw(cls, raw: Float[Array, "21 *batch"], scale: Float[Array, "6"]) -> "EigenSpd":
-        """The operator of 21 unconstrained numbers (packed P); zeros give S²."""
+    def from_raw(
+        cls,
+        raw: Float[Array, "21 *batch"],
+        scale: Float[Array, "6 6"],
+        unscale: Float[Array, "6 6"],
+    ) -> "EigenSpd":
         rows = unpack_symmetric(raw)
         value, inverse = symmetric.positive(jnp.stack([jnp.stack(row) for row in rows]))
-        return cls(value, inverse, scale)
+        return cls(value, inverse, scale, unscale)
 
-    def matvec(self, x: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
-        s, x = se3.align(self.scale, x)
-        return s * _apply(self.value, s * x)
+    def _batch_shape(self) -> tuple[int, ...]:
+        return self.value.shape[2:]
 
-    def solve(self, y: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
-        s, y = se3.align(self.scale, y)
-        return _apply(self.inverse, y / s) / s
+    def _inner_matvec(self, x: Array) -> Array:
+        return _apply(self.value, x)
 
-    def matrix(self) -> Float[Array, "6 6 *batch"]:
-        s = self.scale.reshape((N,) + (1,) * (self.value.ndim - 2))
-        return s[:, None] * s[None] * self.value
+    def _inner_solve(self, y: Array) -> Array:
+        return _apply(self.inverse, y)
 
 
 def _apply(A: Array, x: Array) -> Array:
+    A = A.reshape((N, N) + (1,) * (x.ndim + 1 - A.ndim) + A.shape[2:])
     columns = zip(jnp.unstack(A, axis=1), jnp.unstack(x), strict=True)
     return _sum(column * entry[None] for column, entry in columns)
 

@@ -19,7 +19,7 @@ from .dynamics import Coefficients, Dynamics
 from .networks import ACTIVATIONS, Activation, Heads, MlpStack
 from .potential import BoundedScalar, GravityPotential, PosePotential, Potential, PotentialKind
 from .rigid_body import FossenDynamics
-from .spd import CholeskySpd, EigenSpd, Spd, pack, squareplus
+from .spd import PACKED, CholeskySpd, EigenSpd, Spd, squareplus
 
 SpdKind = Literal["cholesky", "eigenvalues"]
 
@@ -67,8 +67,9 @@ class Scales(eqx.Module):
     """Magnitudes (not trained) that make the networks' inputs and outputs of order one."""
 
     velocity: Float[Array, "6"]
-    matrices: Float[Array, "3 6"]
-    """Square roots of the diagonals of M, D, D^f."""
+    roots: Float[Array, "3 6 6"]
+    """S with S Sᵀ the magnitudes of M, D, D^f: Cholesky factors of the reference's."""
+    inverse_roots: Float[Array, "3 6 6"]
     diffusion: Float[Array, "6"]
 
 
@@ -115,24 +116,18 @@ class Spinn(Dynamics):
         )
         floor = 0.01 * np.diag(M)
         matrices = [M, _floored(D, floor), _floored(Df, floor / v)]
-        diagonals = np.stack([np.diag(a) for a in matrices])
-        drag = diagonals[1] * v + diagonals[2] * v**2
+        drag = np.diag(matrices[1]) * v + np.diag(matrices[2]) * v**2
         b = np.asarray(reference.diffusion, float)
+        if config.start == "scale":
+            matrices = [np.diag(np.diag(a)) for a in matrices]
+        roots = np.linalg.cholesky(np.stack(matrices))
         scales = Scales(
             velocity=jnp.asarray(v, dtype),
-            matrices=jnp.asarray(np.sqrt(diagonals), dtype),
+            roots=jnp.asarray(roots, dtype),
+            inverse_roots=jnp.asarray(np.linalg.inv(roots), dtype),
             diffusion=jnp.asarray(np.where(b > 0, b, 0.05 * drag), dtype),
         )
-        packed = np.stack(
-            [
-                _raw(a / np.sqrt(np.outer(d, d)), config.spd)
-                if config.start == "reference"
-                else np.zeros(21)
-                for a, d in zip(matrices, diagonals, strict=True)
-            ]
-        )
-        raw = jnp.asarray(packed, dtype)
-        variable = raw[1:] if config.constant_mass else raw
+        variable = jnp.zeros((2 if config.constant_mass else 3, PACKED), dtype)
         network_key, potential_key = jax.random.split(key)
         count = variable.shape[0] + config.stochastic
         return cls(
@@ -148,7 +143,7 @@ class Spinn(Dynamics):
             diffusion_head=Heads.constant(jnp.zeros((1, 6), dtype), config.width)
             if config.stochastic
             else None,
-            constant_mass=raw[0] if config.constant_mass else None,
+            constant_mass=jnp.zeros(PACKED, dtype) if config.constant_mass else None,
             learned_potential=_potential(config, reference, potential_key, dtype),
         )
 
@@ -200,8 +195,9 @@ class Spinn(Dynamics):
         return scale.reshape((6,) + (1,) * (raw.ndim - 1)) * squareplus(raw)
 
     def _spd(self, raw: Array, index: int) -> Spd:
-        scale = jax.lax.stop_gradient(self.scales.matrices[index])
-        return _OPERATORS[self.config.spd].from_raw(raw, scale)
+        scales = jax.lax.stop_gradient(self.scales)
+        kind = _OPERATORS[self.config.spd]
+        return kind.from_raw(raw, scales.roots[index], scales.inverse_roots[index])
 
     def coefficients(self, V_WB_B: Float[Array, "6 *batch"]) -> Coefficients:
         features = self._features(V_WB_B, self.hidden.weights[0].shape[0])
@@ -238,17 +234,6 @@ def _floored(a: np.ndarray, floor: np.ndarray) -> np.ndarray:
     s = np.sqrt(floor)
     w, Q = np.linalg.eigh((a + a.T) / 2 / np.outer(s, s))
     return np.outer(s, s) * ((Q * np.maximum(w, 1.0)) @ Q.T)
-
-
-def _raw(a: np.ndarray, kind: SpdKind) -> np.ndarray:
-    """The 21 outputs that are made into `a`; x - 1/x undoes squareplus."""
-    if kind == "cholesky":
-        L = np.linalg.cholesky(a)
-        np.fill_diagonal(L, np.diag(L) - 1 / np.diag(L))
-    else:
-        w, Q = np.linalg.eigh(a)
-        L = (Q * (w - 1 / w)) @ Q.T
-    return np.asarray(pack(jnp.asarray(L)))
 
 
 def _potential(config: SpinnConfig, reference: FossenDynamics, key: Array, dtype: Any) -> Potential:

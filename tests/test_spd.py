@@ -10,7 +10,7 @@ from spinndrift.models.spd import CholeskySpd, EigenSpd
 
 KINDS = [CholeskySpd, EigenSpd]
 positive = jax.jit(symmetric.positive)
-SCALE = np.array([4.0, 5.0, 6.0, 0.4, 0.5, 0.6])
+SCALE = np.diag([4.0, 5.0, 6.0, 0.4, 0.5, 0.6]) + np.tril(np.full((6, 6), 0.1), -1)
 
 
 def raw_numbers(seed, *batch, spread=1.0):
@@ -30,13 +30,13 @@ def squareplus_of_matrix(A):
 
 @functools.partial(jax.jit, static_argnums=0)
 def evaluate(kind, raw, scale, x):
-    A = kind.from_raw(raw, scale)
+    A = kind.from_raw(raw, scale, jnp.linalg.inv(scale))
     return A.matvec(x), A.solve(x), A.matrix()
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def there_and_back(kind, raw, scale, x):
-    A = kind.from_raw(raw, scale)
+    A = kind.from_raw(raw, scale, jnp.linalg.inv(scale))
     return A.solve(A.matvec(x))
 
 
@@ -60,8 +60,19 @@ def test_a_single_matrix_equals_its_batch_entry(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("batch", [(), (5,)])
+def test_vectors_ahead_of_the_batch_are_separate_right_hand_sides(kind, batch):
+    raw, x = raw_numbers(3, *batch), np.random.default_rng(4).normal(size=(6, 2, 5))
+    applied, solved, _ = evaluate(kind, raw, SCALE, x)
+    for k in range(2):
+        one = evaluate(kind, raw, SCALE, x[:, k])
+        np.testing.assert_allclose(applied[:, k], one[0], rtol=1e-9)
+        np.testing.assert_allclose(solved[:, k], one[1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_matrices_are_symmetric_and_positive_for_large_outputs(kind):
-    _, _, dense = evaluate(kind, raw_numbers(2, 200, spread=5.0), np.ones(6), np.ones((6, 200)))
+    _, _, dense = evaluate(kind, raw_numbers(2, 200, spread=5.0), np.eye(6), np.ones((6, 200)))
     A = np.moveaxis(np.asarray(dense), -1, 0)
     np.testing.assert_allclose(A, A.swapaxes(1, 2), atol=1e-12 * np.abs(A).max())
     np.linalg.cholesky(A)
@@ -69,9 +80,9 @@ def test_matrices_are_symmetric_and_positive_for_large_outputs(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_zeros_give_the_squared_scale_in_the_given_precision(kind, dtype):
+def test_zeros_give_the_scale_times_its_transpose_in_the_given_precision(kind, dtype):
     results = evaluate(kind, np.zeros((21, 2), dtype), SCALE.astype(dtype), np.ones((6, 2), dtype))
-    np.testing.assert_allclose(results[2][..., 0], np.diag(SCALE**2), rtol=1e-6)
+    np.testing.assert_allclose(results[2][..., 0], SCALE @ SCALE.T, rtol=1e-6, atol=1e-6)
     assert all(result.dtype == dtype for result in results)
 
 
@@ -158,11 +169,12 @@ def test_eigh_differentiates_to_nan_at_a_multiple_of_the_identity_and_positive_d
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_of_solve_agree_with_differences(kind):
+    scale = jnp.asarray(SCALE)
     raw, y = jnp.asarray(raw_numbers(12)), jnp.asarray(np.random.default_rng(13).normal(size=6))
 
     @jax.jit
     def value(raw, y):
-        return jnp.sum(jnp.sin(kind.from_raw(raw, jnp.asarray(SCALE)).solve(y)))
+        return jnp.sum(jnp.sin(kind.from_raw(raw, scale, jnp.linalg.inv(scale)).solve(y)))
 
     direction, h = jnp.asarray(raw_numbers(14)), 1e-6
     slope = (value(raw + h * direction, y) - value(raw - h * direction, y)) / (2 * h)

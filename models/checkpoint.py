@@ -5,12 +5,14 @@ loadable if it is registered here (`register`), so that reading a file never run
 """
 
 import dataclasses
+import io
 import json
 import struct
 import zipfile
 import zlib
 from collections.abc import Callable
 from os import PathLike
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -151,7 +153,8 @@ def load_model(
 def _read(path: str | PathLike[str]) -> tuple[dict[str, Any], list[np.ndarray]]:
     """Header and arrays of a file whose format, version and completeness have been checked."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        content = io.BytesIO(Path(path).read_bytes())
+        with np.load(content, allow_pickle=False) as archive:
             header = json.loads(archive["header"].tobytes())
             if not isinstance(header, dict) or header.get("format") != FORMAT:
                 raise ValueError("no spinndrift header")

@@ -6,6 +6,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import matplotlib
 import numpy as np
+from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -25,7 +26,7 @@ _STYLE = {
     "axes.labelcolor": QUIET,
     "axes.labelsize": 9,
     "axes.linewidth": 0.8,
-    "axes.prop_cycle": matplotlib.cycler(color=[FLOWN, PLANNED, ESTIMATE, GOAL, LIMIT, WATER]),
+    "axes.prop_cycle": cycler(color=[FLOWN, PLANNED, ESTIMATE, GOAL, LIMIT, WATER]),
     "axes.spines.right": False,
     "axes.spines.top": False,
     "axes.titlecolor": INK,

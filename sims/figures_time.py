@@ -83,7 +83,7 @@ def wrench_figure(log: RunLog, limits: Float[np.ndarray, "6"] | None = None) -> 
         ax.plot(log.time, log["F_Bo_B"][:, c], color=FLOWN, lw=1)
         if limits is not None:
             largest = np.abs(log["F_Bo_B"][:, c]).max()
-            if largest > 0.3 * limits[c]:
+            if largest > 0.6 * limits[c]:
                 for sign in (-1, 1):
                     ax.axhline(sign * limits[c], color=LIMIT, lw=1, ls="--")
                 ax.set_title(name)

@@ -73,12 +73,16 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
+def _pose(p: Float[np.ndarray, "3"], R: RotationMatrix | None = None) -> RigidTransform:
+    return RigidTransform(R or RotationMatrix(), np.asarray(p, float))  # pyright: ignore
+
+
 def _add(
     meshcat: Meshcat, path: str, shape: Shape, rgba: Rgba, p: Float[np.ndarray, "3"] | None = None
 ) -> None:
     meshcat.SetObject(path, shape, rgba)
     if p is not None:
-        meshcat.SetTransform(path, RigidTransform(np.asarray(p, float)))
+        meshcat.SetTransform(path, _pose(p))
 
 
 def _surroundings(meshcat: Meshcat, log: RunLog, scene: Scene) -> None:
@@ -108,8 +112,8 @@ def _surroundings(meshcat: Meshcat, log: RunLog, scene: Scene) -> None:
     norm = float(np.linalg.norm(way))
     ahead = way / norm if norm > 0.5 else np.array([1.0, 0.0])
     left = np.array([-ahead[1], ahead[0]])
-    eye = middle[:2] - 0.45 * span * ahead + 0.5 * span * left
-    meshcat.SetCameraPose(np.array([*eye, middle[2] + 0.5 * span]), middle)
+    eye = middle[:2] - 0.42 * span * ahead + 0.36 * span * left
+    meshcat.SetCameraPose(np.array([*eye, middle[2] + 0.6 * span]), middle)
 
 
 def _vehicle(meshcat: Meshcat, vehicle: Vehicle) -> None:
@@ -126,11 +130,11 @@ def _vehicle(meshcat: Meshcat, vehicle: Vehicle) -> None:
         _add(meshcat, f"vehicle/{name}", shape, rgba, np.array(p))
     along = RotationMatrix.MakeYRotation(np.pi / 2)
     meshcat.SetObject("vehicle/tube", Capsule(0.2 * W / 2, 0.62 * L), _TUBE)
-    meshcat.SetTransform("vehicle/tube", RigidTransform(along, np.array([0.02, 0, 0])))
+    meshcat.SetTransform("vehicle/tube", _pose(np.array([0.02, 0, 0]), along))
     for i, mount in enumerate(vehicle.propulsion.mounts):
         axis = np.array(mount.direction) / np.linalg.norm(mount.direction)
         R = RotationMatrix.MakeFromOneVector(axis, 2)
-        X = RigidTransform(R, np.array(mount.position))
+        X = _pose(np.array(mount.position), R)
         meshcat.SetObject(f"vehicle/thruster_{i + 1}", Cylinder(0.048, 0.05), _RING)
         meshcat.SetTransform(f"vehicle/thruster_{i + 1}", X)
 
@@ -138,8 +142,8 @@ def _vehicle(meshcat: Meshcat, vehicle: Vehicle) -> None:
 def _motion(meshcat: Meshcat, log: RunLog) -> None:
     every = max(1, round(1 / (FRAMES * log.dt)))
     for t, X in zip(log.time[::every], log["X_WB"][::every], strict=True):
-        pose = RigidTransform(Quaternion(X[:4] / np.linalg.norm(X[:4])), X[4:])
-        meshcat.SetTransform("vehicle", pose, float(t))
+        R = RotationMatrix(Quaternion(X[:4] / np.linalg.norm(X[:4])))
+        meshcat.SetTransform("vehicle", _pose(X[4:], R), float(t))
 
 
 def _flown(meshcat: Meshcat, log: RunLog) -> None:

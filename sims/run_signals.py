@@ -25,11 +25,17 @@ _NOTES = (
 
 def log_periods(scenario: Scenario) -> dict[str, float]:
     """How often each port of station and controller is logged (s)."""
-    coarse = ("pwm", "X_WB_cheat", "V_WB_B_cheat", "F_disturbance_cheat", "flow_cheat")
-    fine = ("X_WB", "V_WB_B", "covariance", "F_Bo_B")
-    return dict.fromkeys(coarse, 1 / scenario.log.rate) | dict.fromkeys(
-        fine, scenario.station.period
+    coarse: tuple[str, ...] = (
+        "pwm",
+        "X_WB_cheat",
+        "V_WB_B_cheat",
+        "F_disturbance_cheat",
+        "flow_cheat",
     )
+    fine: tuple[str, ...] = ("X_WB", "V_WB_B", "covariance", "F_Bo_B")
+    periods: dict[str, float] = dict.fromkeys(coarse, 1 / scenario.log.rate)
+    periods.update(dict.fromkeys(fine, scenario.station.period))
+    return periods
 
 
 class PlanTap:
@@ -49,7 +55,7 @@ class PlanTap:
                 self.source = source
                 self._context = source.GetMyContextFromRoot(root)
                 names = ("plan", "samples", "figures") if samples else ("plan", "figures")
-                self._ports = {
+                self._ports: dict[str, Any] = {
                     name: source.GetOutputPort(name) for name in names if source.HasOutputPort(name)
                 }
 
@@ -63,7 +69,7 @@ class PlanTap:
         """Keep the plan at hand if it is a new one; `t` (s) is the last time it may be of."""
         if self.source is None:
             return
-        plan = self._ports["plan"].Eval(self._context)
+        plan: np.ndarray = self._ports["plan"].Eval(self._context)
         if self.kept and np.array_equal(plan, self.kept[-1]["plan"], equal_nan=True):
             return
         found = {name: port.Eval(self._context).copy() for name, port in self._ports.items()}

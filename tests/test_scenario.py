@@ -1,5 +1,6 @@
 """Scenarios load, merge with what is laid over them, and fly."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,10 +74,10 @@ def test_text_is_laid_over_key_by_key():
     scenario = overridden(BASE, "{duration: 2, station: {seed: 7}, success: {settle: 1}}")
     assert (scenario.duration, scenario.seed, scenario.station.vehicle) == (2, 7, "bluerov2_heavy")
     assert scenario.success == FollowPath(0.2, 1.0)
+    before = overridden(BASE, "{}").controller
+    assert isinstance(before, TrackReference)
     same = overridden(BASE, "controller: !TrackReference {feedforward: false}").controller
-    assert isinstance(same, TrackReference)
-    assert same.feedforward is False
-    assert same.path == overridden(BASE, "{}").controller.path
+    assert same == replace(before, feedforward=False)
     other = overridden(BASE, "success: !ReachGoal {goal: [1, 0, -1]}")
     assert other.success == ReachGoal(goal=(1.0, 0.0, -1.0))
     np.testing.assert_array_equal(other.goal, [1, 0, -1])
@@ -90,6 +91,7 @@ def test_changes():
     with pytest.raises(UserError, match="TrackReference, which does not plan"):
         scenario.with_changes(model=Path("a.spinn"))
     crossing = load_scenario("pylon_crossing_calm").with_changes(model=Path("a.spinn"))
+    assert isinstance(crossing.controller, MppiImpedance)
     assert crossing.controller.model == Path("a.spinn")
 
 

@@ -6,7 +6,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 from pydrake.common import RandomDistribution
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from ..models import se3
 from ..models.sensors import Compass, DepthSensor, Dvl, Imu
@@ -85,7 +85,7 @@ class Ekf(LeafSystem):
         start, unravel = ravel_pytree(core.init(jnp.asarray(X0), jnp.asarray(V0)))
         n = start.size
         outputs = {"X_WB": 7, "V_WB_B": 6, "covariance": ERRORS**2, "status": len(STATUS)}
-        self._filter = self.DeclareDiscreteState(np.asarray(start))
+        self._filter = self.DeclareDiscreteState(BasicVector(np.asarray(start).tolist()))
         self._outputs = [self.DeclareDiscreteState(size) for size in outputs.values()]
         for name, index in zip(outputs, self._outputs, strict=True):
             self.DeclareStateOutputPort(name, index)

@@ -65,8 +65,8 @@ class LearnedPlant(LeafSystem):
         self._flow = self.DeclareVectorInputPort("flow_W", 6)
         gaussian = RandomDistribution.kGaussian
         self._noise = self.DeclareVectorInputPort("noise", 6 * substeps, gaussian)
-        self._X = self.DeclareDiscreteState(X0)
-        self._V = self.DeclareDiscreteState(V0)
+        self._X = self.DeclareDiscreteState(BasicVector(X0.tolist()))
+        self._V = self.DeclareDiscreteState(BasicVector(V0.tolist()))
         self._A = self.DeclareDiscreteState(6)
         self.DeclareStateOutputPort("X_WB", self._X)
         self.DeclareStateOutputPort("V_WB_B", self._V)

@@ -13,6 +13,7 @@ from ..models.sensors import Compass, DepthSensor, Dvl, Imu, Sensor
 from .jit import VectorFunction, value_or_zeros
 
 Outputs = tuple[Array, ...]
+Motion = tuple[Array, Array, Array]
 
 
 class SensorSuite(LeafSystem):
@@ -82,13 +83,15 @@ class SensorSuite(LeafSystem):
         ends = np.cumsum([0, *sizes])
         shares = [slice(a, b) for a, b in pairwise(ends)]
 
-        def tick(state: Array, w: Array, t: Array, dvl_state: Array, *motion: Array) -> Outputs:
-            state = imu.measure(state, *motion, t, w[shares[0]])
+        def tick(motion: Motion, t: Array, w: Array, state: Array, dvl_state: Array) -> Outputs:
+            X, V, A = motion
+            state = imu.measure(state, X, V, A, t, w[shares[0]])
             # A reading of the DVL becomes visible between its pings.
             return state, imu.reading(state, t), dvl.reading(dvl_state, t)
 
-        def ping(state: Array, w: Array, t: Array, *motion: Array) -> Outputs:
-            return (dvl.measure(state, *motion, t, w[shares[1]]),)
+        def ping(motion: Motion, t: Array, w: Array, state: Array) -> Outputs:
+            X, V, A = motion
+            return (dvl.measure(state, X, V, A, t, w[shares[1]]),)
 
         states, shown = self._states, self._shown
         self._declare(imu, tick, [states[0], states[1]], [states[0], shown[0], shown[1]])
@@ -108,7 +111,7 @@ class SensorSuite(LeafSystem):
         ports = (self._X, self._V, self._A, self._noise)
 
         def packed(t: Array, X: Array, V: Array, A: Array, w: Array, *own: Array) -> Outputs:
-            return measure(own[0], w, t[0], *own[1:], X, V, A)
+            return measure((X, V, A), t[0], w, *own)
 
         def size(index: DiscreteStateIndex) -> int:
             return self._sizes[int(index)]
@@ -134,8 +137,9 @@ class SensorSuite(LeafSystem):
 def _stamped(sensor: Sensor, share: slice) -> Callable[..., Outputs]:
     """A measurement whose reading goes with a valid mark and its time."""
 
-    def measure(state: Array, w: Array, t: Array, *motion: Array) -> Outputs:
-        state = sensor.measure(state, *motion, t, w[share])
+    def measure(motion: Motion, t: Array, w: Array, state: Array) -> Outputs:
+        X, V, A = motion
+        state = sensor.measure(state, X, V, A, t, w[share])
         return state, jnp.concatenate([sensor.reading(state, t), jnp.stack([jnp.ones_like(t), t])])
 
     return measure

@@ -3,13 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import (
     BasicVector,
     Context,
     DiscreteValues,
     LeafSystem,
-    ValueProducer,
 )
 
 from ..models import integrate
@@ -53,30 +51,23 @@ class ThrustAllocation(LeafSystem):
 
         self._allocate = VectorFunction(allocate, [6], [count, count])
         self._F = self.DeclareVectorInputPort("F_Bo_B", 6)
-        both = Value(BasicVector(2 * count))
-        self._both = self.DeclareCacheEntry(
-            "pwm and forces",
-            ValueProducer(allocate=both.Clone, calc=self._calc),
-            {self.input_port_ticket(self._F.get_index())},
-        )
-        ticket = {self._both.ticket()}
-        first, second = slice(0, count), slice(count, 2 * count)
-        self.DeclareVectorOutputPort("pwm", count, lambda c, out: self._put(c, out, first), ticket)
-        self.DeclareVectorOutputPort(
-            "thruster_force", count, lambda c, out: self._put(c, out, second), ticket
-        )
+        self.DeclareVectorOutputPort("pwm", count, self._put_pwm)
+        self.DeclareVectorOutputPort("thruster_force", count, self._put_forces)
 
-    def _calc(self, context: Context, result: AbstractValue) -> None:
-        F = self._F.Eval(context)
+    def _both(self, context: Context) -> list[np.ndarray]:
+        F = np.asarray(self._F.Eval(context))
         if not np.all(np.isfinite(F)):
             raise FloatingPointError(
                 f"{self.get_name() or 'ThrustAllocation'}: the wanted wrench at "
                 f"t = {context.get_time():.4f} s is not finite: {F}"
             )
-        result.get_mutable_value().SetFromVector(self._allocate.flat(F))
+        return self._allocate(F)
 
-    def _put(self, context: Context, output: BasicVector, part: slice) -> None:
-        output.SetFromVector(self._both.Eval(context).value()[part])
+    def _put_pwm(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._both(context)[0])
+
+    def _put_forces(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._both(context)[1])
 
 
 class ThrusterBank(LeafSystem):

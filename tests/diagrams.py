@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from pydrake.common import RandomDistribution, RandomGenerator
 from pydrake.systems.analysis import InitializeParams, Simulator
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, LeafSystem, System
 from pydrake.systems.primitives import RandomSource
 
 PERIOD = 0.01
@@ -35,6 +35,11 @@ def seeded(diagram: Diagram, seed: int = 0) -> Simulator:
     diagram.SetRandomContext(simulator.get_mutable_context(), RandomGenerator(seed))
     simulator.Initialize()
     return simulator
+
+
+def read(system: System, name: str, context: Context) -> np.ndarray:
+    """Value of a vector output port."""
+    return np.asarray(system.GetOutputPort(name).Eval(context))
 
 
 def outputs(diagram: Diagram, context: Context) -> np.ndarray:

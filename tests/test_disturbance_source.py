@@ -1,7 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from diagrams import add_randomness, check_reproducible, connect, run
+from diagrams import add_randomness, check_reproducible, connect, read, run
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
@@ -61,7 +61,7 @@ def test_outputs_are_those_of_the_model_at_their_time():
     def shown() -> np.ndarray:
         names = "F_disturbance_Bo_B", "flow_W"
         context = simulator.get_context()
-        return np.concatenate([source.GetOutputPort(name).Eval(context) for name in names])
+        return np.concatenate([read(source, name, context) for name in names])
 
     def expected(state, X, t) -> np.ndarray:
         flow = SEA.flow(state, X, t)

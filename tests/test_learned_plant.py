@@ -1,7 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from diagrams import add_randomness, check_reproducible
+from diagrams import add_randomness, check_reproducible, read
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.math import SpatialVelocity
 from pydrake.multibody.plant import MultibodyPlant
@@ -55,7 +55,7 @@ def advance(plant: LearnedPlant, end: float, **inputs: np.ndarray) -> tuple[np.n
     for name, value in inputs.items():
         plant.GetInputPort(name).FixValue(context, value)
     simulator.AdvanceTo(end)
-    return tuple(plant.GetOutputPort(n).Eval(context) for n in ("X_WB", "V_WB_B", "A_WB_B"))
+    return tuple(read(plant, n, context) for n in ("X_WB", "V_WB_B", "A_WB_B"))
 
 
 def free_body_in_drake(X0: np.ndarray, V0: np.ndarray, end: float) -> np.ndarray:
@@ -74,7 +74,7 @@ def free_body_in_drake(X0: np.ndarray, V0: np.ndarray, end: float) -> np.ndarray
     V = SpatialVelocity(w=R @ V0[3:], v=R @ V0[:3])
     plant.SetFreeBodySpatialVelocity(context, body, V)
     simulator.AdvanceTo(end)
-    return plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4()
+    return np.asarray(plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4(), float)
 
 
 def test_converges_with_order_one_to_drakes_free_body():
@@ -161,7 +161,7 @@ def test_quaternion_stays_unit_and_states_agree():
     context = simulator.get_mutable_context()
     plant.GetInputPort("F_Bo_B").FixValue(context, np.array([0, 0, 0, 2.0, 1.0, 3.0]))
     simulator.AdvanceTo(100.0)
-    X, V, state = (plant.GetOutputPort(n).Eval(context) for n in ("X_WB", "V_WB_B", "state"))
+    X, V, state = (read(plant, n, context) for n in ("X_WB", "V_WB_B", "state"))
     assert np.linalg.norm(V[3:]) > 1
     assert abs(np.linalg.norm(X[:4]) - 1) < 4e-16
     np.testing.assert_array_equal(state, np.concatenate([X, V]))
@@ -202,10 +202,8 @@ def test_set_state_writes_the_context_only():
     plant = LearnedPlant(vehicle())
     context, other = plant.CreateDefaultContext(), plant.CreateDefaultContext()
     plant.set_state(context, np.array([0.0, 1, 0, 0, 1, 2, 3]), np.arange(6.0))
-    np.testing.assert_array_equal(
-        plant.GetOutputPort("state").Eval(context), [0, 1, 0, 0, 1, 2, 3, *range(6)]
-    )
-    np.testing.assert_array_equal(plant.GetOutputPort("V_WB_B").Eval(other), np.zeros(6))
+    np.testing.assert_array_equal(read(plant, "state", context), [0, 1, 0, 0, 1, 2, 3, *range(6)])
+    np.testing.assert_array_equal(read(plant, "V_WB_B", other), np.zeros(6))
 
 
 def test_same_seed_same_bits():

@@ -1,7 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from diagrams import add_randomness, check_reproducible, connect, seeded
+from diagrams import add_randomness, check_reproducible, connect, read, seeded
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
@@ -48,7 +48,7 @@ def history() -> dict[str, np.ndarray]:
     for n in range(600):
         simulator.AdvanceTo((n + 0.5) * 0.01)
         for name in PORTS:
-            rows[name].append(station.GetOutputPort(name).Eval(simulator.get_context()))
+            rows[name].append(read(station, name, simulator.get_context()))
     return {name: np.stack(values) for name, values in rows.items()}
 
 
@@ -58,7 +58,7 @@ def still(sensors: SensorSuite, time: float) -> dict[str, np.ndarray]:
     for name, value in (("X_WB", X), ("V_WB_B", V), ("A_WB_B", A)):
         sensors.GetInputPort(name).FixValue(simulator.get_mutable_context(), value)
     simulator.AdvanceTo(time)
-    return {name: sensors.GetOutputPort(name).Eval(simulator.get_context()) for name in PORTS}
+    return {name: read(sensors, name, simulator.get_context()) for name in PORTS}
 
 
 def test_without_noise_the_readings_are_the_expected_ones():
@@ -78,7 +78,7 @@ def test_nothing_is_valid_before_the_first_measurement():
     simulator = Simulator(sensors)
     simulator.Initialize()
     for name, mark in (("dvl", 3), ("depth", 1), ("compass", 1)):
-        assert sensors.GetOutputPort(name).Eval(simulator.get_context())[mark] == 0
+        assert read(sensors, name, simulator.get_context())[mark] == 0
 
 
 def test_every_sensor_keeps_its_rate_and_holds_between(history):
@@ -116,9 +116,9 @@ def test_biases_are_drawn_at_the_start():
     simulator.AdvanceTo(0.0)
     simulator.AdvanceTo(0.05)
     gravity = np.asarray(se3.rotate_inverse(jnp.asarray(X), jnp.array([0, 0, 9.80665])))
-    force = sensors.GetOutputPort("imu").Eval(context)[:3]
+    force = read(sensors, "imu", context)[:3]
     np.testing.assert_allclose(force, gravity + w[:3], rtol=1e-12)
-    offset = sensors.GetOutputPort("depth").Eval(context)[0]
+    offset = read(sensors, "depth", context)[0]
     expected = DepthSensor().expected(jnp.asarray(X))[0] + 0.5 * w[6 + 2]
     np.testing.assert_allclose(offset, expected, rtol=1e-12)
 

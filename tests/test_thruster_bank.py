@@ -1,7 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from diagrams import connect
+from diagrams import connect, read
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
@@ -44,7 +44,7 @@ class Chain:
         return self.read(self.bank, "F_Bo_B")
 
     def read(self, system, name: str) -> np.ndarray:
-        return system.GetOutputPort(name).Eval(system.GetMyContextFromRoot(self.context))
+        return read(system, name, system.GetMyContextFromRoot(self.context))
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_without_commands_the_thrusters_stand_still():
     bank = ThrusterBank(thrusters())
     simulator = Simulator(bank)
     simulator.AdvanceTo(0.1)
-    wrench = bank.GetOutputPort("F_Bo_B").Eval(simulator.get_context())
+    wrench = read(bank, "F_Bo_B", simulator.get_context())
     np.testing.assert_array_equal(wrench, np.zeros(6))
 
 

@@ -43,8 +43,8 @@ def generated(tmp_path_factory):
     folder = tmp_path_factory.mktemp("generated")
     path = folder / "tiny.nc"
     code = called(
-        "generate", "--out", path, "--maneuvers", "surge-forward", "yaw-left", "--trajectories", "3",
-        "--duration", "2", "--substeps", "2", "--disturbances", "calm",
+        "generate", "--out", path, "--maneuvers", "surge-forward", "yaw-left", "--disturbances",
+        "calm", "--trajectories", "3", "--duration", "2", "--substeps", "2",
     )  # fmt: skip
     assert code is None
     return path

@@ -188,7 +188,7 @@ def test_diffrax_solver_takes_the_same_steps():
         0.0, n * dt, dt / 8, shape=(6,), key=jax.random.key(3), levy_area=diffrax.BrownianIncrement
     )
     grid = dt * jnp.arange(n + 1.0)
-    dW = jax.vmap(path.evaluate)(grid[:-1], grid[1:])
+    dW = jnp.asarray(jax.vmap(path.evaluate)(grid[:-1], grid[1:]))
     Xs, Vs = rollout(dynamics, X0, V0, jnp.tile(F, (n, 1)), dt, dW[:, None])
     solution = diffrax.diffeqsolve(
         sde_terms(dynamics, lambda t: F, path),
@@ -199,6 +199,7 @@ def test_diffrax_solver_takes_the_same_steps():
         (X0, V0),
         saveat=diffrax.SaveAt(ts=grid[1:]),
     )
+    assert solution.ys is not None
     X_diffrax, V_diffrax = solution.ys
     np.testing.assert_allclose(X_diffrax, Xs, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(V_diffrax, Vs, rtol=1e-6, atol=1e-6)

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 from run_example import example_log
+
 from spinndrift.models.recording import Recording
 from spinndrift.sims.run_log import RunLog
 

@@ -67,8 +67,8 @@ class Run(NamedTuple):
 def simulate(scenario: Scenario, progress: Progress | None = None) -> Run:
     """Fly a scenario to its end. The same scenario gives the same log, bit for bit.
 
-    Ctrl-C ends the run after the sample at hand with the outcome `interrupted`; what was flown
-    until then is returned. A second one interrupts at once.
+    Ctrl-C ends the flight after the sample at hand with the outcome `interrupted`; what was flown
+    until then is returned. A second one, or one before the flight, interrupts at once.
 
     Raises:
         UserError: the scenario names what can't be read, or its controller lacks a port.
@@ -85,8 +85,13 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Run:
     obstacles = scenario.station.obstacles
     monitor = Monitor(vehicle, obstacles, scenario.success, scenario.goal, scenario.safety)
     tap = PlanTap(diagram, context, scenario.log.samples)
+    timing = Timing(dt=1 / scenario.log.rate)
+    started = time.perf_counter()
+    with _ticking(tell, "compiling"):
+        _warm_up(diagram, min(scenario.duration, _WARM_UP))
+    timing.compilation = time.perf_counter() - started
     with _stop_on_interrupt() as stopped:
-        outcome, timing = _fly(scenario, diagram, simulator, monitor, tap, tell, stopped)
+        outcome = _fly(scenario, diagram, simulator, monitor, tap, timing, tell, stopped)
     log = collect(scenario, logged(diagram, context), tap, outcome.time)
     return Run(scenario, log, outcome, timing)
 
@@ -97,21 +102,17 @@ def _fly(
     simulator: Simulator,
     monitor: Monitor,
     tap: PlanTap,
+    timing: Timing,
     tell: Progress,
     stopped: threading.Event,
-) -> tuple[Outcome, Timing]:
+) -> Outcome:
     """Advance sample by sample until the monitor, the clock or the user ends the run."""
     context = simulator.get_mutable_context()
     station = diagram.GetSubsystemByName("station")
     own = station.GetMyContextFromRoot(context)
     ports = [station.GetOutputPort(name) for name in ("X_WB_cheat", "V_WB_B_cheat")]
-    dt = 1 / scenario.log.rate
-    timing = Timing(dt=dt)
+    dt = timing.dt
     steps = max(1, round(scenario.duration / dt))
-    started = time.perf_counter()
-    with _ticking(tell, "compiling"):
-        _warm_up(diagram, min(scenario.duration, _WARM_UP))
-    timing.compilation = time.perf_counter() - started
     k, done, outcome = 0, 0.0, None
     try:
         simulator.Initialize()
@@ -137,7 +138,7 @@ def _fly(
         simulator.AdvanceTo(k * dt + scenario.station.period)
     except FloatingPointError as error:  # the plant names what was not finite
         outcome = outcome or Outcome("not finite", round(k * dt, 9), str(error))
-    return outcome, timing
+    return outcome
 
 
 def _warm_up(diagram: Diagram, duration: float) -> None:

@@ -23,6 +23,7 @@ from the identity up to the cut locus at π (Solà et al. 2018, "A micro Lie the
 from fractions import Fraction
 from math import comb, factorial
 
+import jax
 import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
@@ -150,22 +151,28 @@ def exp(xi: Float[Array, "6 *batch"]) -> Float[Array, "7 *batch"]:
     """The pose reached by flowing for unit time with the constant twist xi = [v, ω]."""
     v, omega = jnp.split(xi, 2)
     t2 = _dot(omega, omega)
-    series = t2 < _SERIES_BELOW
-    small = jnp.where(series, t2, 0)
-    large = jnp.where(series, 1, t2)
-    theta = jnp.sqrt(large)
-    sin_half, cos_half = jnp.sin(theta / 2), jnp.cos(theta / 2)
-    half = jnp.where(series, _polynomial(_SIN_HALF, small), sin_half / theta)
-    w = jnp.where(series, _polynomial(_COS_HALF, small), cos_half)
-    b = jnp.where(series, _polynomial(_ONE_MINUS_COS, small), 2 * sin_half**2 / large)
-    c = jnp.where(
-        series,
-        _polynomial(_X_MINUS_SIN, small),
-        (theta - 2 * sin_half * cos_half) / (large * theta),
-    )
+    # A step of an integrator turns by far less than a radian: then no sine is evaluated at all.
+    small = jnp.all(t2 < _SERIES_BELOW)
+    w, half, b, c = jnp.unstack(jax.lax.cond(small, _exp_series, _exp_coefficients, t2))
     wxv = cross(omega, v)
     p = v + b[None] * wxv + c[None] * cross(omega, wxv)
     return jnp.concatenate([w[None], half[None] * omega, p])
+
+
+def _exp_series(t2: Array) -> Array:
+    """cos(θ/2), sin(θ/2)/θ, (1 - cos θ)/θ² and (θ - sin θ)/θ³ from θ² below one."""
+    series = (_COS_HALF, _SIN_HALF, _ONE_MINUS_COS, _X_MINUS_SIN)
+    return jnp.stack([_polynomial(coefficients, t2) for coefficients in series])
+
+
+def _exp_coefficients(t2: Array) -> Array:
+    """The same from any θ²."""
+    series = t2 < _SERIES_BELOW
+    large = jnp.where(series, 1, t2)
+    theta = jnp.sqrt(large)
+    s, c = jnp.sin(theta / 2), jnp.cos(theta / 2)
+    closed = jnp.stack([c, s / theta, 2 * s**2 / large, (theta - 2 * s * c) / (large * theta)])
+    return jnp.where(series[None], _exp_series(jnp.where(series, t2, 0)), closed)
 
 
 def log(X: Float[Array, "7 *batch"]) -> Float[Array, "6 *batch"]:

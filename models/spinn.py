@@ -19,7 +19,7 @@ from .dynamics import Coefficients, Dynamics
 from .networks import ACTIVATIONS, Activation, Heads, MlpStack
 from .potential import BoundedScalar, GravityPotential, PosePotential, Potential, PotentialKind
 from .rigid_body import FossenDynamics
-from .spd import PACKED, CholeskySpd, EigenSpd, Spd, squareplus
+from .spd import PACKED, CholeskySpd, ConstantSpd, EigenSpd, Spd, squareplus
 
 SpdKind = Literal["cholesky", "eigenvalues"]
 
@@ -203,24 +203,25 @@ class Spinn(Dynamics):
         features = self._features(V_WB_B, self.hidden.weights[0].shape[0])
         first = int(self.config.stochastic)
         raw = self.matrix_heads(features[first:], features.shape[0] - first)
-        mass = raw[0] if self.constant_mass is None else self.constant_mass
         return Coefficients(
-            self._spd(mass, 0),
+            self._mass(raw),
             self._spd(raw[-2], 1),
             self._spd(raw[-1], 2),
             self._diffusion(features),
         )
 
     def mass_and_diffusion(self, V_WB_B: Float[Array, "6 *batch"]) -> tuple[Spd, Array]:
-        mass = self.constant_mass
-        count = int(self.config.stochastic) + int(mass is None)
-        if count == 0:
-            assert mass is not None
-            return self._spd(mass, 0), self._diffusion(V_WB_B)
-        features = self._features(V_WB_B, count)
-        if mass is None:
-            mass = self.matrix_heads(features[count - 1 :], 1)[0]
-        return self._spd(mass, 0), self._diffusion(features)
+        first, varies = int(self.config.stochastic), self.constant_mass is None
+        features = self._features(V_WB_B, max(first + varies, 1))
+        raw = self.matrix_heads(features[first:], 1) if varies else None
+        return self._mass(raw), self._diffusion(features)
+
+    def _mass(self, raw: Array | None) -> Spd:
+        if self.constant_mass is None:
+            assert raw is not None
+            return self._spd(raw[0], 0)
+        M = self._spd(self.constant_mass, 0)
+        return ConstantSpd(M.matrix(), M.solve(jnp.eye(6, dtype=self.constant_mass.dtype)))
 
     def potential(self, X_WB: Float[Array, "7 *batch"]) -> Float[Array, "*batch"]:
         return self.learned_potential.energy(X_WB)

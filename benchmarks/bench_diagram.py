@@ -1,5 +1,6 @@
 """Simulated time per time of the diagram without controller and planner, part by part."""
 
+import jax
 import numpy as np
 import pytest
 from pydrake.common import RandomDistribution, RandomGenerator
@@ -16,6 +17,13 @@ from spinndrift.systems.sensor_suite import SensorSuite
 from spinndrift.systems.thruster_bank import ThrustAllocation, ThrusterBank
 
 SIMULATED = 2.0
+
+
+@pytest.fixture(autouse=True)
+def _settings():
+    """What the command line sets at its start."""
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
 def build(parts: set[str]) -> Simulator:
@@ -78,7 +86,7 @@ def build(parts: set[str]) -> Simulator:
         "plant disturbance sensors ekf thrusters",
     ],
 )
-def bench_diagram(benchmark, parts):
+def test_diagram(benchmark, parts):
     simulator = build(set(parts.split()))
 
     def advance():

@@ -1,5 +1,7 @@
 """The vehicle as a discrete-time system around any model of its dynamics."""
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -118,16 +120,16 @@ class LearnedPlant(LeafSystem):
         parts += [value_or_zeros(p, context) for p in (self._F, self._F_disturbance, self._noise)]
         if self._flow.HasValue(context):
             parts.append(self._flow.Eval(context))
-            result = self._flowing(*parts)
+            result = self._flowing.flat(*parts)
         else:
-            result = self._still(*parts)
-        if not all(np.isfinite(part.sum()) for part in result):
-            raise FloatingPointError(self._explain(context.get_time(), parts, result))
-        discrete_state.set_value(self._X, result[0])
-        discrete_state.set_value(self._V, result[1])
-        discrete_state.set_value(self._A, result[2])
+            result = self._still.flat(*parts)
+        if not math.isfinite(result.sum()):
+            raise FloatingPointError(self._explain(context.get_time(), parts, result[7:13]))
+        discrete_state.set_value(self._X, result[:7])
+        discrete_state.set_value(self._V, result[7:13])
+        discrete_state.set_value(self._A, result[13:])
 
-    def _explain(self, t: float, parts: list[np.ndarray], result: list[np.ndarray]) -> str:
+    def _explain(self, t: float, parts: list[np.ndarray], V: np.ndarray) -> str:
         names = ["X_WB", "V_WB_B", "F_Bo_B", "F_disturbance_Bo_B", "noise", "flow_W"]
         told = dict(zip(names, parts, strict=False))
         bad = [name for name, part in told.items() if not np.all(np.isfinite(part))]
@@ -140,7 +142,7 @@ class LearnedPlant(LeafSystem):
             return (
                 f"{self.get_name() or 'LearnedPlant'}: the state is not finite after the step from "
                 f"t = {t:.4f} s; {cause}. Before the step X_WB = {parts[0]}, V_WB_B = {parts[1]}, "
-                f"F_Bo_B = {parts[2]}; after it V_WB_B = {result[1]}."
+                f"F_Bo_B = {parts[2]}; after it V_WB_B = {V}."
             )
 
 

@@ -100,7 +100,7 @@ class _Run:
         self.config, self.windows, self.metadata = config, windows, metadata
         self.folder = None if out_dir is None else RunFolder(out_dir)
         params, self.static = partition(model)
-        self.train_step = TrainStep(config, self.static)
+        self.train_step = TrainStep(config, params, self.static)
         # the step donates its inputs: never the caller's own arrays
         self.state = TrainState(
             params=jax.tree.map(jnp.array, params),

@@ -18,6 +18,10 @@ from ..models import se3
 from .geodesic import relative_log
 
 
+def _subtract(a: Array, b: Array) -> list[Array]:
+    return [y - x for x, y in zip(jnp.unstack(a), jnp.unstack(b), strict=True)]
+
+
 class Kernel(eqx.Module):
     """A product kernel over two times; `bandwidths` (components, N) has one column a time index."""
 
@@ -57,7 +61,7 @@ class VelocityKernel(Kernel):
 
     @staticmethod
     def difference(a: Float[Array, "6 *a"], b: Float[Array, "6 *b"]) -> list[Array]:
-        return [y - x for x, y in zip(jnp.unstack(a), jnp.unstack(b), strict=True)]
+        return _subtract(a, b)
 
 
 class ChordalKernel(Kernel):
@@ -67,7 +71,7 @@ class ChordalKernel(Kernel):
 
     @staticmethod
     def difference(a: Float[Array, "7 *a"], b: Float[Array, "7 *b"]) -> list[Array]:
-        return VelocityKernel.difference(se3.chordal(a), se3.chordal(b))
+        return _subtract(se3.chordal(a), se3.chordal(b))
 
 
 class GeodesicKernel(Kernel):

@@ -5,7 +5,7 @@ class stands in the union `losses.ObjectiveConfig`, so YAML names it by its tag.
 """
 
 import abc
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ class Batch(NamedTuple):
     F: Float[Array, "T 6 W"]
 
     @classmethod
-    def of(cls, windows: Windows) -> Self:
+    def of(cls, windows: Windows) -> "Batch":
         """All windows as one batch."""
         return cls(jnp.asarray(windows.X), jnp.asarray(windows.V), jnp.asarray(windows.F))
 
@@ -39,7 +39,7 @@ class Objective(eqx.Module):
     ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
         """The mean loss over the batch and its parts by name; all randomness comes from `key`."""
 
-    def refit(self, model: Dynamics, windows: Windows) -> Self:
+    def refit(self, model: Dynamics, windows: Windows) -> "Objective":
         """The objective with its data-driven constants fitted anew to what `model` now misses."""
         del model, windows
         return self

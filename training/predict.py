@@ -27,15 +27,17 @@ def predict(
     """
     T, _, W = F.shape
     count = samples + with_path_of_drift
-    dW = jnp.zeros((T, substeps, 6, 0, W), F.dtype)
-    if samples:
-        scale = jnp.asarray((dt / substeps) ** 0.5, F.dtype)
-        dW = scale * jax.random.normal(key, (T, substeps, 6, samples, W), F.dtype)
+    # substeps as steps of their own: the compiled step is one, however many there are
+    F = jnp.repeat(F[:, :, None], substeps, axis=0)
+    dt = dt / substeps
+    scale = jnp.asarray(dt**0.5, F.dtype)
+    dW = scale * jax.random.normal(key, (T * substeps, 1, 6, samples, W), F.dtype)
     if with_path_of_drift:
-        dW = jnp.concatenate([dW, jnp.zeros((T, substeps, 6, 1, W), F.dtype)], axis=3)
+        dW = jnp.concatenate([dW, jnp.zeros((T * substeps, 1, 6, 1, W), F.dtype)], axis=3)
     X = jnp.broadcast_to(X_0[:, None], (7, count, W))
     V = jnp.broadcast_to(V_0[:, None], (6, count, W))
-    return rollout(model, X, V, F[:, :, None], dt, dW)
+    Xs, Vs = rollout(model, X, V, F, dt, dW)
+    return Xs[substeps - 1 :: substeps], Vs[substeps - 1 :: substeps]
 
 
 def predict_drift(
@@ -48,4 +50,5 @@ def predict_drift(
     substeps: int = 1,
 ) -> tuple[Float[Array, "T 7 W"], Float[Array, "T 6 W"]]:
     """The noise-free motion of each window at t_1 … t_T."""
-    return rollout(model, X_0, V_0, F, dt, substeps=substeps)
+    Xs, Vs = rollout(model, X_0, V_0, jnp.repeat(F, substeps, axis=0), dt / substeps)
+    return Xs[substeps - 1 :: substeps], Vs[substeps - 1 :: substeps]

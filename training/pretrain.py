@@ -50,7 +50,8 @@ def pretrain(
         p, moments = carry
         k, rate = inputs
         value, gradient = jax.value_and_grad(loss)(p, k)
-        direction, moments = adam.update(gradient, moments, p)
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes int32 and float
+            direction, moments = adam.update(gradient, moments, p)
         p = jax.tree.map(lambda a, d: a - rate.astype(a.dtype) * d, p, direction)
         return (p, moments), value
 

@@ -113,7 +113,10 @@ class RunFolder:
             UserError: the checkpoint is damaged, or of other settings or other data.
         """
         try:
-            with np.load(self.checkpoint, allow_pickle=False) as archive:
+            with (
+                self.checkpoint.open("rb") as handle,
+                np.load(handle, allow_pickle=False) as archive,
+            ):
                 header = json.loads(archive["header"].tobytes())
                 arrays = [archive[f"array_{i:04d}"] for i in range(len(archive.files) - 1)]
             _check_same(yaml.loads(TrainingConfig, header["config"], "checkpoint"), config)

@@ -1,4 +1,6 @@
-"""The model that training starts from: a preset, with its diffusion estimated from the data."""
+"""The model that training starts from: a preset, drift and diffusion brought near the data."""
+
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -6,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..models.rigid_body import FossenDynamics
+from ..models.dynamics import Dynamics
 from ..models.spinn import Spinn
 from ..models.vehicle import Vehicle
 from .config import TrainingConfig
+from .fit import Progress, fit
+from .losses import Mse
 from .objective import Batch
 from .predict import predict_drift
 from .pretrain import pretrain
@@ -19,22 +23,25 @@ _NORMAL_QUARTILE = 0.6744897501960817
 
 
 def estimate_diffusion(
-    dynamics: FossenDynamics, windows: Windows, horizon_s: float = 0.5
+    dynamics: Dynamics, windows: Windows, horizon_s: float = 0.5, substeps: int = 1
 ) -> Float[np.ndarray, "6"]:
     """A first guess of b (N√s, N·m√s): how far M ξ misses its prediction after `horizon_s`.
 
     b_i² h = Var[(M (ξ̂ - ξ))_i] for a horizon h short against the drag's time constant; the variance
-    is taken from the median of absolute values. It contains what the preset misses by bias and the
+    is taken from the median of absolute values. It contains what the model misses by bias and the
     sensors' noise, so it is rather too large. At least 1e-3 of what accelerates by 1 in a second.
     """
     steps = int(np.clip(round(horizon_s / windows.dt), 1, windows.steps))
     pieces = windows.thin(256).subdivide(steps).thin(1024)
     batch = Batch.of(pieces)
-    _, V = eqx.filter_jit(predict_drift)(dynamics, batch.X[0], batch.V[0], batch.F, windows.dt)
-    momentum = dynamics.mass.matvec(batch.V[-1] - V[-1])
-    miss = np.abs(np.asarray(momentum, np.float64))
+    _, V = eqx.filter_jit(predict_drift)(
+        dynamics, batch.X[0], batch.V[0], batch.F, windows.dt, substeps=substeps
+    )
+    mass = dynamics.coefficients(jnp.zeros(6, V.dtype)).mass.matrix()
+    M = np.asarray(mass, np.float64)
+    miss = np.abs(M @ np.asarray(batch.V[-1] - V[-1], np.float64))
     miss = miss[:, np.isfinite(miss).all(axis=0)]
-    floor = 1e-3 * np.diag(np.asarray(dynamics.mass.matrix(), np.float64))
+    floor = 1e-3 * np.diag(M)
     if not miss.size:
         return floor
     return np.maximum(
@@ -42,11 +49,45 @@ def estimate_diffusion(
     )
 
 
-def starting_model(config: TrainingConfig, vehicle: Vehicle, windows: Windows) -> Spinn:
-    """A SPINN at the vehicle's preset, its diffusion as the windows suggest."""
+def fit_drift(
+    config: TrainingConfig, model: Spinn, windows: Windows, progress: Progress | None = None
+) -> Spinn:
+    """The model after the squared-error fit that `config.drift` describes."""
+    c = config.drift
+    if c.steps == 0:
+        return model
+    pieces = windows.subdivide(int(np.clip(round(c.length_s / windows.dt), 1, windows.steps)))
+    settings = replace(
+        config,
+        objective=Mse(substeps=config.objective.substeps),
+        steps=c.steps,
+        batch=c.batch,
+        learning_rate=c.learning_rate,
+        warm_up=min(config.warm_up, c.steps // 10),
+        schedule="cosine",
+        refit_at=(),
+        patience=0,
+        checkpoint_every=100,
+    )
+    fitted = fit(settings, model, pieces, progress=progress).model
+    assert isinstance(fitted, Spinn)
+    return fitted
+
+
+def starting_model(
+    config: TrainingConfig, vehicle: Vehicle, windows: Windows, progress: Progress | None = None
+) -> Spinn:
+    """A SPINN at the vehicle's preset, its drift fitted to short pieces, b from what is then left.
+
+    A function of its arguments alone, so that a resumed run starts from the same bits.
+    """
     dtype = jnp.dtype(windows.X.dtype)
-    preset = vehicle.dynamics(dtype=dtype)
-    reference = vehicle.dynamics(estimate_diffusion(preset, windows), dtype)
+    reference = vehicle.dynamics(dtype=dtype)
     model_key, pretrain_key = jax.random.split(jax.random.key(config.seed))
     model = Spinn.create(config.model, reference, model_key, dtype)
-    return pretrain(model, reference, config.pretrain, pretrain_key)[0]
+    model = pretrain(model, reference, config.pretrain, pretrain_key)[0]
+    model = fit_drift(config, model, windows, progress)
+    if not config.model.stochastic:
+        return model
+    b = estimate_diffusion(model, windows, substeps=config.objective.substeps)
+    return eqx.tree_at(lambda m: m.scales.diffusion, model, jnp.asarray(b, dtype))

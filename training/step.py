@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt
 
 from ..models.dynamics import Dynamics
 from .config import TrainingConfig
@@ -58,14 +58,22 @@ def partition(model: Dynamics) -> tuple[Any, Any]:
     return eqx.partition(model, eqx.is_inexact_array if trainable is None else trainable())
 
 
+def head_weights(params: Any) -> Any:
+    """A tree with one number a leaf: 1 for weights of networks' output layers, else 0."""
+    paths, treedef = jax.tree_util.tree_flatten_with_path(params)
+    chosen = [float("head" in (n := jax.tree_util.keystr(p)) and "weight" in n) for p, _ in paths]
+    return jax.tree.unflatten(treedef, chosen)
+
+
 class TrainStep:
     """The compiled step of one model structure and one objective.
 
     `traces` counts how often Python was traced: 1 after the first call and ever after.
     """
 
-    def __init__(self, config: TrainingConfig, static: Dynamics):
+    def __init__(self, config: TrainingConfig, params: Any, static: Any):
         self.optimizer = optimizer(config)
+        decay = jax.tree.map(lambda w: config.head_decay * w, head_weights(params))
         self.traces = 0
         transformation = self.optimizer
 
@@ -75,8 +83,8 @@ class TrainStep:
             objective: Objective,
             data: Batch,
             indices: Int[Array, " B"],
-            seed: Int[Array, ""],
-            number: Int[Array, ""],
+            seed: UInt[Array, ""],
+            number: UInt[Array, ""],
             rate: Float[Array, ""],
         ) -> tuple[Any, Any, Report]:
             self.traces += 1
@@ -87,8 +95,11 @@ class TrainStep:
                 return objective.loss(eqx.combine(p, static), batch, key)
 
             (value, parts), gradient = jax.value_and_grad(loss, has_aux=True)(params)
-            direction, new_moments = transformation.update(gradient, moments, params)
-            new = jax.tree.map(lambda p, d: p - rate.astype(p.dtype) * d, params, direction)
+            with jax.numpy_dtype_promotion("standard"):  # optax mixes int32 and float
+                direction, new_moments = transformation.update(gradient, moments, params)
+            new = jax.tree.map(
+                lambda p, d, w: p - rate.astype(p.dtype) * (d + w * p), params, direction, decay
+            )
             ok = jnp.isfinite(value) & all_finite(gradient) & all_finite(new)
 
             def keep(fresh: Array, old: Array) -> Array:
@@ -97,7 +108,7 @@ class TrainStep:
             return (
                 jax.tree.map(keep, new, params),
                 jax.tree.map(keep, new_moments, moments),
-                Report(ok, value, parts, optax.global_norm(gradient)),
+                Report(ok, value, parts, optax.tree.norm(gradient)),
             )
 
         self._step = jax.jit(step, donate_argnums=(0, 1), compiler_options=QUICK_COMPILE)

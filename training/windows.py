@@ -6,7 +6,7 @@ the vehicle move on? Arrays are time-major, component-first, windows last (`mode
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -63,7 +63,7 @@ class Windows:
         name = self.names[int(self.scenario[index])]
         return f"scenario '{name}', run {int(self.run[index])}, from {self.start[index]:.2f} s"
 
-    def take(self, indices: Sequence[int] | np.ndarray) -> Self:
+    def take(self, indices: Sequence[int] | np.ndarray) -> "Windows":
         """Return the windows of these indices, in this order."""
         i = np.asarray(indices, int)
         return replace(
@@ -76,13 +76,13 @@ class Windows:
             start=self.start[i],
         )
 
-    def thin(self, count: int) -> Self:
+    def thin(self, count: int) -> "Windows":
         """Return at most `count` windows, evenly spread over all."""
         if len(self) <= count:
             return self
         return self.take(np.linspace(0, len(self) - 1, count).round().astype(int))
 
-    def subdivide(self, steps: int) -> Self:
+    def subdivide(self, steps: int) -> "Windows":
         """Cut every window into ⌊T / steps⌋ shorter ones, normalised like the long ones."""
         if not 1 <= steps <= self.steps:
             raise ValueError(f"steps: must lie between 1 and {self.steps}, got {steps}")
@@ -107,7 +107,7 @@ class Windows:
             start=np.concatenate([part.start for part in parts]),
         )
 
-    def overlaps(self, other: Self) -> bool:
+    def overlaps(self, other: "Windows") -> bool:
         """Tell whether a window here shares a moment of the same run with one of `other`."""
         mine = [self.names[s] for s in self.scenario]
         theirs = [other.names[s] for s in other.scenario]

@@ -1,6 +1,7 @@
 """Progress on the terminal: a bar with an estimate, silent for work of under two seconds."""
 
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -39,40 +40,77 @@ def progress_bar(what: str, shown: Console | None = None) -> Iterator[Update]:
     Without a terminal, one line is printed each ten per cent instead, so that logs stay short.
     """
     out = console() if shown is None else shown
-    started = time.monotonic()
-    bar = Progress(
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[remark]}"),
-        console=out,
-        transient=False,
-    )
-    task = bar.add_task(what, total=1.0, remark="")
-    state = {"running": False, "tenth": 0}
-
-    def update(fraction: float, remark: str = "", /) -> None:
-        fraction = min(max(fraction, 0.0), 1.0)
-        elapsed = time.monotonic() - started
-        if elapsed < _SHOW_AFTER:
-            return
-        if out.is_terminal:
-            if not state["running"]:
-                bar.start()
-                state["running"] = True
-            bar.update(task, completed=fraction, remark=remark)
-        elif int(10 * fraction) > state["tenth"]:
-            state["tenth"] = int(10 * fraction)
-            left = elapsed * (1 - fraction) / fraction
-            out.print(f"{what}: {fraction:.0%}, about {left:.0f} s left {remark}".rstrip())
-
+    watch = _Terminal(what, out) if out.is_terminal else _Lines(what, out)
+    timer = threading.Timer(_SHOW_AFTER, watch.show)
+    timer.daemon = True
+    timer.start()
     try:
-        yield update
-        if state["running"]:
-            bar.update(task, completed=1.0)
+        yield watch.update
+        watch.update(1.0)
     finally:
-        if state["running"]:
-            bar.stop()
+        timer.cancel()
+        watch.close()
+
+
+class _Terminal:
+    """A bar that redraws itself, so that it lives while nothing is reported (compilation, say)."""
+
+    def __init__(self, what: str, out: Console):
+        self._bar = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[remark]}"),
+            console=out,
+        )
+        self._task = self._bar.add_task(what, total=1.0, remark="")
+        self._lock = threading.Lock()
+        self._open, self._started = True, False
+
+    def show(self) -> None:
+        with self._lock:
+            if self._open:
+                self._bar.start()
+                self._started = True
+
+    def update(self, fraction: float, remark: str = "", /) -> None:
+        self._bar.update(self._task, completed=min(max(fraction, 0.0), 1.0), remark=remark)
+
+    def close(self) -> None:
+        with self._lock:
+            self._open = False
+            if self._started:
+                self._bar.stop()
+
+
+class _Lines:
+    """A line each ten per cent; the estimate counts from the first report, not from the start."""
+
+    def __init__(self, what: str, out: Console):
+        self._what, self._out = what, out
+        self._shown, self._tenth = False, 0
+        self._first: tuple[float, float] | None = None
+
+    def show(self) -> None:
+        self._shown = True
+
+    def update(self, fraction: float, remark: str = "", /) -> None:
+        fraction, now = min(max(fraction, 0.0), 1.0), time.monotonic()
+        if fraction <= 0:
+            return
+        if self._first is None:
+            self._first = (now, fraction)
+        if not self._shown or int(10 * fraction) <= self._tenth:
+            return
+        self._tenth = int(10 * fraction)
+        since, at = self._first
+        if fraction > at and fraction < 1:
+            left = (now - since) * (1 - fraction) / (fraction - at)
+            remark = f"about {left:.0f} s left {remark}"
+        self._out.print(f"{self._what}: {fraction:.0%} {remark}".rstrip())
+
+    def close(self) -> None:
+        self._shown = False

@@ -1,0 +1,52 @@
+"""Progress: silent for short work, lines in a log, a bar on a terminal."""
+
+import io
+import time
+
+import pytest
+from rich.console import Console
+
+from spinndrift.sims import progress
+from spinndrift.sims.progress import progress_bar
+
+
+@pytest.fixture
+def soon(monkeypatch):
+    monkeypatch.setattr(progress, "_SHOW_AFTER", 0.05)
+
+
+def played(terminal, wait):
+    out = io.StringIO()
+    with progress_bar("work", Console(file=out, force_terminal=terminal, width=100)) as update:
+        time.sleep(wait)
+        for k in range(1, 101):
+            update(k / 100, f"step {k}")
+    return out.getvalue()
+
+
+def test_short_work_is_silent():
+    assert played(False, 0.0) == ""
+    assert played(True, 0.0) == ""
+
+
+def test_a_log_gets_one_line_each_ten_per_cent(soon):
+    lines = played(False, 0.2).splitlines()
+    assert len(lines) == 10
+    assert "s left" in lines[4]
+    assert "100%" in lines[-1]
+
+
+def test_a_terminal_gets_a_bar(soon):
+    told = played(True, 0.3)
+    assert "work" in told
+    assert "100%" in told
+
+
+def test_an_error_inside_passes_through(soon):
+    def stopped():
+        with progress_bar("work", Console(file=io.StringIO())):
+            time.sleep(0.1)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stopped()

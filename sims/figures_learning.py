@@ -96,7 +96,7 @@ def error_figure(evaluation: Evaluation) -> Figure:
         ax.set_xlabel("horizon / s")
         ax.set_ylim(bottom=0)
         ax.set_xlim(0, float(d["horizon"][-1]))
-    legend(axes[0, -1])
+    axes[0, 0].legend(loc="upper left")
     return figure
 
 

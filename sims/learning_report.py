@@ -15,16 +15,22 @@ from .figures_learning import (
 from .learning import FINE_SUBSTEPS, Learned
 from .pages import Page
 
+_LEFT_OUT = ("rmse_geodesic", "rmse_velocity", "finite")
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
 
 def add_data(page: Page, recording: Recording) -> Page:
     """What the recording holds, and lacks."""
-    page.section("The data", recording.summary())
-    page.figure(recording_figure(recording), "What was measured, one colour a stretch of the log.")
+    minutes = recording.duration / 60
+    page.section(
+        "The data",
+        f"{minutes:.1f} minutes at {1 / recording.dt:g} Hz in {int((recording.lengths > 0).sum())} "
+        f"stretches; commands as `{recording.commands[0]}`.",
+    )
+    page.figure(recording_figure(recording), "What was measured, one colour a stretch.")
     if recording.notes:
-        page.table([(note,) for note in recording.notes], caption="What the source had and lacked.")
-    return page
+        page.table([(note,) for note in recording.notes], ("what the source had and lacked",))
+    return page.details("Ranges of everything recorded", recording.summary())
 
 
 def add_training(page: Page, learned: Learned) -> Page:
@@ -59,9 +65,10 @@ def add_evaluation(page: Page, learned: Learned, window: int | None = None) -> P
         f"{len(held_out)} windows of {held_out.length:g} s that share no moment with training.",
     )
     page.figure(error_figure(evaluation), "Error of the noise-free prediction against its horizon.")
+    shown = [key for key in next(iter(evaluation.overall().values())) if key not in _LEFT_OUT]
     page.table(
-        [(name, *row.values()) for name, row in evaluation.overall().items()],
-        ("model", *(key.replace("_", " ") for key in next(iter(evaluation.overall().values())))),
+        [(name, *(row[key] for key in shown)) for name, row in evaluation.overall().items()],
+        ("model", *(key.replace("_", " ") for key in shown)),
         "Averages over all horizons; coverage should be 0.5 and 0.9, the energy score is small "
         "for a law that is sharp and right.",
     )

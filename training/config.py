@@ -51,13 +51,13 @@ class PretrainConfig:
 class DriftConfig:
     """Fit of the noise-free motion to short pieces of the windows, before the law is trained.
 
-    A preset may be off by factors, where kernels hardly feel a difference; over a second the
+    A preset may be off by factors, where kernels hardly feel a difference; over a second or two the
     squared error leads there in a few cheap steps.
     """
 
     steps: int = 600
     """0 leaves it out."""
-    length_s: float = 1.0
+    length_s: float = 2.0
     batch: int = 64
     learning_rate: float = 1e-2
 
@@ -89,7 +89,7 @@ class TrainingConfig:
     """Steps of linear rise to the peak rate."""
     clip: float = 1.0
     """Largest norm of a step's gradient; 0 leaves it as it is."""
-    head_decay: float = 10.0
+    head_decay: float = 30.0
     """Decoupled decay (Loshchilov and Hutter 2019) of the networks' output weights: coefficients
     stay as constant in velocity as the data allow."""
     refit_at: tuple[float, ...] = (0.3,)

@@ -10,6 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+_INLINE = {"xla_cpu_enable_concurrency_optimized_scheduler": False}
+"""Kernels of small programs one after the other: handing them to other threads costs more."""
+
 
 class VectorFunction:
     """A pure function of vectors, compiled once for its sizes and called with NumPy arrays.
@@ -53,7 +56,11 @@ class VectorFunction:
     @cached_property
     def _compiled(self) -> Any:
         size = jax.ShapeDtypeStruct((sum(self._inputs),), np.float64)
-        return jax.jit(self._packed).lower(size).compile()
+        lowered = jax.jit(self._packed).lower(size)
+        try:
+            return lowered.compile(_INLINE)
+        except jax.errors.JaxRuntimeError:  # another version's compiler without this option
+            return lowered.compile()
 
     def flat(self, *parts: Float[np.ndarray, "_"]) -> Float[np.ndarray, "m"]:
         """Call with one array for each input and return all results in one (read-only) array."""

@@ -36,6 +36,7 @@ CHEATS = {
 """Output ports that only a simulation has: the truth."""
 
 _NEVER = 1e9  # period (s) of noise that is drawn once
+_WATER = 2  # periods of the plant between steps of the water, whose waves take seconds
 
 
 def station_ports(hardware: bool = False) -> tuple[dict[str, int], dict[str, int]]:
@@ -74,12 +75,13 @@ def _simulated(config: StationConfig) -> Diagram:
     thrusters = config.load_vehicle().thrusters()
     X0, V0 = config.initial_state()
     s = config.sensing
+    water_period = _WATER * config.period
     builder = DiagramBuilder()
     add = builder.AddNamedSystem
     allocation = add("allocation", ThrustAllocation(thrusters, config.voltage))
     bank = add("thrusters", ThrusterBank(thrusters, config.period))
     plant = add("plant", LearnedPlant(config.dynamics(), config.period, config.substeps, X0, V0))
-    water = add("disturbances", DisturbanceSource(config.disturbance(), config.period))
+    water = add("disturbances", DisturbanceSource(config.disturbance(), water_period))
     sensors = add("sensors", SensorSuite(s.imu, s.dvl, s.depth, s.compass))
     ekf = add("ekf", Ekf(s.imu, s.dvl, s.depth, s.compass, s.ekf, X0, V0))
 
@@ -101,7 +103,7 @@ def _simulated(config: StationConfig) -> Diagram:
         builder.Connect(battery.get_output_port(), bank.GetInputPort("voltage"))
 
     add_noise(builder, plant, "noise", config.period)
-    add_noise(builder, water, "noise", config.period)
+    add_noise(builder, water, "noise", water_period)
     add_noise(builder, sensors, "noise", 1 / s.imu.rate)
     for system in (water, sensors, ekf):
         add_noise(builder, system, "initial_noise", _NEVER)

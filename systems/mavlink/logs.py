@@ -113,7 +113,10 @@ def load_data(
             )
     else:
         logged, _ = import_log(
-            path, rate=20.0 if rate is None else rate, vehicle=vehicle or "bluerov2_heavy", progress=progress
+            path,
+            rate=20.0 if rate is None else rate,
+            vehicle=vehicle or "bluerov2_heavy",
+            progress=progress,
         )
         return logged
     progress(1.0)

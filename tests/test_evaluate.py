@@ -12,9 +12,9 @@ import xarray as xr
 from diagonal import Diagonal, simulated
 
 from spinndrift.models import se3
+from spinndrift.sims.figures_learning import coverage_figure, error_figure, learning_figure
 from spinndrift.training.evaluate import evaluate
 from spinndrift.training.metrics import AXES, energy_score, order_statistics
-from spinndrift.training.plots import bands, errors, learning_curve
 
 TRUTH = Diagonal.of()
 WRONG = Diagonal.of(mass=13.0, drag=5.0, diffusion=0.4)
@@ -133,15 +133,16 @@ def test_tables_are_tidy_and_whole(evaluation, tmp_path):
 
 
 def test_figures_show_every_model(evaluation):
-    figure = errors(evaluation)
-    assert [len(ax.lines) for ax in figure.axes] == [2, 2, 2, 2]
-    assert len(bands(evaluation).axes) == 4
+    lines = [len(ax.lines) for ax in error_figure(evaluation).axes]
+    assert lines == [2, 2, 2, 2]
+    assert [len(ax.patches) for ax in coverage_figure(evaluation).axes] == [24, 24]
     metrics = {
         "step": np.arange(40),
         "loss": np.linspace(1, 0, 40),
+        "score": np.linspace(0, 1, 40),
         "validation": np.where(np.arange(40) % 10 == 9, 0.5, np.nan),
     }
-    assert len(learning_curve(metrics).axes[0].lines) == 2
+    assert [len(ax.lines) for ax in learning_figure(metrics).axes] == [2, 1]
 
 
 def test_windows_where_a_model_runs_away_are_counted_and_left_out(windows):

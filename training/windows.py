@@ -8,11 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
-from ..models import se3
 from ..models.errors import UserError
 from ..models.recording import Recording
 
@@ -195,15 +193,20 @@ def _normalised(
     """Poses seen from the frame that `normalise` attaches to each window's start."""
     if normalise == "none":
         return X_WB
-    X = X_WB.copy()
-    X[:, 4:] -= X_WB[:1, 4:]  # first, in double precision: positions may be large
-    start = jnp.asarray(X[0])
+    w, x, y, z = X_WB[0, :4].astype(np.float64)
     if normalise == "heading":
-        zero = jnp.zeros_like(start[0])
-        start = se3.from_position_rpy(start[4:], jnp.stack([zero, zero, se3.yaw(start)]))
-    back = se3.inverse(start)
-    moved: Array = se3.compose(back[:, None], jnp.moveaxis(jnp.asarray(X), 1, 0))
-    return np.moveaxis(np.array(se3.normalize(moved)), 0, 1).astype(X_WB.dtype)
+        half = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) / 2
+        w, x, y, z = np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)
+    # the inverse of the start's rotation, applied to all poses; NumPy, as it keeps double precision
+    u = np.stack([-x, -y, -z])
+    q, p = X_WB[:, :4].astype(np.float64), (X_WB[:, 4:] - X_WB[:1, 4:]).astype(np.float64)
+    scalar = w * q[:, 0] - np.sum(u * q[:, 1:], axis=1)
+    vector = w * q[:, 1:] + q[:, :1] * u + np.cross(u[None], q[:, 1:], axis=1)
+    turned = np.concatenate([scalar[:, None], vector], axis=1)
+    t = 2 * np.cross(u[None], p, axis=1)
+    moved = p + w * t + np.cross(u[None], t, axis=1)
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    return np.concatenate([turned, moved], axis=1).astype(X_WB.dtype)
 
 
 def split_windows(

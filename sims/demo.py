@@ -58,6 +58,8 @@ def demo(
     scenario = replace(scenario, station=station)
     with progress_bar("3/4 flying") as update:
         run = simulate(scenario, update)
+    if run.outcome.reason == "interrupted":
+        raise KeyboardInterrupt
     with progress_bar("4/4 writing the report"):
         shutil.rmtree(out / "dive", ignore_errors=True)
         values = write_run(run, out / "dive")

@@ -23,6 +23,7 @@ from ..training.windows import Windows, make_windows
 FINE_SUBSTEPS = 5
 """Steps a sample for models that were not trained at a step of their own, such as presets."""
 _VALIDATION = 0.15
+_DRIFT = 0.2  # of the time, about, for the start that fits the drift alone
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,12 @@ def learn(
         UserError: the data don't suffice; the sentence says what is missing.
     """
     parts = split_parts(recording, vehicle, config.windows)
-    model = starting_model(config, vehicle, parts.learn)
+    model = starting_model(
+        config,
+        vehicle,
+        parts.learn,
+        lambda step, total, loss: progress(_DRIFT * step / total, "drift first"),
+    )
     dtype = jnp.dtype(parts.learn.X.dtype)
     preset = vehicle.dynamics(estimate_diffusion(vehicle.dynamics(dtype=dtype), parts.learn), dtype)
     substeps = config.objective.substeps
@@ -128,7 +134,9 @@ def learn(
         parts.learn,
         out,
         validation=parts.validation,
-        progress=lambda step, total, loss: progress(step / total, f"loss {loss:.3f}"),
+        progress=lambda step, total, loss: progress(
+            _DRIFT + (1 - _DRIFT) * step / total, f"loss {loss:.3f}"
+        ),
         resume=resume,
         metadata=metadata,
     )

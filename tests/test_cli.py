@@ -13,7 +13,12 @@ from spinndrift.models.recording import Recording
 from spinndrift.models.spinn import Spinn, SpinnConfig
 from spinndrift.sims.cli import main
 from spinndrift.sims.demo import EMBEDDED
-from spinndrift.training.config import PretrainConfig, TrainingConfig, WindowConfig
+from spinndrift.training.config import (
+    DriftConfig,
+    PretrainConfig,
+    TrainingConfig,
+    WindowConfig,
+)
 from spinndrift.training.losses import Mse
 
 TINY = TrainingConfig(
@@ -21,6 +26,7 @@ TINY = TrainingConfig(
     model=SpinnConfig(width=4, depth=1, constant_mass=True),
     windows=WindowConfig(length_s=0.5, stride_s=0.5, gap_s=0.25),
     pretrain=PretrainConfig(steps=2, batch=8),
+    drift=DriftConfig(steps=2, batch=2, length_s=0.25),
     steps=4,
     batch=2,
     validate_every=2,

@@ -98,9 +98,10 @@ def _simulated(config: StationConfig) -> Diagram:
     connect(plant, "A_WB_B", sensors)
     for reading in ("imu", "dvl", "depth", "compass"):
         connect(sensors, reading, ekf)
-    if config.voltage is not None:
-        battery = add("battery", ConstantVectorSource([config.voltage]))
-        builder.Connect(battery.get_output_port(), bank.GetInputPort("voltage"))
+    nominal = float(thrusters.nominal_voltage)
+    volts = nominal if config.voltage is None else config.voltage
+    battery = add("battery", ConstantVectorSource([volts]))
+    builder.Connect(battery.get_output_port(), bank.GetInputPort("voltage"))
 
     add_noise(builder, plant, "noise", config.period)
     add_noise(builder, water, "noise", water_period)

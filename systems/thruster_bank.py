@@ -51,8 +51,9 @@ class ThrustAllocation(LeafSystem):
 
         self._allocate = VectorFunction(allocate, [6], [count, count])
         self._F = self.DeclareVectorInputPort("F_Bo_B", 6)
-        self.DeclareVectorOutputPort("pwm", count, self._put_pwm)
-        self.DeclareVectorOutputPort("thruster_force", count, self._put_forces)
+        once = {self._F.ticket()}  # computed anew for another wrench, not for another time
+        self.DeclareVectorOutputPort("pwm", count, self._put_pwm, once)
+        self.DeclareVectorOutputPort("thruster_force", count, self._put_forces, once)
 
     def _both(self, context: Context) -> list[np.ndarray]:
         F = np.asarray(self._F.Eval(context))

@@ -11,8 +11,9 @@ SEEDS = range(1, 21)
 
 
 @pytest.fixture(autouse=True)
-def _double_precision():
+def _as_the_command_sets_it():
     jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
 @pytest.mark.parametrize("name", ["station_keeping_calm", "station_keeping_harbour"])

@@ -41,7 +41,7 @@ class TrainingResult:
     Attributes:
         model: the best model on the validation windows, or without those the last.
         last: the model after the last step.
-        steps: steps done, also those of earlier sessions of a resumed run.
+        steps: steps done, also those of earlier parts of a resumed run.
         best_step: after how many steps `model` was reached.
         metrics: columns of metrics.csv by name (this process' rows alone without a folder).
         events: recoveries, each with its step and what happened.

@@ -25,7 +25,7 @@ from ...models.checks import Vector3, check_numbers, require
 from ...models.sensors import Compass, DepthSensor, Dvl, Imu
 from ...models.sensors.base import velocity_at
 from . import error_state, measurement
-from .error_state import ERRORS, Navigation
+from .error_state import Navigation
 
 SLOT = 15  # has sample, force 3, rate 3 | has dvl, v 3 | has depth, depth | has compass, yaw
 _DVL, _DEPTH, _COMPASS = 7, 11, 13
@@ -335,8 +335,3 @@ class DelayedFilter(eqx.Module):
         beyond = error_state.sample_increment(mean, rate, ahead * ring[-1, 0])
         now = error_state.apply(now, beyond, self.imu.gravity)
         return now.X_WB, jnp.concatenate([now.v_B, rate]), P
-
-
-def unpack_covariance(flat: Float[Array, "324"]) -> Float[Array, "18 18"]:
-    """The error covariance of a flat output."""
-    return flat.reshape(ERRORS, ERRORS)

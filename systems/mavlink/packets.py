@@ -5,7 +5,6 @@ seeds, message ids and field layouts are those of pymavlink's ArduPilot dialect.
 """
 
 import re
-import struct
 from dataclasses import dataclass
 from functools import cache
 
@@ -15,7 +14,6 @@ from pymavlink.generator.mavcrc import x25crc
 
 from .log_bytes import Progress, no_progress
 
-STAMP = struct.Struct(">Q")
 _V2, _V1 = 0xFD, 0xFE
 _MAGICS = (_V2, _V1)
 _MAGIC = re.compile(rb"[\xfd\xfe]")

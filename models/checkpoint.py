@@ -21,7 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from .dynamics import Dynamics
+from .effects.extended import Extended
+from .effects.library import kind
 from .errors import UserError
+from .euclidean import EuclideanSpinn, create_spinn
 from .files import atomic_path
 from .integrate import cast
 from .rigid_body import FossenDynamics
@@ -197,8 +200,33 @@ def _unit_body() -> FossenDynamics:
 
 def _spinn(config: dict[str, Any]) -> Spinn:
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in config.items()}
-    return Spinn.create(SpinnConfig(**values), _unit_body(), jax.random.key(0), jnp.float32)
+    return create_spinn(SpinnConfig(**values), _unit_body(), jax.random.key(0), jnp.float32)
 
 
 register(FossenDynamics, lambda _: {}, lambda _: cast(_unit_body(), jnp.float32))
-register(Spinn, lambda model: dataclasses.asdict(model.config), _spinn)
+for _kind in (Spinn, EuclideanSpinn):
+    register(_kind, lambda model: dataclasses.asdict(model.config), _spinn)
+
+
+def _describe_extended(model: Extended) -> dict[str, Any]:
+    effects = []
+    for effect in model.effects:
+        options = {
+            field.name: getattr(effect, field.name)
+            for field in dataclasses.fields(effect)
+            if field.metadata.get("static", False)
+        }
+        effects.append({"name": effect.name, "options": options})
+    n = model.positions.shape[1]
+    return {"base": describe(model.base), "effects": effects, "thrusters": n}
+
+
+def _extended(config: dict[str, Any]) -> Extended:
+    effects = tuple(kind(e["name"]).neutral(jnp.float32, **e["options"]) for e in config["effects"])
+    n = int(config["thrusters"])
+    places, inverse = jnp.zeros((3, n), jnp.float32), jnp.zeros((n, 6), jnp.float32)
+    base = template(config["base"])
+    return Extended(base, effects, places, places, inverse)  # pyright: ignore[reportCallIssue]
+
+
+register(Extended, _describe_extended, _extended)

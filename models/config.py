@@ -45,8 +45,8 @@ T = TypeVar("T")
 FieldPath = tuple[str | int, ...]
 
 
-def load(cls: type[T], path: str | PathLike[str]) -> T:
-    """Read a `cls` from a YAML file.
+def load(cls: type[T], path: str | PathLike[str], base: T | None = None) -> T:
+    """Read a `cls` from a YAML file; what it leaves out is as in `base`, or as the class has it.
 
     Raises:
         UserError: the file can't be read, or its text is no `cls` (see `loads`).
@@ -57,18 +57,23 @@ def load(cls: type[T], path: str | PathLike[str]) -> T:
         raise UserError(f"{path}: there is no such file; check the path") from error
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: can't be read as UTF-8 text: {error}") from error
-    return loads(cls, text, str(path))
+    return loads(cls, text, str(path), base)
 
 
-def loads(cls: type[T], text: str, source: str = "text") -> T:
+def loads(cls: type[T], text: str, source: str = "text", base: T | None = None) -> T:
     """Read a `cls` from YAML text; `source` is how messages call the text.
+
+    Mappings are laid over those of `base` key by key, lists and values of another tag replace it.
 
     Raises:
         UserError: one line a fault, each `source:line: field: what was found; what to write`.
     """
     data, node = parse(text, source)
+    data = {} if data is None else data
+    if base is not None:
+        data = _overlaid(parse(dump(base), source)[0], data)
     try:
-        return _CONVERTER.structure({} if data is None else data, cls)
+        return _CONVERTER.structure(data, cls)
     except (BaseValidationError, ValueError, TypeError) as error:
         lines = []
         for path, message in _faults(error, (), cls):
@@ -76,6 +81,14 @@ def loads(cls: type[T], text: str, source: str = "text") -> T:
             where = source if line is None else f"{source}:{line}"
             lines.append(": ".join(part for part in (where, _dotted(path), message) if part))
         raise UserError("\n".join(lines)) from error
+
+
+def _overlaid(base: Any, data: Any) -> Any:
+    if isinstance(base, Tagged) and isinstance(data, Tagged) and base.tag == data.tag:
+        return Tagged(data.tag, _overlaid(base.value, {} if data.value is None else data.value))
+    if isinstance(base, Mapping) and isinstance(data, Mapping):
+        return {**base, **{k: _overlaid(base[k], v) if k in base else v for k, v in data.items()}}
+    return data
 
 
 def dump(obj: Any) -> str:

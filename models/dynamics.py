@@ -70,6 +70,12 @@ class Dynamics(eqx.Module):
     def potential_wrench(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "6 *#batch"]:
         """F_V: minus the derivative of V along g exp(s e_i), a wrench about Bo in B."""
 
+    def displace(
+        self, X_WB: Float[Array, "7 *#batch"], twist_dt: Float[Array, "6 *#batch"]
+    ) -> Float[Array, "7 *#batch"]:
+        """The pose after a step in which ξ dt = `twist_dt`: X exp(ξ dt), the Lie-Euler step."""
+        return se3.retract(X_WB, twist_dt)
+
     def drag_wrench(
         self, V_CB_B: Float[Array, "6 *#batch"], coefficients: Coefficients | None = None
     ) -> Float[Array, "6 *#batch"]:

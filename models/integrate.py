@@ -50,7 +50,7 @@ def step(
         first = dynamics.noise_acceleration(V_WB_B, dW)
         second = dynamics.noise_acceleration(V_WB_B + first, dW)
         dV = h * drift + (first + second) / 2
-    return se3.retract(X_WB, V_WB_B * h), V_WB_B + dV
+    return dynamics.displace(X_WB, V_WB_B * h), V_WB_B + dV
 
 
 def rollout(
@@ -124,6 +124,13 @@ class NoiseTerm(diffrax.AbstractTerm):
         return self.dynamics.noise_acceleration(vf, control)
 
 
+def _unwrapped(term: Any) -> DriftTerm:
+    """The term itself, whatever Diffrax has wrapped around it."""
+    while not isinstance(term, DriftTerm):
+        term = term.term
+    return term
+
+
 class LieEulerHeun(diffrax.AbstractStratonovichSolver):
     """Algorithm 1 as a Diffrax solver; solve `sde_terms(...)` from y0 = (X_WB, V_WB_B)."""
 
@@ -156,7 +163,7 @@ class LieEulerHeun(diffrax.AbstractStratonovichSolver):
         dW = noise.contr(t0, t1)
         first = noise.prod(V, dW)
         second = noise.prod(V + first, dW)
-        y1 = (se3.retract(X, twist), V + dV + (first + second) / 2)
+        y1 = (_unwrapped(drift).dynamics.displace(X, twist), V + dV + (first + second) / 2)
         return y1, None, {"y0": y0, "y1": y1}, None, RESULTS.successful
 
     def func(self, terms: Any, t0: Any, y0: State, args: Any) -> Any:

@@ -48,7 +48,8 @@ def activate(x: Array, kind: Activation) -> Array:
     return jax.nn.silu(x) * (1 / 1.1)
 
 
-def _expand(a: Array, rank: int) -> Array:
+def expand(a: Array, rank: int) -> Array:
+    """Append batch axes of length one up to this rank."""
     return a.reshape(a.shape + (1,) * (rank - a.ndim))
 
 
@@ -83,10 +84,10 @@ class MlpStack(eqx.Module):
     def __call__(self, x: Float[Array, "in *batch"], count: int) -> Float[Array, "n out *batch"]:
         """The features of the first `count` networks, all of which see the same input."""
         h = jnp.tensordot(self.weights[0][:count], x, 1)
-        h = activate(h + _expand(self.biases[0][:count], h.ndim), self.activation)
+        h = activate(h + expand(self.biases[0][:count], h.ndim), self.activation)
         for w, b in zip(self.weights[1:], self.biases[1:], strict=True):
             h = jnp.einsum("noi,ni...->no...", w[:count], h)
-            h = activate(h + _expand(b[:count], h.ndim), self.activation)
+            h = activate(h + expand(b[:count], h.ndim), self.activation)
         return h
 
 
@@ -104,4 +105,4 @@ class Heads(eqx.Module):
     def __call__(self, h: Float[Array, "k in *batch"], count: int) -> Float[Array, "k out *batch"]:
         """The outputs of the first `count` networks."""
         y = jnp.einsum("noi,ni...->no...", self.weight[:count], h)
-        return y + _expand(self.bias[:count], y.ndim)
+        return y + expand(self.bias[:count], y.ndim)

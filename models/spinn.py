@@ -6,7 +6,7 @@ definite, b_θ(ξ) diagonal and positive, and V_θ(g) bounded by a learned λ.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .checks import Vector6, check_numbers, require
+from .distance_aware import DiffusionKind, DistanceAware
 from .dynamics import Coefficients, Dynamics
-from .networks import ACTIVATIONS, Activation, Heads, MlpStack
+from .networks import ACTIVATIONS, Activation, Heads, MlpStack, expand
 from .potential import BoundedScalar, GravityPotential, PosePotential, Potential, PotentialKind
 from .rigid_body import FossenDynamics
 from .spd import PACKED, CholeskySpd, ConstantSpd, EigenSpd, Spd, squareplus
@@ -44,6 +45,11 @@ class SpinnConfig:
     """M does not depend on velocity, as physics has it."""
     stochastic: bool = True
     """Without it b = 0 (a geometric PINN)."""
+    diffusion: DiffusionKind = "network"
+    """b by a network of its own, or one that grows with the distance from the data."""
+    coordinates: Literal["group", "euler"] = "group"
+    """State on SE(3), or position and Euler angles in R¹² as baselines have it (`EuclideanSpinn`).
+    """
     start: Literal["reference", "scale"] = "reference"
     """Networks start at the reference's matrices, or at the diagonal matrices of their scales."""
     velocity_scale: Vector6 = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
@@ -59,6 +65,9 @@ class SpinnConfig:
         require(self.spd in _OPERATORS, self, "spd", f"use one of {tuple(_OPERATORS)}")
         require(self.potential in ("gravity", "pose"), self, "potential", "use gravity or pose")
         require(self.start in ("reference", "scale"), self, "start", "use reference or scale")
+        kinds = get_args(DiffusionKind)
+        require(self.diffusion in kinds, self, "diffusion", f"use one of {kinds}")
+        require(self.coordinates in ("group", "euler"), self, "coordinates", "use group or euler")
         require(min(self.velocity_scale) > 0, self, "velocity_scale", "give positive numbers")
         require(self.length_scale > 0, self, "length_scale", "give a positive length in m")
 
@@ -76,8 +85,9 @@ class Scales(eqx.Module):
 class Spinn(Dynamics):
     """Learned drift and diffusion; make one with `Spinn.create`.
 
-    The networks stand in the order (b, M, D, D^f), less b if not `stochastic` and less M if
-    `constant_mass`: the second stage of a Heun step evaluates a prefix of them.
+    The networks stand in the order (b, M, D, D^f), less b if not `stochastic` or if b is
+    `distance_aware`, and less M if `constant_mass`: the second stage of a Heun step evaluates a
+    prefix of them.
     """
 
     config: SpinnConfig = eqx.field(static=True)
@@ -90,6 +100,7 @@ class Spinn(Dynamics):
     diffusion_head: Heads | None
     constant_mass: Float[Array, "21"] | None
     learned_potential: Potential
+    distance_aware: DistanceAware | None = None
 
     @classmethod
     def create(
@@ -102,7 +113,8 @@ class Spinn(Dynamics):
         """A model that starts at `reference`: its matrices, and V to a few percent.
 
         Diffusion that is zero in the reference starts at 5 % of the drag at `velocity_scale`, and a
-        drag of zero at 1 % of what stops the vehicle in a second.
+        drag of zero at 1 % of what stops the vehicle in a second. A distance-aware diffusion has
+        that as its prior.
         """
         dtype = reference.rigid_inertia.dtype if dtype is None else dtype
         v = np.asarray(config.velocity_scale)
@@ -129,7 +141,9 @@ class Spinn(Dynamics):
         )
         variable = jnp.zeros((2 if config.constant_mass else 3, PACKED), dtype)
         network_key, potential_key = jax.random.split(key)
-        count = variable.shape[0] + config.stochastic
+        network = config.stochastic and config.diffusion == "network"
+        aware = config.stochastic and not network
+        count = variable.shape[0] + network
         return cls(
             config=config,
             rigid_inertia=reference.rigid_inertia.astype(dtype),
@@ -141,11 +155,23 @@ class Spinn(Dynamics):
             ),
             matrix_heads=Heads.constant(variable, config.width),
             diffusion_head=Heads.constant(jnp.zeros((1, 6), dtype), config.width)
-            if config.stochastic
+            if network
             else None,
             constant_mass=jnp.zeros(PACKED, dtype) if config.constant_mass else None,
-            learned_potential=_potential(config, reference, potential_key, dtype),
+            learned_potential=cls.starting_potential(config, reference, potential_key, dtype),
+            distance_aware=DistanceAware.create(
+                config.diffusion, jax.random.fold_in(key, 1), jnp.dtype(dtype)
+            )
+            if aware
+            else None,
         )
+
+    @staticmethod
+    def starting_potential(
+        config: SpinnConfig, reference: FossenDynamics, key: Array, dtype: Any
+    ) -> Potential:
+        """V near the reference's restoring energy."""
+        return _potential(config, reference, key, dtype)
 
     @property
     def stochastic(self) -> bool:
@@ -174,7 +200,7 @@ class Spinn(Dynamics):
         """
         if self.constant_mass is not None:
             return jnp.zeros((), V_WB_B.dtype)
-        count = int(self.config.stochastic) + 1
+        count = int(self.diffusion_head is not None) + 1
 
         def raw(V: Array) -> Array:
             return self.matrix_heads(self._features(V, count)[count - 1 :], 1)[0]
@@ -183,16 +209,22 @@ class Spinn(Dynamics):
         _, change = jax.jvp(raw, (V_WB_B,), (direction * jax.lax.stop_gradient(scale),))
         return jnp.mean(jnp.sum(change**2, axis=0))
 
-    def _features(self, V_WB_B: Array, count: int) -> Array:
-        scale = jax.lax.stop_gradient(self.scales.velocity)
-        return self.hidden(V_WB_B / scale.reshape((6,) + (1,) * (V_WB_B.ndim - 1)), count)
+    def scaled_velocity(self, V_WB_B: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
+        """What the networks see: ξ in units of `velocity_scale`."""
+        return V_WB_B / expand(jax.lax.stop_gradient(self.scales.velocity), V_WB_B.ndim)
 
-    def _diffusion(self, features: Array) -> Array:
-        if self.diffusion_head is None:
-            return jnp.zeros_like(self.scales.diffusion)
-        raw = self.diffusion_head(features[:1], 1)[0]
+    def _features(self, V_WB_B: Array, count: int) -> Array:
+        return self.hidden(self.scaled_velocity(V_WB_B), count)
+
+    def _diffusion(self, V_WB_B: Array, features: Array) -> Array:
         scale = jax.lax.stop_gradient(self.scales.diffusion)
-        return scale.reshape((6,) + (1,) * (raw.ndim - 1)) * squareplus(raw)
+        if self.distance_aware is not None:
+            factor = self.distance_aware(self.scaled_velocity(V_WB_B))
+            return expand(scale, factor.ndim) * factor
+        if self.diffusion_head is None:
+            return jnp.zeros_like(scale)
+        raw = self.diffusion_head(features[:1], 1)[0]
+        return expand(scale, raw.ndim) * squareplus(raw)
 
     def _spd(self, raw: Array, index: int) -> Spd:
         scales = jax.lax.stop_gradient(self.scales)
@@ -201,20 +233,20 @@ class Spinn(Dynamics):
 
     def coefficients(self, V_WB_B: Float[Array, "6 *batch"]) -> Coefficients:
         features = self._features(V_WB_B, self.hidden.weights[0].shape[0])
-        first = int(self.config.stochastic)
+        first = int(self.diffusion_head is not None)
         raw = self.matrix_heads(features[first:], features.shape[0] - first)
         return Coefficients(
             self._mass(raw),
             self._spd(raw[-2], 1),
             self._spd(raw[-1], 2),
-            self._diffusion(features),
+            self._diffusion(V_WB_B, features),
         )
 
     def mass_and_diffusion(self, V_WB_B: Float[Array, "6 *batch"]) -> tuple[Spd, Array]:
-        first, varies = int(self.config.stochastic), self.constant_mass is None
+        first, varies = int(self.diffusion_head is not None), self.constant_mass is None
         features = self._features(V_WB_B, max(first + varies, 1))
         raw = self.matrix_heads(features[first:], 1) if varies else None
-        return self._mass(raw), self._diffusion(features)
+        return self._mass(raw), self._diffusion(V_WB_B, features)
 
     def _mass(self, raw: Array | None) -> Spd:
         if self.constant_mass is None:
@@ -237,7 +269,10 @@ def _floored(a: np.ndarray, floor: np.ndarray) -> np.ndarray:
     return np.outer(s, s) * ((Q * np.maximum(w, 1.0)) @ Q.T)
 
 
-def _potential(config: SpinnConfig, reference: FossenDynamics, key: Array, dtype: Any) -> Potential:
+def restoring(
+    config: SpinnConfig, reference: FossenDynamics
+) -> tuple[Float[np.ndarray, "3"], float, float]:
+    """What a bounded potential starts from: slope on R_WBᵀ e_z, heave energy (J), bound λ (J)."""
     buoyancy, weight = float(reference.buoyancy), float(reference.weight)
     lever = buoyancy * np.asarray(reference.p_BoCb_B) - weight * np.asarray(reference.p_BoBcm_B)
     moment = max(float(np.linalg.norm(lever)), 1e-3 * weight * config.length_scale)
@@ -246,6 +281,11 @@ def _potential(config: SpinnConfig, reference: FossenDynamics, key: Array, dtype
     slope = -1.075 * lever / bound  # 0.2687 (1 - tanh² 0.2687) = 1/4: exact when upright
     if config.start == "scale":
         slope, heave = 0 * slope, 0.0
+    return slope, heave, bound
+
+
+def _potential(config: SpinnConfig, reference: FossenDynamics, key: Array, dtype: Any) -> Potential:
+    slope, heave, bound = restoring(config, reference)
     if config.potential == "gravity":
         skip = slope
     else:
@@ -259,5 +299,6 @@ def _potential(config: SpinnConfig, reference: FossenDynamics, key: Array, dtype
         key,
     )
     if config.potential == "gravity":
-        return GravityPotential(scalar, jnp.asarray(buoyancy - weight, dtype))
+        buoyancy = float(reference.buoyancy) - float(reference.weight)
+        return GravityPotential(scalar, jnp.asarray(buoyancy, dtype))
     return PosePotential(scalar, jnp.asarray(config.length_scale, dtype))

@@ -1,0 +1,58 @@
+"""Inertia of the water: other added masses, coupled ones, another Munk moment."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .. import se3
+from .base import AXES, Effect, Parameter, Plant
+
+ENTRIES = (
+    ("surge_pitch", 0, 4),
+    ("sway_roll", 1, 3),
+    ("sway_yaw", 1, 5),
+    ("heave_pitch", 2, 4),
+)
+
+
+class AddedMass(Effect):
+    """M_ii grows by Δ on one axis (kg, kg·m²)."""
+
+    name: ClassVar[str] = "added_mass"
+    family: ClassVar = "body"
+    parameters: ClassVar = (Parameter("change", "kg or kg·m²", (0.5,), -60.0, 100.0),)
+    places: ClassVar = AXES
+    source: ClassVar[str] = "published sets differ by a factor of 2"
+
+    def inertia(self) -> Float[Array, "6 6 *batch"]:
+        eye = jnp.eye(6, dtype=self.values.dtype)
+        return eye.reshape((6, 6) + (1,) * (self.values.ndim - 1)) * self.values[None]
+
+
+class AddedMassCoupling(Effect):
+    """Off-diagonal added mass M_ij = M_ji (kg·m), or `munk`: (1 + κ) times the Munk moment.
+
+    The Munk moment of a body that moves with v is p × v with p = M v (Fossen 2011, section 6.3.1:
+    the destabilising part of C_A).
+    """
+
+    name: ClassVar[str] = "added_mass_coupling"
+    family: ClassVar = "body"
+    parameters: ClassVar = (Parameter("change", "kg·m or 1", (0.1,), -20.0, 20.0),)
+    places: ClassVar = (*(name for name, _, _ in ENTRIES), "munk")
+    source: ClassVar[str] = "a few cm between Bo and the centre of the water's inertia"
+
+    def inertia(self) -> Float[Array, "6 6 *batch"]:
+        M = jnp.zeros((6, 6, *self.values.shape[1:]), self.values.dtype)
+        for k, (_, i, j) in enumerate(ENTRIES):
+            M = M.at[i, j].add(self.values[k]).at[j, i].add(self.values[k])
+        return M
+
+    def wrench(
+        self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
+    ) -> Float[Array, "6 *#batch"]:
+        v = V_CB_B[:3]
+        moment = se3.cross(jnp.tensordot(plant.mass[:3, :3], v, 1), v)
+        moment = self.part(len(ENTRIES), V_CB_B)[None] * moment
+        return jnp.concatenate([jnp.zeros_like(moment), moment])

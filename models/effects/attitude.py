@@ -1,0 +1,135 @@
+"""Errors of gyro, heading and clock."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .. import se3
+from .base import XYZ, Effect, Parameter
+
+
+class GyroBias(Effect):
+    """ω_recorded = ω + β (rad/s)."""
+
+    name: ClassVar[str] = "gyro_bias"
+    family: ClassVar = "measurement"
+    parameters: ClassVar = (Parameter("bias", "rad/s", (0.002,), -0.2, 0.2),)
+    places: ClassVar = XYZ
+    order: ClassVar[int] = 50
+    source: ClassVar[str] = "mrad/s for MEMS gyros after warm-up"
+
+    def _bias(self, V: Array) -> Array:
+        beta = self.column(V)
+        return jnp.concatenate([jnp.zeros_like(beta), beta])
+
+    def measure(
+        self,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "6 *#batch"],
+    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
+        return X_WB, V_WB_B + self._bias(V_WB_B)
+
+    def unmeasure(
+        self,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "6 *#batch"],
+    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
+        return X_WB, V_WB_B - self._bias(V_WB_B)
+
+
+class HeadingError(Effect):
+    """ψ_recorded = ψ + s sin ψ + c cos ψ + o: a compass in the field of its own vehicle.
+
+    ψ counts from east, counter-clockwise. The semicircular deviation of a compass is s, c (Bowditch
+    2019, ch. 8); o is a constant offset.
+    """
+
+    name: ClassVar[str] = "heading_error"
+    family: ClassVar = "measurement"
+    parameters: ClassVar = (
+        Parameter("sine", "rad", (0.01,), -0.8, 0.8),
+        Parameter("cosine", "rad", (0.01,), -0.8, 0.8),
+        Parameter("offset", "rad", (0.01,), -3.2, 3.2),
+    )
+    order: ClassVar[int] = 60
+    source: ClassVar[str] = "degrees"
+
+    def _error(self, X: Array, sine: Array, cosine: Array) -> Array:
+        s, c, o = (self.part(i, X) for i in range(3))
+        return s * sine + c * cosine + o
+
+    def measure(
+        self,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "6 *#batch"],
+    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
+        return _turned(X_WB, self._error(X_WB, *_heading(X_WB))), V_WB_B
+
+    def unmeasure(
+        self,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "6 *#batch"],
+    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
+        sine, cosine = _heading(X_WB)
+        error = self._error(X_WB, sine, cosine)
+        for _ in range(2):  # contracts by the error's own size each time
+            s, c = jnp.sin(error), jnp.cos(error)
+            error = self._error(X_WB, sine * c - cosine * s, cosine * c + sine * s)
+        return _turned(X_WB, -error), V_WB_B
+
+
+class ClockOffset(Effect):
+    """One channel's stamps are late by δ: what is recorded at t is the value of t - δ.
+
+    `twist`: V(t - δ) ≈ V - δ dV/dt; `pose`: X exp(-δ V). Both against the command's clock.
+    """
+
+    name: ClassVar[str] = "clock_offset"
+    family: ClassVar = "measurement"
+    parameters: ClassVar = (Parameter("delay", "s", (0.005, -0.005), -0.3, 0.3),)
+    places: ClassVar = ("twist", "pose")
+    echoes: ClassVar = ("thruster_lag", "actuation_delay")
+    order: ClassVar[int] = 10
+    source: ClassVar[str] = "5 to 50 ms between computers"
+
+    def _moved(self, X: Array, V: Array, A: Array, sign: float) -> tuple[Array, Array]:
+        late_V, late_X = sign * self.part(0, V)[None], sign * self.part(1, V)[None]
+        return se3.retract(X, V * late_X), V + A * late_V
+
+    def measure(
+        self,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "6 *#batch"],
+    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
+        return self._moved(X_WB, V_WB_B, A_WB_B, -1.0)
+
+    def unmeasure(
+        self,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "6 *#batch"],
+    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
+        return self._moved(X_WB, V_WB_B, A_WB_B, 1.0)
+
+
+def _heading(X: Array) -> tuple[Array, Array]:
+    """Sine and cosine of the heading."""
+    w, x, y, z = jnp.unstack(X[:4])
+    s, c = 2 * (w * z + x * y), 1 - 2 * (y * y + z * z)
+    size = jnp.sqrt(s * s + c * c)
+    return s / size, c / size
+
+
+def _turned(X: Array, angle: Array) -> Array:
+    """The pose with its attitude turned about W's z axis, its position kept."""
+    w, x, y, z = jnp.unstack(X[:4])
+    c, s = jnp.cos(angle / 2), jnp.sin(angle / 2)
+    q = [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w]
+    p = [X[i] + 0 * c for i in (4, 5, 6)]
+    return jnp.stack(jnp.broadcast_arrays(*q, *p))

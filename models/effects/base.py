@@ -1,0 +1,285 @@
+"""What a named physical effect offers: numbers that are zero when it is absent, and its hooks.
+
+An effect is one possible difference between a simulation and the world. The same object serves the
+simulator (`extended.Extended`), the one-step predictor of a diagnosis and the extended model that
+comes out of it, so that a name means one equation everywhere.
+
+To add one, subclass `Effect`, state `name`, `family`, `parameters`, `places`, and override the
+hooks at the places of a simulation where it acts::
+
+    command (n) → `actuate` (memory: lag, delay) → `thrust` (static, by thruster) → allocation
+    → `wrench` + `inertia` + `flow` (body and water) → `diffusion`, `advance` (noise laws)
+    → `measure` (sensors; `unmeasure` is its inverse)
+
+Arrays are component first as in `models.se3`. `values` may carry batch axes of their own that
+broadcast against the state's (one column a hypothesis), so that one compiled program runs every
+hypothesis. All parameters are zero for "not there"; `neutral` values change nothing.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..errors import UserError
+from ..networks import expand
+
+Family = Literal["actuation", "body", "environment", "disturbance", "measurement"]
+AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+XYZ = ("x", "y", "z")
+THRUSTERS = ("1", "2", "3", "4", "5", "6", "7", "8")
+ALL_OR_ONE = ("all", *THRUSTERS)
+"""Places of an effect that may sit in every thruster alike or in a single one."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect: zero means absent.
+
+    Attributes:
+        name: as reports say it.
+        unit: SI unit, "1" for a ratio.
+        probes: sizes at which a diagnosis measures the response; several where it is not linear.
+            For effects with places of unlike units, one tuple of sizes a place.
+        low: least admissible value; an estimate below it vetoes the name.
+        high: largest admissible value.
+    """
+
+    name: str
+    unit: str
+    probes: tuple[float, ...]
+    low: float = -math.inf
+    high: float = math.inf
+
+
+class Plant(NamedTuple):
+    """Constants of the vehicle that effects refer to."""
+
+    positions: Float[Array, "3 n"]
+    directions: Float[Array, "3 n"]
+    mass: Float[Array, "6 6"]
+    weight: Float[Array, ""]
+
+
+class Effect(eqx.Module):
+    """Base of all effects; every hook's default does nothing.
+
+    Attributes:
+        values: parameters by place: index = place × number of parameters + parameter.
+        name: the cause's name in reports.
+        parameters: what one place has.
+        places: where it can act (axis, thruster number, frame).
+        simpler: names that explain the same data with less; they win unless clearly beaten.
+        echoes: names of one family that leave traces of one another.
+        absorber: it soaks up slow structure of any origin, so it is ranked last.
+        order: actuation and measurement effects apply from small to large.
+        source: where the admissible range comes from.
+    """
+
+    values: Float[Array, "p *batch"]
+
+    name: ClassVar[str] = ""
+    family: ClassVar[Family] = "body"
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+    places: ClassVar[tuple[str, ...]] = ("all",)
+    simpler: ClassVar[tuple[str, ...]] = ()
+    echoes: ClassVar[tuple[str, ...]] = ()
+    absorber: ClassVar[bool] = False
+    order: ClassVar[int] = 0
+    source: ClassVar[str] = ""
+
+    # --------------------------------------------------------------------------------- making
+
+    @classmethod
+    def size(cls) -> int:
+        """Number of values."""
+        return len(cls.places) * len(cls.parameters)
+
+    @classmethod
+    def neutral(cls, dtype: Any = float, **options: Any) -> "Effect":
+        """The effect that changes nothing."""
+        return cls(jnp.zeros(cls.size(), dtype), **options)
+
+    @classmethod
+    def index(cls, place: str, parameter: str) -> int:
+        """Where a parameter of a place stands in `values`.
+
+        Raises:
+            UserError: the effect has no such place or parameter.
+        """
+        names = [p.name for p in cls.parameters]
+        if place not in cls.places:
+            raise UserError(f"{cls.name}.where is {place!r}: take one of {', '.join(cls.places)}")
+        if parameter not in names:
+            raise UserError(f"{cls.name} has no {parameter!r}: it has {', '.join(names)}")
+        return cls.places.index(place) * len(names) + names.index(parameter)
+
+    @classmethod
+    def of(
+        cls, where: str | None = None, dtype: Any = float, options: Any = None, **parameters: float
+    ) -> "Effect":
+        """The effect with parameters by name at one place: `ThrusterLag.of(time_constant=0.1)`.
+
+        `where` may be left out for an effect with a single place, or with `all` among them;
+        `options` are its further fields.
+
+        Raises:
+            UserError: a place or parameter is unknown, or a value is not admissible.
+        """
+        places = list(cls.places)
+        if where is None and len(places) > 1 and "all" not in places:
+            raise UserError(f"{cls.name}: say where: one of {', '.join(places)}")
+        values = np.zeros(cls.size())
+        for name, value in parameters.items():
+            i = cls.index(where or places[0], name)
+            p = cls.parameters[i % len(cls.parameters)]
+            if not p.low <= value <= p.high:
+                raise UserError(
+                    f"{cls.name}.{name} is {value:g}: give {p.low:g} to {p.high:g} {p.unit}"
+                )
+            values[i] = value
+        return cls(jnp.asarray(values, dtype), **(options or {}))
+
+    @classmethod
+    def acts(cls, hook: str) -> bool:
+        """Whether this kind overrides a hook."""
+        return getattr(cls, hook) is not getattr(Effect, hook)
+
+    def part(self, i: int, like: Array) -> Array:
+        """Value i, of the rank of one component of `like`."""
+        return expand(self.values[i], like.ndim - 1)
+
+    def each(self, k: int, like: Array) -> Array:
+        """Parameter k of every thruster, for places `ALL_OR_ONE`: the common part and its own."""
+        own = expand(self.values[k :: len(self.parameters)], like.ndim)
+        return own[:1] + own[1:]
+
+    def column(self, like: Array) -> Array:
+        """All values as components, of the rank of `like`."""
+        return expand(self.values, like.ndim)
+
+    # --------------------------------------------------------------------------- actuation
+
+    @property
+    def memory_size(self) -> int:
+        """Numbers that the effect carries from step to step, for each thruster or in all."""
+        return 0
+
+    def initial(self, command: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
+        """The memory of an effect that has seen `command` for ever."""
+        return jnp.zeros((self.memory_size, *command.shape[1:]), command.dtype)
+
+    def actuate(
+        self,
+        memory: Float[Array, "m *#batch"],
+        level: Float[Array, "n *#batch S"],
+        dt: Float[Array, ""],
+    ) -> tuple[Float[Array, "m *#batch"], Float[Array, "n *#batch S"]]:
+        """Memory after a step of `dt` s and thruster forces (N), means over its S substeps."""
+        del dt
+        return memory, level
+
+    def thrust(
+        self,
+        force: Float[Array, "n *#batch"],
+        V_CB_B: Float[Array, "6 *#batch"],
+        voltage: Float[Array, "1 *#batch"],
+        plant: Plant,
+    ) -> Float[Array, "n *#batch"]:
+        """Thruster forces (N) of those wanted; `voltage` relative to the nominal one."""
+        del V_CB_B, voltage, plant
+        return force
+
+    # ---------------------------------------------------------------------- body and water
+
+    def inertia(self) -> Float[Array, "6 6 *batch"]:
+        """What is added to the mass matrix (kg, kg·m, kg·m²)."""
+        return jnp.zeros((6, 6, *self.values.shape[1:]), self.values.dtype)
+
+    def wrench(
+        self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
+    ) -> Float[Array, "6 *#batch"]:
+        """A wrench F_Bo_B (N, N·m) at a pose and a velocity relative to the water."""
+        del X_WB, plant
+        return jnp.zeros_like(V_CB_B)
+
+    def flow(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "3 *#batch"]:
+        """Velocity of the water in W (m/s), steady and uniform around the vehicle."""
+        return jnp.zeros_like(X_WB[4:])
+
+    # ------------------------------------------------------------------------- noise laws
+
+    @property
+    def noise_size(self) -> int:
+        """Unit Gaussians that one step of `advance` takes."""
+        return 0
+
+    @property
+    def pushes(self) -> int:
+        """Length of the random state that `advance` moves and `push` reads."""
+        return 0
+
+    def diffusion(
+        self, V_WB_B: Float[Array, "6 *#batch"], b: Float[Array, "6 *#batch"]
+    ) -> Float[Array, "6 *#batch"]:
+        """The diffusion (N√s, N·m√s) in place of b."""
+        del V_WB_B
+        return b
+
+    def advance(
+        self, state: Float[Array, "s *#batch"], w: Float[Array, "w *#batch"], dt: Float[Array, ""]
+    ) -> Float[Array, "s *#batch"]:
+        """The random state after `dt` s from unit Gaussians w."""
+        del w, dt
+        return state
+
+    def push(
+        self, state: Float[Array, "s *#batch"], X_WB: Float[Array, "7 *#batch"]
+    ) -> Float[Array, "6 *#batch"]:
+        """The wrench F_Bo_B of the random state."""
+        del state
+        return jnp.zeros((6, *X_WB.shape[1:]), X_WB.dtype)
+
+    def drift_of_water(
+        self, state: Float[Array, "s *#batch"], X_WB: Float[Array, "7 *#batch"]
+    ) -> Float[Array, "3 *#batch"]:
+        """The random part of the water's velocity in W (m/s)."""
+        del state
+        return jnp.zeros_like(X_WB[4:])
+
+    # ------------------------------------------------------------------------ measurement
+
+    def measure(
+        self,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "6 *#batch"],
+    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
+        """What is recorded of a pose and twist; A is the rate of the twist's components."""
+        del A_WB_B
+        return X_WB, V_WB_B
+
+    def unmeasure(
+        self,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "6 *#batch"],
+    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
+        """The pose and twist of a record: the inverse of `measure`."""
+        del A_WB_B
+        return X_WB, V_WB_B
+
+
+def force_only(f: Float[Array, "3 *batch"]) -> Float[Array, "6 *batch"]:
+    """A wrench without moment."""
+    return jnp.concatenate([f, jnp.zeros_like(f)])
+
+
+def axes_only(entries: dict[int, Array], like: Array) -> Array:
+    """Six components of which only some are not zero."""
+    zero = jnp.zeros_like(like[0])
+    return jnp.stack(jnp.broadcast_arrays(*(entries.get(i, zero) for i in range(6))))

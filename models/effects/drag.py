@@ -1,0 +1,107 @@
+"""Damping that differs from the model's: by axis, direction, power and coupling."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .base import AXES, Effect, Parameter, Plant, axes_only
+
+COUPLINGS = (
+    ("sway_from_yaw", 1, 5),
+    ("yaw_from_sway", 5, 1),
+    ("surge_from_pitch", 0, 4),
+    ("pitch_from_surge", 4, 0),
+    ("sway_from_roll", 1, 3),
+    ("roll_from_sway", 3, 1),
+    ("heave_from_pitch", 2, 4),
+    ("pitch_from_heave", 4, 2),
+    ("yaw_from_surge", 5, 0),
+    ("surge_from_yaw", 0, 5),
+)
+"""(place, axis that feels it, axis whose velocity makes it): those that symmetry lets exist."""
+
+
+class LinearDrag(Effect):
+    """F_i = -Δd_i ξ_i on one axis (N·s/m, N·m·s)."""
+
+    name: ClassVar[str] = "linear_drag"
+    family: ClassVar = "body"
+    parameters: ClassVar = (Parameter("change", "N·s/m or N·m·s", (0.5,), -200.0, 200.0),)
+    places: ClassVar = AXES
+    source: ClassVar[str] = "published sets differ by factors"
+
+    def wrench(
+        self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
+    ) -> Float[Array, "6 *#batch"]:
+        return -self.column(V_CB_B) * V_CB_B
+
+
+class QuadraticDrag(Effect):
+    """F_i = -Δd_i |ξ_i| ξ_i on one axis (N·s²/m², N·m·s²)."""
+
+    name: ClassVar[str] = "quadratic_drag"
+    family: ClassVar = "body"
+    parameters: ClassVar = (Parameter("change", "N·s²/m² or N·m·s²", (2.0,), -500.0, 500.0),)
+    places: ClassVar = AXES
+    source: ClassVar[str] = "published sets differ by a factor of 8"
+
+    def wrench(
+        self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
+    ) -> Float[Array, "6 *#batch"]:
+        return -self.column(V_CB_B) * jnp.abs(V_CB_B) * V_CB_B
+
+
+class DragAsymmetry(Effect):
+    """F_i = -e_i ξ_i²: quadratic drag larger by e forwards and smaller by e backwards."""
+
+    name: ClassVar[str] = "drag_asymmetry"
+    family: ClassVar = "body"
+    parameters: ClassVar = (Parameter("difference", "N·s²/m² or N·m·s²", (2.0,), -200.0, 200.0),)
+    places: ClassVar = AXES
+    source: ClassVar[str] = "5 to 20 % between bow and stern"
+
+    def wrench(
+        self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
+    ) -> Float[Array, "6 *#batch"]:
+        return -self.column(V_CB_B) * V_CB_B * V_CB_B
+
+
+class CubicDrag(Effect):
+    """F_i = -c_i ξ_i³ on one axis."""
+
+    name: ClassVar[str] = "cubic_drag"
+    family: ClassVar = "body"
+    parameters: ClassVar = (Parameter("coefficient", "N·s³/m³ or N·m·s³", (2.0,), -300.0, 300.0),)
+    places: ClassVar = AXES
+    simpler: ClassVar = ("linear_drag", "quadratic_drag")
+    source: ClassVar[str] = "0 to 10 % of the drag"
+
+    def wrench(
+        self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
+    ) -> Float[Array, "6 *#batch"]:
+        return -self.column(V_CB_B) * V_CB_B * V_CB_B * V_CB_B
+
+
+class DragCoupling(Effect):
+    """F_i = -c |ξ_j| ξ_j - l ξ_j: drag on axis i from motion along axis j."""
+
+    name: ClassVar[str] = "drag_coupling"
+    family: ClassVar = "body"
+    parameters: ClassVar = (
+        Parameter("quadratic", "N·s²/m² and the like", (0.5,), -100.0, 100.0),
+        Parameter("linear", "N·s/m and the like", (0.2,), -100.0, 100.0),
+    )
+    places: ClassVar = tuple(name for name, _, _ in COUPLINGS)
+    source: ClassVar[str] = "centre of pressure a few cm from Bo"
+
+    def wrench(
+        self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
+    ) -> Float[Array, "6 *#batch"]:
+        entries: dict[int, Array] = {}
+        for k, (_, i, j) in enumerate(COUPLINGS):
+            v = V_CB_B[j]
+            c, l = self.part(2 * k, V_CB_B), self.part(2 * k + 1, V_CB_B)
+            term = -(c * jnp.abs(v) + l) * v
+            entries[i] = entries[i] + term if i in entries else term
+        return axes_only(entries, V_CB_B)

@@ -1,0 +1,351 @@
+"""A base model with effects: rolls out, is stored, and stands where any `Dynamics` stands."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .. import se3
+from ..dynamics import Coefficients, Dynamics, Flow
+from ..spd import ConstantSpd, Spd
+from ..thrusters import Thrusters
+from .base import Effect, Plant
+
+Memory = tuple[Array, ...]
+"""One array (m, *batch) for each effect that has a memory, in the model's order."""
+Random = tuple[Array, ...]
+"""One array (s, *batch) for each effect with a random state, in the model's order."""
+
+
+class Inertia(NamedTuple):
+    """The constant mass matrix with its inverse, of the effects' own batch; made once a call."""
+
+    matrix: Float[Array, "6 6 *batch"]
+    inverse: Float[Array, "6 6 *batch"]
+
+
+def times(M: Array, x: Array) -> Array:
+    """M x for matrices with or without batch axes."""
+    if M.ndim == 2:
+        return jnp.tensordot(M, x, 1)
+    M = M.reshape(M.shape + (1,) * (x.ndim + 1 - M.ndim))
+    return jnp.sum(M * x[None], axis=1)
+
+
+class Extended(Dynamics):
+    """`base` with `effects`, at the level of its thrusters.
+
+    As a `Dynamics` it takes a wrench, splits it over the thrusters with the least effort, and has
+    no memory: lag, delay and random states act in `predict.advance` and `rollout` alone, which
+    take thruster commands.
+    """
+
+    base: Dynamics
+    effects: tuple[Effect, ...]
+    positions: Float[Array, "3 n"]
+    directions: Float[Array, "3 n"]
+    inverse: Float[Array, "n 6"]
+
+    @classmethod
+    def create(
+        cls, base: Dynamics, effects: tuple[Effect, ...], thrusters: Thrusters
+    ) -> "Extended":
+        """Effects in any order; they apply in the order of their kinds."""
+        ordered = tuple(sorted(effects, key=lambda effect: effect.order))
+        t = thrusters
+        return cls(base, ordered, t.positions, t.directions, t.inverse)  # pyright: ignore[reportCallIssue]
+
+    def with_effects(self, effects: tuple[Effect, ...]) -> "Extended":
+        """The same base and thrusters with other effects."""
+        ordered = tuple(sorted(effects, key=lambda effect: effect.order))
+        return dataclasses.replace(self, effects=ordered)
+
+    # ------------------------------------------------------------- what every `Dynamics` has
+
+    @property
+    def rigid_inertia(self) -> Float[Array, "6 6"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.base.rigid_inertia
+
+    @property
+    def displaced_mass(self) -> Float[Array, ""]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.base.displaced_mass
+
+    @property
+    def p_BoCb_B(self) -> Float[Array, "3"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.base.p_BoCb_B
+
+    @property
+    def stochastic(self) -> bool:
+        return self.base.stochastic
+
+    def coefficients(self, V_WB_B: Float[Array, "6 *#batch"]) -> Coefficients:
+        c = self.base.coefficients(V_WB_B)
+        return c._replace(mass=self._mass(c.mass), diffusion=self._diffusion(V_WB_B, c.diffusion))
+
+    def mass_and_diffusion(self, V_WB_B: Float[Array, "6 *#batch"]) -> tuple[Spd, Array]:
+        mass, b = self.base.mass_and_diffusion(V_WB_B)
+        return self._mass(mass), self._diffusion(V_WB_B, b)
+
+    def potential(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "*#batch"]:
+        """Of the base: effects need not have a potential."""
+        return self.base.potential(X_WB)
+
+    def potential_wrench(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "6 *#batch"]:
+        """Of the base alone."""
+        return self.base.potential_wrench(X_WB)
+
+    def balance(
+        self,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        F_Bo_B: Float[Array, "6 *#batch"],
+        flow: Flow | None = None,
+        coefficients: Coefficients | None = None,
+    ) -> tuple[Spd, Float[Array, "6 *#batch"]]:
+        level = None
+        if self._any("thrust"):
+            level = self.thrust(jnp.tensordot(self.inverse, F_Bo_B, 1), V_WB_B)
+            F_Bo_B = self.allocate(level)
+        V_own, turning = self._through_water(X_WB, V_WB_B)
+        own = None if coefficients is None else coefficients._replace(mass=self._base_mass(V_own))
+        mass, wrench = self.base.balance(X_WB, V_own, F_Bo_B, flow, own)
+        V_CB = V_own
+        if flow is not None:
+            v_c = se3.rotate_inverse(X_WB, flow.v_WC_W)
+            V_CB = V_own - jnp.concatenate([v_c, jnp.zeros_like(v_c)])
+        extra = self._extra_inertia()
+        wrench = wrench + self.extra_wrench(X_WB, V_CB, extra)
+        mass = self._mass(mass, extra)
+        if turning is not None:
+            wrench = wrench + mass.matvec(turning)
+        return mass, wrench
+
+    # --------------------------------------------------------------------------- the pieces
+
+    @property
+    def plant(self) -> Plant:
+        """What effects may refer to."""
+        zero = jnp.zeros(6, self.positions.dtype)
+        mass = self.base.coefficients(zero).mass.matrix()
+        weight = getattr(self.base, "weight", self.base.displaced_mass * 9.80665)
+        return Plant(self.positions, self.directions, mass, jnp.asarray(weight))
+
+    def _any(self, hook: str) -> bool:
+        return any(effect.acts(hook) for effect in self.effects)
+
+    def _extra_inertia(self) -> Array | None:
+        parts = [effect.inertia() for effect in self.effects if effect.acts("inertia")]
+        return sum(parts[1:], parts[0]) if parts else None
+
+    def _base_mass(self, V: Array) -> Spd:
+        return self.base.mass_and_diffusion(V)[0]
+
+    def _mass(self, mass: Spd, extra: Array | None = None) -> Spd:
+        extra = self._extra_inertia() if extra is None else extra
+        return mass if extra is None else ConstantSpd(mass.matrix() + extra)
+
+    def _diffusion(self, V: Array, b: Array) -> Array:
+        for effect in self.effects:
+            if effect.acts("diffusion"):
+                V, b = se3.align(V, b)
+                b = effect.diffusion(V, b)
+        return b
+
+    def inertia(self) -> Inertia:
+        """The mass matrix of a base whose own is constant, for all columns of the effects' values.
+
+        Raises:
+            ValueError: the base's mass depends on its velocity.
+        """
+        mass = self._base_mass(jnp.zeros(6, self.positions.dtype))
+        if not isinstance(mass, ConstantSpd):
+            raise ValueError("effects with batches of values need a base of constant mass")
+        extra = self._extra_inertia()
+        if extra is None:
+            return Inertia(mass.dense, mass.inverse)
+        M, _ = se3.align(mass.dense, extra)
+        M = M + extra
+        batch = M.shape[2:]
+        flat = jnp.moveaxis(M.reshape(6, 6, -1), -1, 0)
+        inverse = jnp.moveaxis(jnp.linalg.inv(flat), 0, -1).reshape(6, 6, *batch)
+        return Inertia(M, inverse)
+
+    def allocate(self, level: Float[Array, "n *batch"]) -> Float[Array, "6 *batch"]:
+        """The wrench of thruster forces."""
+        lever = jnp.cross(self.positions, self.directions, axis=0)
+        return jnp.tensordot(jnp.concatenate([self.directions, lever]), level, 1)
+
+    def _through_water(self, X: Array, V: Array) -> tuple[Array, Array | None]:
+        """Velocity relative to the effects' steady flow, and how B's turning changes that flow.
+
+        For a uniform steady flow the equations hold unchanged in the relative velocity (Fossen
+        2011, property 8.1: Galilean invariance).
+        """
+        if not self._any("flow"):
+            return V, None
+        flows = [effect.flow(X) for effect in self.effects if effect.acts("flow")]
+        v_c = se3.rotate_inverse(X, sum(flows[1:], flows[0]))
+        zero = jnp.zeros_like(v_c)
+        turning = jnp.concatenate([-se3.cross(jnp.broadcast_to(V[3:], v_c.shape), v_c), zero])
+        return V - jnp.concatenate([v_c, zero]), turning
+
+    def extra_wrench(
+        self,
+        X_WB: Float[Array, "7 *#batch"],
+        V_CB_B: Float[Array, "6 *#batch"],
+        extra: Float[Array, "6 6 *#batch"] | None = None,
+    ) -> Float[Array, "6 *#batch"]:
+        """What the effects add to the wrench balance besides thrust."""
+        total = jnp.zeros_like(V_CB_B)
+        if extra is not None:
+            total = total + se3.coad_apply(V_CB_B, times(extra, V_CB_B))
+        plant = self.plant
+        for effect in self.effects:
+            if effect.acts("wrench"):
+                total = total + effect.wrench(X_WB, V_CB_B, plant)
+        return total
+
+    def thrust(
+        self,
+        level: Float[Array, "n *#batch"],
+        V_CB_B: Float[Array, "6 *#batch"],
+        voltage: Float[Array, "1 *#batch"] | None = None,
+    ) -> Float[Array, "n *#batch"]:
+        """Static actuation effects on thruster forces (N); `voltage` relative to the nominal."""
+        relative = jnp.ones_like(level[:1]) if voltage is None else voltage
+        plant = self.plant
+        for effect in self.effects:
+            if effect.acts("thrust"):
+                level = effect.thrust(level, V_CB_B, relative, plant)
+        return level
+
+    def drift(
+        self,
+        inertia: Inertia,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        level: Float[Array, "n *#batch"],
+        voltage: Float[Array, "1 *#batch"] | None = None,
+        push: Float[Array, "6 *#batch"] | None = None,
+    ) -> Float[Array, "6 *#batch"]:
+        """dV/dt under thruster forces that memory effects have passed, and a random push."""
+        V_r, turning = self._through_water(X_WB, V_WB_B)
+        F = self.allocate(self.thrust(level, V_r, voltage))
+        F = F if push is None else F + push
+        _, wrench = self.base.balance(X_WB, V_r, F)
+        wrench = wrench + self.extra_wrench(X_WB, V_r, self._extra_inertia())
+        acceleration = times(inertia.inverse, wrench)
+        return acceleration if turning is None else acceleration + turning
+
+    # ---------------------------------------------------------------------------- memories
+
+    def remember(self, command: Float[Array, "n *batch"]) -> Memory:
+        """Memories that have seen a command for ever."""
+        return tuple(e.initial(command) for e in self.effects if e.memory_size)
+
+    def actuate(
+        self, memory: Memory, command: Float[Array, "n *#batch"], dt: Any, substeps: int
+    ) -> tuple[Memory, Float[Array, "n *#batch S"]]:
+        """Memories after a held command of `dt` s, and mean forces over its substeps."""
+        h = jnp.asarray(dt, command.dtype)
+        level = jnp.broadcast_to(command[..., None], (*command.shape, substeps))
+        kept, i = [], 0
+        for effect in self.effects:
+            if effect.memory_size:
+                new, level = effect.actuate(memory[i], level, h)
+                kept.append(new)
+                i += 1
+        return tuple(kept), level
+
+    def observe(
+        self,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "6 *#batch"],
+    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
+        """What is recorded of a state, without noise."""
+        for effect in self.effects:
+            if effect.acts("measure"):
+                X_WB, V_WB_B = effect.measure(X_WB, V_WB_B, A_WB_B)
+        return X_WB, V_WB_B
+
+    def infer(
+        self,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "6 *#batch"],
+    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
+        """The state of a record: the inverse of `observe`."""
+        for effect in reversed(self.effects):
+            if effect.acts("measure"):
+                X_WB, V_WB_B = effect.unmeasure(X_WB, V_WB_B, A_WB_B)
+        return X_WB, V_WB_B
+
+    # -------------------------------------------------------------------------- simulation
+
+    @property
+    def noise_size(self) -> int:
+        """Unit Gaussians that a step of `rollout` takes: six for b dW, then the effects'."""
+        return 6 + sum(effect.noise_size for effect in self.effects)
+
+    def rollout(
+        self,
+        X_WB: Float[Array, "7 *batch"],
+        V_WB_B: Float[Array, "6 *batch"],
+        command: Float[Array, "T n *batch"],
+        dt: float,
+        w: Float[Array, "T k *batch"] | None = None,
+        voltage: Float[Array, "T *batch"] | None = None,
+    ) -> tuple[Float[Array, "T 7 *batch"], Float[Array, "T 6 *batch"]]:
+        """States at dt, 2 dt, … under thruster commands (N), each held for a step.
+
+        `w` holds `noise_size` unit Gaussians a step; without it the motion is noise-free. Values of
+        the effects must have no batch axes, or ones that broadcast against the state's.
+        """
+        from .predict import advance
+
+        inertia = self.inertia()
+        state = tuple(
+            jnp.zeros((e.pushes, *V_WB_B.shape[1:]), V_WB_B.dtype) for e in self.effects if e.pushes
+        )
+
+        def body(carry: Any, given: Any) -> Any:
+            memory, state, X, V = carry
+            u, noise, volts = given
+            push = None
+            if noise is not None:
+                state, push = self._stir(state, X, V, noise, dt)
+            memory, X, V, _ = advance(self, inertia, memory, X, V, u, dt, 1, volts, push)
+            if noise is not None:
+                h = jnp.asarray(dt, V.dtype)
+                b = self._diffusion(V, self.base.mass_and_diffusion(V)[1])
+                b, dW = se3.align(b, jnp.sqrt(h) * noise[:6])
+                V = V + times(inertia.inverse, b * dW)
+            return (memory, state, X, V), (X, V)
+
+        volts = None if voltage is None else voltage[:, None]
+        start = (self.remember(command[0]), state, X_WB, V_WB_B)
+        return jax.lax.scan(body, start, (command, w, volts))[1]
+
+    def _stir(self, state: Random, X: Array, V: Array, w: Array, dt: float) -> tuple[Random, Array]:
+        """Random states after a step, and their wrench, drag of moving water included."""
+        h = jnp.asarray(dt, V.dtype)
+        moved, push, at, i = [], jnp.zeros_like(V), 6, 0
+        water = None
+        for effect in self.effects:
+            if not effect.pushes:
+                continue
+            new = effect.advance(state[i], w[at : at + effect.noise_size], h)
+            moved.append(new)
+            at, i = at + effect.noise_size, i + 1
+            push = push + effect.push(new, X)
+            if effect.acts("drift_of_water"):
+                v = effect.drift_of_water(new, X)
+                water = v if water is None else water + v
+        if water is not None:
+            v_c = se3.rotate_inverse(X, water)
+            V_r = V - jnp.concatenate([v_c, jnp.zeros_like(v_c)])
+            push = push + self.base.drag_wrench(V_r) - self.base.drag_wrench(V)
+        return tuple(moved), push

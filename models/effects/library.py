@@ -1,0 +1,151 @@
+"""All named causes, and how their numbers lie in one vector."""
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..errors import UserError
+from .added_mass import AddedMass, AddedMassCoupling
+from .attitude import ClockOffset, GyroBias, HeadingError
+from .base import ALL_OR_ONE, Effect, Parameter
+from .delay import ActuationDelay
+from .drag import CubicDrag, DragAsymmetry, DragCoupling, LinearDrag, QuadraticDrag
+from .dvl import DvlLeverArm, DvlMisalignment, DvlScale
+from .inflow import InflowThrustLoss
+from .lag import ThrusterLag
+from .lift import Lift
+from .load import CentreOfGravity, NetBuoyancy, Payload
+from .noise import (
+    DisturbanceColour,
+    DisturbanceImpacts,
+    DisturbanceLevel,
+    DisturbanceStateDependence,
+)
+from .proximity import Proximity
+from .supply import LoadDroop, VoltageSag
+from .tether import Tether
+from .thrust import ThrustAsymmetry, ThrustCurve, ThrusterDeadZone, ThrusterGain, ThrustScale
+from .water import CurrentSteady, CurrentVarying, Waves
+
+KINDS: dict[str, type[Effect]] = {
+    kind.name: kind
+    for kind in (
+        ThrusterLag,
+        ActuationDelay,
+        ThrusterDeadZone,
+        ThrustAsymmetry,
+        ThrustCurve,
+        ThrusterGain,
+        ThrustScale,
+        VoltageSag,
+        LoadDroop,
+        InflowThrustLoss,
+        NetBuoyancy,
+        CentreOfGravity,
+        Payload,
+        LinearDrag,
+        QuadraticDrag,
+        DragAsymmetry,
+        DragCoupling,
+        CubicDrag,
+        Lift,
+        AddedMass,
+        AddedMassCoupling,
+        Proximity,
+        CurrentSteady,
+        CurrentVarying,
+        Waves,
+        Tether,
+        DisturbanceLevel,
+        DisturbanceColour,
+        DisturbanceImpacts,
+        DisturbanceStateDependence,
+        DvlLeverArm,
+        DvlMisalignment,
+        DvlScale,
+        GyroBias,
+        ClockOffset,
+        HeadingError,
+    )
+}
+"""Every named cause; a new one is added here."""
+
+
+def kind(name: str) -> type[Effect]:
+    """The class of a cause.
+
+    Raises:
+        UserError: there is no such cause.
+    """
+    if name not in KINDS:
+        raise UserError(f"cause {name!r} is unknown: take one of {', '.join(sorted(KINDS))}")
+    return KINDS[name]
+
+
+class Entry(NamedTuple):
+    """One number of the vector of all values."""
+
+    cause: str
+    where: str
+    parameter: Parameter
+
+
+class Library:
+    """Effects side by side, their values one vector θ with zero for absent."""
+
+    def __init__(self, effects: Iterable[Effect]):
+        self.effects = tuple(sorted(effects, key=lambda effect: effect.order))
+        self.entries = tuple(_entries(self.effects))
+        sizes = [effect.size() for effect in self.effects]
+        self._starts = np.concatenate([[0], np.cumsum(sizes)])
+        self._index = {(e.cause, e.where, e.parameter.name): i for i, e in enumerate(self.entries)}
+
+    @property
+    def size(self) -> int:
+        """Length of θ."""
+        return len(self.entries)
+
+    def index(self, cause: str, where: str, parameter: str) -> int:
+        """Where a number stands in θ."""
+        return self._index[cause, where, parameter]
+
+    def at(self, cause: str, where: str) -> list[int]:
+        """Where the numbers of one cause at one place stand in θ."""
+        return [i for i, e in enumerate(self.entries) if e.cause == cause and e.where == where]
+
+    def hypotheses(self, single: bool | None = None) -> list[tuple[str, str]]:
+        """Every (cause, where).
+
+        `single` keeps those in one thruster of causes that may be in all, or leaves them out.
+        """
+        every = list(dict.fromkeys((e.cause, e.where) for e in self.entries))
+        if single is None:
+            return every
+        return [h for h in every if (KINDS[h[0]].places == ALL_OR_ONE and h[1] != "all") == single]
+
+    def filled(self, theta: Float[Array, "p *batch"]) -> tuple[Effect, ...]:
+        """The effects with values from θ, whose batch axes they take."""
+        a = self._starts
+        return tuple(
+            _filled(effect, theta[a[i] : a[i + 1]]) for i, effect in enumerate(self.effects)
+        )
+
+    def used(self, theta: Float[np.ndarray, " p"]) -> tuple[Effect, ...]:
+        """Those effects of one θ that are not absent."""
+        chosen = self.filled(jnp.asarray(theta))
+        return tuple(effect for effect in chosen if bool(np.any(np.asarray(effect.values) != 0)))
+
+
+def _filled(effect: Effect, values: Any) -> Effect:
+    return dataclasses.replace(effect, values=values)
+
+
+def _entries(effects: tuple[Effect, ...]) -> Iterator[Entry]:
+    for effect in effects:
+        for where in effect.places:
+            for parameter in effect.parameters:
+                yield Entry(effect.name, where, parameter)

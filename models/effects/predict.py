@@ -1,0 +1,64 @@
+"""Deterministic motion over a held command, of fourth order on the group."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .. import se3
+from .extended import Extended, Inertia, Memory
+
+_AHEAD = np.array([0.5, 0.5, 1.0, 0.0])
+_WEIGHT = np.array([1.0, 2.0, 2.0, 1.0]) / 6
+
+
+def advance(
+    model: Extended,
+    inertia: Inertia,
+    memory: Memory,
+    X_WB: Float[Array, "7 *#batch"],
+    V_WB_B: Float[Array, "6 *#batch"],
+    command: Float[Array, "n *#batch"],
+    dt: Any,
+    substeps: int = 1,
+    voltage: Float[Array, "1 *#batch"] | None = None,
+    push: Float[Array, "6 *#batch"] | None = None,
+) -> tuple[Memory, Float[Array, "7 *#batch"], Float[Array, "6 *#batch"], Float[Array, "6 *#batch"]]:
+    """Memory, pose and twist after `dt` s, and the twist's rate at the end of the last substep.
+
+    Runge–Kutta–Munthe-Kaas of order 4 for X' = X V (Munthe-Kaas 1999; Owren and Marthinsen 1999),
+    thruster forces constant over a substep at their mean. `inertia` is `model.inertia()`. The four
+    stages are one loop, so that a model of many effects compiles once.
+    """
+    memory, levels = model.actuate(memory, command, dt, substeps)
+    dtype = V_WB_B.dtype
+    h = jnp.asarray(dt / substeps, dtype)
+    batch = jnp.broadcast_shapes(
+        X_WB.shape[1:], V_WB_B.shape[1:], levels.shape[1:-1], inertia.inverse.shape[2:]
+        if inertia.inverse.ndim - 1 == V_WB_B.ndim else ()
+    )  # fmt: skip
+    X = jnp.broadcast_to(X_WB, (7, *batch))
+    V = jnp.broadcast_to(V_WB_B, (6, *batch))
+    table = (jnp.asarray(_AHEAD, dtype), jnp.asarray(_WEIGHT, dtype))
+
+    def substep(carry: Any, level: Array) -> Any:
+        X, V, _ = carry
+
+        def stage(carry: Any, numbers: Any) -> Any:
+            X_s, V_s, twist, gain, _ = carry
+            ahead, weight = numbers
+            a = model.drift(inertia, X_s, V_s, level, voltage, push)
+            twist, gain = twist + weight * V_s, gain + weight * a
+            following = se3.retract(X, ahead * h * V_s), V + ahead * h * a
+            return (*following, twist, gain, a), V_s
+
+        zero = jnp.zeros_like(V)
+        (_, _, twist, gain, a), stages = jax.lax.scan(stage, (X, V, zero, zero, zero), table)
+        twist = twist + h / 12 * se3.ad_apply(stages[0], stages[3])
+        return (se3.retract(X, h * twist), V + h * gain, a), None
+
+    start = (X, V, jnp.zeros_like(V))
+    (X, V, a), _ = jax.lax.scan(substep, start, jnp.moveaxis(levels, -1, 0))
+    return memory, X, V, a

@@ -5,7 +5,8 @@ from typing import Literal
 
 from ..models.checks import check_numbers, require
 from ..models.spinn import SpinnConfig
-from .losses import Fdm, ObjectiveConfig
+from .losses import Fdm
+from .objectives import ObjectiveConfig
 
 
 @dataclass(frozen=True)
@@ -49,24 +50,24 @@ class PretrainConfig:
 
 @dataclass(frozen=True)
 class DriftConfig:
-    """Fit of the noise-free motion to short pieces of the windows, before the law is trained.
+    """Least squares on the output biases before the law is trained (`training.drift`)."""
 
-    A preset may be off by factors, where kernels hardly feel a difference; over a second or two the
-    squared error leads there in a few cheap steps.
-    """
-
-    steps: int = 600
-    """0 leaves it out."""
-    length_s: float = 2.0
-    batch: int = 64
-    learning_rate: float = 1e-2
+    iterations: int = 8
+    """At most so many steps of each of two passes; 0 leaves the fit out."""
+    length_s: float = 1.0
+    """Seconds of the pieces whose noise-free motion is compared."""
+    pieces: int = 256
+    """Pieces used, evenly taken from all."""
+    prior: float = 1e-3
+    """Weight of the squared change of a raw bias (a change of 1 doubles a coefficient, about)
+    against the mean squared error in the units of what the model misses."""
 
     def __post_init__(self) -> None:
         check_numbers(self)
-        require(self.steps >= 0, self, "steps", "give zero or more")
-        require(self.batch >= 1, self, "batch", "give at least 1")
-        for name in ("length_s", "learning_rate"):
-            require(getattr(self, name) > 0, self, name, "give a positive number")
+        require(self.iterations >= 0, self, "iterations", "give zero or more")
+        require(self.length_s > 0, self, "length_s", "give a time above 0 s")
+        require(self.pieces >= 1, self, "pieces", "give at least 1")
+        require(self.prior >= 0, self, "prior", "give zero or more")
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,12 @@ from ..models.checkpoint import save_model
 from ..models.dynamics import Dynamics
 from ..models.errors import UserError
 from .config import TrainingConfig
+from .groups import group_labels, members, step_indices, whole_groups
 from .guard import Diagnosis, TrainingError, diagnose, not_finite
 from .objective import Batch, Objective
 from .provenance import fingerprint, provenance
 from .run_folder import RunFolder, TrainState
-from .step import TrainStep, batch_indices, learning_rate, partition
+from .step import Report, TrainStep, learning_rate, optimizer, partition
 from .windows import Windows
 
 Progress = Callable[[int, int, float], None]
@@ -82,10 +83,12 @@ def fit(
         UserError: the starting model or all windows are not finite, or the checkpoint doesn't fit.
         TrainingError: more bad steps than `max_recoveries`; the last good state is checkpointed.
     """
-    return _Run(config, model, windows, out_dir, validation, metadata).go(progress, resume)
+    return Run(config, model, windows, out_dir, validation, metadata).go(progress, resume)
 
 
-class _Run:
+class Run:
+    """One run's state and what it does between the compiled steps (`fit`, `fit_ensemble`)."""
+
     def __init__(
         self,
         config: TrainingConfig,
@@ -100,81 +103,91 @@ class _Run:
         self.config, self.windows, self.metadata = config, windows, metadata
         self.folder = None if out_dir is None else RunFolder(out_dir)
         params, self.static = partition(model)
-        self.train_step = TrainStep(config, params, self.static)
         # the step donates its inputs: never the caller's own arrays
         self.state = TrainState(
             params=jax.tree.map(jnp.array, params),
-            moments=self.train_step.optimizer.init(params),
+            moments=optimizer(config).init(params),
             objective=config.objective.build(model, windows),
             best=jax.tree.map(jnp.array, params),
         )
         self.snapshot = (self.state.arrays(), self.state.plain())
         self.data = Batch.of(windows)
         self.data_id = fingerprint(windows)
+        self.labels = group_labels(windows)
         self.validation = (
-            None if validation is None else Batch.of(validation.thin(_VALIDATION_WINDOWS))
+            None
+            if validation is None
+            else Batch.of(
+                whole_groups(validation, self.state.objective.group_size(), _VALIDATION_WINDOWS)
+            )
         )
         self.rows: list[dict[str, Any]] = []
         self.unwritten: list[dict[str, Any]] = []
         self.bad_in_a_row = 0
+        self.began = time.monotonic()
+        self.loss = float("nan")
 
     # the loop
 
-    def go(self, progress: Progress | None, resume: bool) -> TrainingResult:
-        state, config = self.state, self.config
+    def begin(self, resume: bool) -> None:
+        """Open the folder, and with `resume` take over its checkpoint."""
+        state = self.state
         if self.folder is not None:
             if resume and self.folder.checkpoint.exists():
-                self.folder.load(state, config, self.data_id)
-            self.folder.begin(config, provenance(self.windows))
+                self.folder.load(state, self.config, self.data_id)
+            self.folder.begin(self.config, provenance(self.windows))
             self.folder.begin_metrics(state.step)
         self.snapshot = (state.arrays(), state.plain())
-        began = time.monotonic() - state.seconds
+        self.began = time.monotonic() - state.seconds
+
+    def go(self, progress: Progress | None, resume: bool) -> TrainingResult:
+        """All steps that are left."""
+        self.begin(resume)
+        step = TrainStep(self.config, self.state.params, self.static)
         stopped = False
-        with _deferred_interrupt() as interrupted:
+        with deferred_interrupt() as interrupted:
             try:
-                while state.step < config.steps and not stopped:
-                    row = self._advance()
-                    stopped = self._validate(row)
-                    state.seconds = time.monotonic() - began
-                    self._note(row)
-                    if state.step % config.checkpoint_every == 0:
-                        self._checkpoint()
+                while self.state.step < self.config.steps and not stopped:
+                    plan = self.plan()
+                    stopped = self.take(plan, *step(*plan))
                     if progress is not None:
-                        progress(state.step, config.steps, row["loss"])
+                        progress(self.state.step, self.config.steps, self.loss)
                     if interrupted():
                         raise KeyboardInterrupt
             except KeyboardInterrupt:
-                self._checkpoint()
+                self.checkpoint()
                 raise
-        self._checkpoint()
+        return self.finish(stopped)
+
+    def finish(self, stopped: bool) -> TrainingResult:
+        """Write what is left to write; the result."""
+        self.checkpoint()
         return self._result(stopped)
 
-    def _advance(self) -> dict[str, Any]:
+    def plan(self) -> tuple[Any, ...]:
+        """What the compiled step takes for the step at hand."""
         state, config = self.state, self.config
         if state.step in {round(f * config.steps) for f in config.refit_at}:
             state.objective = state.objective.refit(self._model(state.params), self._usable())
             state.best_value = float("inf")  # scores before and after can't be compared
-        number = state.step
         usable = np.setdiff1d(np.arange(len(self.windows)), state.excluded)
-        batch = min(config.batch, usable.size)
-        indices = np.resize(batch_indices(config.seed, number, batch, usable), config.batch)
-        rate = learning_rate(config, number) * state.rate_scale
-        state.params, state.moments, report = self.train_step(
-            state.params,
-            state.moments,
-            state.objective,
-            self.data,
-            indices,
-            config.seed,
-            number,
-            rate,
-        )
+        size = state.objective.group_size()
+        indices = step_indices(config.seed, state.step, config.batch, usable, self.labels, size)
+        rate = learning_rate(config, state.step) * state.rate_scale
+        seed, number = config.seed, state.step
+        return state.params, state.moments, state.objective, self.data, indices, seed, number, rate
+
+    def take(self, plan: tuple[Any, ...], params: Any, moments: Any, report: Report) -> bool:
+        """Take over what a step returned; tell whether patience has run out."""
+        state = self.state
+        *_, indices, _, number, rate = plan
+        state.params, state.moments = params, moments
         if bool(report.ok):
             self.bad_in_a_row = 0
         else:
             self._recover(indices, number)
         state.step = number + 1
-        return {
+        row = {
             "step": number,
             "loss": float(report.loss),
             "gradient_norm": float(report.gradient_norm),
@@ -184,6 +197,13 @@ class _Run:
             "seconds": "",
             **{name: float(value) for name, value in report.parts.items()},
         }
+        stopped = self._validate(row)
+        state.seconds = time.monotonic() - self.began
+        self._note(row)
+        if state.step % self.config.checkpoint_every == 0:
+            self.checkpoint()
+        self.loss = row["loss"]
+        return stopped
 
     def _recover(self, indices: np.ndarray, number: int) -> None:
         """Name what happened; then drop the windows at fault, or go back and shrink the rate."""
@@ -212,16 +232,17 @@ class _Run:
 
     def _give_up_if_needed(self, found: Diagnosis, number: int) -> None:
         state = self.state
-        none_left = len(state.excluded) == len(self.windows)
+        usable = np.setdiff1d(np.arange(len(self.windows)), state.excluded)
+        none_left = not members(self.labels, usable, state.objective.group_size())
         if len(state.events) <= self.config.max_recoveries and not none_left:
             return
         state.step = number
-        self._checkpoint()
+        self.checkpoint()
         kept = (
             "" if self.folder is None else f"; the last good state is in {self.folder.checkpoint}"
         )
         why = (
-            "no window has finite data"
+            "no window, or no whole group of them, has finite data"
             if none_left
             else f"more than {self.config.max_recoveries} bad steps, so training stopped"
         )
@@ -266,7 +287,8 @@ class _Run:
             self.folder.append_metrics(self.unwritten)
             self.unwritten = []
 
-    def _checkpoint(self) -> None:
+    def checkpoint(self) -> None:
+        """Write the state as it is between two steps."""
         self._flush()
         self.snapshot = (self.state.arrays(), self.state.plain())
         if self.folder is not None:
@@ -313,7 +335,7 @@ def _validation_loss(model: Dynamics, objective: Objective, batch: Batch, seed: 
 
 
 @contextmanager
-def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
+def deferred_interrupt() -> Iterator[Callable[[], bool]]:
     """Note the first Ctrl-C only, so that it can't split a step; a second one interrupts."""
     noted: list[int] = []
     if threading.current_thread() is not threading.main_thread():

@@ -78,31 +78,36 @@ def diagnose(
             f"{batch.label(int(i))} (after {t:.2f} s)" for i, t in zip(lost, when, strict=True)
         )
         return Diagnosis(tuple(int(ids[i]) for i in lost), (), (), f"motion runs away in {named}")
-    return _one_by_one(model, objective, batch, ids, key)
+    return _one_by_one(model, objective, windows, indices, key)
 
 
 def _one_by_one(
-    model: Dynamics, objective: Objective, batch: Windows, ids: np.ndarray, key: jax.Array
+    model: Dynamics, objective: Objective, windows: Windows, indices: np.ndarray, key: jax.Array
 ) -> Diagnosis:
+    """Look at each window's loss and gradient, or at each group's."""
+
     @eqx.filter_jit
     def value_and_gradient(model: Dynamics, one: Batch) -> Any:
         return eqx.filter_value_and_grad(lambda m: objective.loss(m, one, key)[0])(model)
 
     found, leaves = [], []
-    for i in range(ids.size):
-        value, gradient = value_and_gradient(model, Batch.of(batch.take([i])))
+    size = objective.group_size()
+    alone = np.unique(indices)[:, None] if size == 1 else indices.reshape(-1, size)
+    for group in alone:
+        value, gradient = value_and_gradient(model, Batch.of(windows.take(group)))
         names = not_finite(gradient)
         if not np.isfinite(float(value)) or names:
-            found.append(i)
+            found.extend(int(i) for i in group)
             leaves.extend(names)
     unique = tuple(dict.fromkeys(leaves))
     if not found:
         return Diagnosis(
             (), (), (), "loss or update not finite, though no window alone is at fault"
         )
-    named = "; ".join(batch.label(i) for i in found)
+    found = list(dict.fromkeys(found))
+    named = "; ".join(windows.label(i) for i in found)
     what = f"gradient of {_list(unique)}" if unique else "loss"
-    return Diagnosis(tuple(int(ids[i]) for i in found), (), unique, f"{what} not finite in {named}")
+    return Diagnosis(tuple(found), (), unique, f"{what} not finite in {named}")
 
 
 def _finite(windows: Windows, i: int) -> bool:

@@ -99,10 +99,6 @@ class Mse:
         return MseObjective(self, SquaredError.build(self.unit, self.substeps, model, windows))
 
 
-ObjectiveConfig = Fdm | Mse
-"""Settings of every objective; YAML picks one by its tag."""
-
-
 class SquaredError(eqx.Module):
     """Mean of ‖log(g⁻¹ ĝ)‖² and ‖ξ̂ - ξ‖² over samples and times, each axis in its unit."""
 
@@ -132,12 +128,18 @@ class SquaredError(eqx.Module):
         self, X: Float[Array, "T 7 P W"], V: Float[Array, "T 6 P W"], batch: Batch
     ) -> Float[Array, ""]:
         """The mean for P predicted motions of each window."""
+        e, d = self.by_axis(X, V, batch)
+        return (jnp.mean(e * e) + jnp.mean(d * d)) / 2
+
+    def by_axis(
+        self, X: Float[Array, "T 7 P W"], V: Float[Array, "T 6 P W"], batch: Batch
+    ) -> tuple[Float[Array, "6 T P W"], Float[Array, "6 T P W"]]:
+        """The errors of pose and twist themselves, in their units."""
         X, V, X_hat, V_hat = (
             jnp.moveaxis(a, 1, 0) for a in (X, V, batch.X[1:, :, None], batch.V[1:, :, None])
         )
         e = se3.local(X, X_hat) / self.pose_unit[:, :, None, None]
-        d = (V_hat - V) / self.velocity_unit[:, :, None, None]
-        return (jnp.mean(e * e) + jnp.mean(d * d)) / 2
+        return e, (V_hat - V) / self.velocity_unit[:, :, None, None]
 
 
 class FdmObjective(Objective):

@@ -1,7 +1,7 @@
 """What a training step makes small: the interface that every method of training implements.
 
 A method is a frozen dataclass of settings with `build(model, windows) -> Objective`; the settings'
-class stands in the union `losses.ObjectiveConfig`, so YAML names it by its tag.
+class stands in the union `objectives.ObjectiveConfig`, so YAML names it by its tag.
 """
 
 import abc
@@ -38,6 +38,13 @@ class Objective(eqx.Module):
         self, model: Dynamics, batch: Batch, key: Array
     ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
         """The mean loss over the batch and its parts by name; all randomness comes from `key`."""
+
+    def group_size(self) -> int:
+        """How many windows of equal scenario and start stand side by side in a batch.
+
+        Batches hold whole groups, one after the other (`training.groups`); 1 is any window.
+        """
+        return 1
 
     def refit(self, model: Dynamics, windows: Windows) -> "Objective":
         """The objective with its data-driven constants fitted anew to what `model` now misses."""

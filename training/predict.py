@@ -28,16 +28,25 @@ def predict(
     T, _, W = F.shape
     count = samples + with_path_of_drift
     # substeps as steps of their own: the compiled step is one, however many there are
-    F = jnp.repeat(F[:, :, None], substeps, axis=0)
     dt = dt / substeps
     scale = jnp.asarray(dt**0.5, F.dtype)
-    dW = scale * jax.random.normal(key, (T * substeps, 1, 6, samples, W), F.dtype)
+    dW = scale * jax.random.normal(key, (T * substeps, 1, 6, W, samples), F.dtype)
     if with_path_of_drift:
-        dW = jnp.concatenate([dW, jnp.zeros((T * substeps, 1, 6, 1, W), F.dtype)], axis=3)
-    X = jnp.broadcast_to(X_0[:, None], (7, count, W))
-    V = jnp.broadcast_to(V_0[:, None], (6, count, W))
-    Xs, Vs = rollout(model, X, V, F, dt, dW)
-    return Xs[substeps - 1 :: substeps], Vs[substeps - 1 :: substeps]
+        dW = jnp.concatenate([dW, jnp.zeros((T * substeps, 1, 6, W, 1), F.dtype)], axis=4)
+
+    # one axis of all windows' samples: loops over it are long, whatever W and P are
+    def flat(a: Array) -> Array:
+        a = jnp.broadcast_to(a[..., None], (*a.shape, count))
+        return a.reshape(*a.shape[:-2], W * count)
+
+    F = jnp.repeat(flat(F), substeps, axis=0)
+    dW = dW.reshape(T * substeps, 1, 6, W * count)
+    Xs, Vs = rollout(model, flat(X_0), flat(V_0), F, dt, dW)
+    return _by_sample(Xs[substeps - 1 :: substeps], W), _by_sample(Vs[substeps - 1 :: substeps], W)
+
+
+def _by_sample(a: Float[Array, "T C WP"], windows: int) -> Float[Array, "T C P W"]:
+    return jnp.swapaxes(a.reshape(*a.shape[:2], windows, -1), 2, 3)
 
 
 def predict_drift(

@@ -1,7 +1,5 @@
 """The model that training starts from: a preset, drift and diffusion brought near the data."""
 
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,11 +7,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..models.dynamics import Dynamics
+from ..models.euclidean import create_spinn
 from ..models.spinn import Spinn
 from ..models.vehicle import Vehicle
 from .config import TrainingConfig
-from .fit import Progress, fit
-from .losses import Mse
+from .drift import fit_drift
+from .fit import Progress
 from .objective import Batch
 from .predict import predict_drift
 from .pretrain import pretrain
@@ -49,31 +48,6 @@ def estimate_diffusion(
     )
 
 
-def fit_drift(
-    config: TrainingConfig, model: Spinn, windows: Windows, progress: Progress | None = None
-) -> Spinn:
-    """The model after the squared-error fit that `config.drift` describes."""
-    c = config.drift
-    if c.steps == 0:
-        return model
-    pieces = windows.subdivide(int(np.clip(round(c.length_s / windows.dt), 1, windows.steps)))
-    settings = replace(
-        config,
-        objective=Mse(substeps=config.objective.substeps),
-        steps=c.steps,
-        batch=c.batch,
-        learning_rate=c.learning_rate,
-        warm_up=min(config.warm_up, c.steps // 10),
-        schedule="cosine",
-        refit_at=(),
-        patience=0,
-        checkpoint_every=100,
-    )
-    fitted = fit(settings, model, pieces, progress=progress).model
-    assert isinstance(fitted, Spinn)
-    return fitted
-
-
 def starting_model(
     config: TrainingConfig, vehicle: Vehicle, windows: Windows, progress: Progress | None = None
 ) -> Spinn:
@@ -84,9 +58,9 @@ def starting_model(
     dtype = jnp.dtype(windows.X.dtype)
     reference = vehicle.dynamics(dtype=dtype)
     model_key, pretrain_key = jax.random.split(jax.random.key(config.seed))
-    model = Spinn.create(config.model, reference, model_key, dtype)
+    model = create_spinn(config.model, reference, model_key, dtype)
     model = pretrain(model, reference, config.pretrain, pretrain_key)[0]
-    model = fit_drift(config, model, windows, progress)
+    model = fit_drift(config.drift, model, windows, config.objective.substeps, progress)
     if not config.model.stochastic:
         return model
     b = estimate_diffusion(model, windows, substeps=config.objective.substeps)

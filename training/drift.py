@@ -1,0 +1,174 @@
+"""A first fit of the drift: the networks' output biases by nonlinear least squares.
+
+A preset may be off by factors, where kernels hardly feel a difference, and a gradient step sees
+masses and drags through very unequal slopes. With the networks' weights left alone a SPINN is a
+vehicle with constant M, D and D^f: some 70 numbers, which Powell's dogleg method (Nocedal and
+Wright 2006, chapter 4) finds in a few steps from the noise-free motion over short pieces. What the
+data don't tell (an axis that never moves) stays where the preset has it, held by a weak prior.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from ..models.euclidean import EulerPotential
+from ..models.networks import Heads, MlpStack
+from ..models.potential import BoundedScalar, GravityPotential, PosePotential, Potential
+from ..models.spinn import Spinn
+from .config import DriftConfig
+from .fit import Progress
+from .losses import SquaredError
+from .objective import Batch
+from .predict import predict_drift
+from .windows import Windows
+
+Model = TypeVar("Model", bound=Spinn)
+
+_PASSES = 2
+
+
+def fit_drift(
+    config: DriftConfig,
+    model: Model,
+    windows: Windows,
+    substeps: int,
+    progress: Progress | None = None,
+) -> Model:
+    """The model with the biases that fit the motion of short pieces best.
+
+    Raises:
+        UserError: the model's motion runs away in most of the pieces.
+    """
+    if config.iterations == 0:
+        return model
+    steps = int(np.clip(round(config.length_s / windows.dt), 1, windows.steps))
+    small = _without_networks(model)
+    pieces = _telling(windows.subdivide(steps), small, config.pieces, substeps)
+    start, unravel = ravel_pytree(_constants(model))
+    residuals = _residuals(config, unravel, start, substeps, pieces.dt)
+    solver = optimistix.Dogleg(rtol=1e-3, atol=1e-3)
+
+    @eqx.filter_jit
+    def solve(values: Array, arguments: Any) -> Array:
+        return optimistix.least_squares(
+            residuals,
+            solver,
+            values,
+            args=arguments,
+            options={"jac": "fwd"},
+            max_steps=config.iterations,
+            throw=False,
+        ).value
+
+    # once with the preset's errors as the units, once with the errors that are left
+    values = start.astype(jnp.result_type(float))  # what the solver makes its own numbers of
+    for n in range(_PASSES):
+        if progress is not None:
+            progress(n, _PASSES, float("nan"))
+        current = eqx.tree_at(_constants, small, unravel(values.astype(start.dtype)))
+        unit = SquaredError.build("typical", substeps, current, pieces)
+        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+            found = solve(values, (small, Batch.of(pieces), unit))
+        if not bool(jnp.all(jnp.isfinite(found))):
+            break
+        values = found
+    return eqx.tree_at(_constants, model, unravel(values.astype(start.dtype)))
+
+
+def _telling(pieces: Windows, model: Spinn, count: int, substeps: int) -> Windows:
+    """Half of `count` evenly spread over all, half where the model expects the largest changes.
+
+    A change of velocity tells masses apart from drags, and a recording may hold few of them. Chosen
+    are the largest expected changes on each axis: they follow from states and commands, not from
+    the noise that is to come, so the choice favours no outcome.
+    """
+    if len(pieces) <= count:
+        return pieces
+    start, F = (jnp.asarray(pieces.X[0]), jnp.asarray(pieces.V[0])), jnp.asarray(pieces.F)
+    _, V = eqx.filter_jit(predict_drift)(model, *start, F, pieces.dt, substeps=substeps)
+    change = np.nan_to_num(np.abs(np.asarray(V[-1]) - pieces.V[0]), nan=0.0, posinf=0.0)
+    largest = np.argsort(-change, axis=1, kind="stable")[:, : max(1, count // 12)]
+    even = np.linspace(0, len(pieces) - 1, max(1, count - largest.size)).round().astype(int)
+    return pieces.take(np.unique(np.concatenate([largest.ravel(), even])))
+
+
+def _residuals(
+    config: DriftConfig,
+    unravel: Callable[[Array], Any],
+    start: Float[Array, " p"],
+    substeps: int,
+    dt: float,
+) -> Callable[[Array, Any], Any]:
+    def residuals(values: Array, arguments: Any) -> Any:
+        model, batch, unit = arguments
+        model = eqx.tree_at(_constants, model, unravel(values.astype(start.dtype)))
+        X, V = predict_drift(model, batch.X[0], batch.V[0], batch.F, dt, substeps=substeps)
+        errors = jnp.stack(unit.by_axis(X[:, :, None], V[:, :, None], batch))
+        errors = errors[:, :, 1::4]  # neighbouring times say nearly the same
+        # a far step of the solver may run away: a large finite error tells it to go back
+        errors = jnp.where(jnp.isfinite(errors), jnp.clip(errors, -1e3, 1e3), 1e3)
+        errors = (errors / errors.size**0.5).astype(values.dtype)
+        return errors, config.prior**0.5 * (values - start.astype(values.dtype))
+
+    return residuals
+
+
+def _constants(model: Spinn) -> list[Any]:
+    """The numbers that make M, D, D^f and V where networks give zero."""
+    potential = model.learned_potential
+    found = [model.matrix_heads.bias, _network(potential).skip]
+    if model.constant_mass is not None:
+        found.append(model.constant_mass)
+    if isinstance(potential, (GravityPotential, EulerPotential)):
+        found.append(potential.net_buoyancy)
+    return found
+
+
+def _network(potential: Potential) -> BoundedScalar | EulerPotential:
+    if isinstance(potential, GravityPotential):
+        return potential.restoring
+    if isinstance(potential, PosePotential):
+        return potential.scalar
+    assert isinstance(potential, EulerPotential)
+    return potential
+
+
+def _without_networks(model: Model) -> Model:
+    """The same function by the smallest networks, where the heads' weights are zero."""
+
+    def small(hidden: MlpStack) -> MlpStack:
+        count, _, inputs = hidden.weights[0].shape
+        weight = jnp.zeros((count, 1, inputs), hidden.weights[0].dtype)
+        return MlpStack((weight,), (weight[:, :, 0],), hidden.activation)
+
+    def narrow(heads: Heads | None) -> Heads | None:
+        return None if heads is None else Heads(heads.weight[..., :1], heads.bias)
+
+    network = _network(model.learned_potential)
+    if any(bool(jnp.any(h.weight != 0)) for h in (model.matrix_heads, network.head)):
+        return model
+    return eqx.tree_at(
+        lambda m: (
+            m.hidden,
+            m.matrix_heads,
+            m.diffusion_head,
+            _network(m.learned_potential).hidden,
+            _network(m.learned_potential).head,
+        ),
+        model,
+        (
+            small(model.hidden),
+            narrow(model.matrix_heads),
+            narrow(model.diffusion_head),
+            small(network.hidden),
+            narrow(network.head),
+        ),
+        is_leaf=lambda x: x is None,
+    )

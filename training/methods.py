@@ -1,0 +1,143 @@
+"""Every method of the paper's simulation study by name, each as one typed `TrainingConfig`.
+
+The study's default is the better physics: windows normalised by heading with the gravity
+potential. The paper's own form (windows from the identity, a potential of the whole pose) is
+`windows.normalise: identity` with `model.potential: pose` in a settings file.
+"""
+
+import operator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ..models import config as yaml
+from ..models.distance_aware import DiffusionKind
+from ..models.errors import UserError
+from ..models.spinn import SpinnConfig
+from .config import TrainingConfig
+from .distance_aware import DistanceAware, Unconstrained
+from .euclidean import EuclideanFdm, EuclideanMoments
+from .losses import Fdm, Mse
+from .moments import Moments
+
+
+@dataclass(frozen=True)
+class Method:
+    """A named method: its settings, and those among them that make it this method."""
+
+    summary: str
+    config: TrainingConfig
+    fixed: tuple[str, ...]
+    """Settings (dotted) that a file must not change; the objective's kind is always one."""
+
+    def check(self, name: str, config: TrainingConfig, source: str) -> None:
+        """Refuse settings that are another method's.
+
+        Raises:
+            UserError: a setting that makes the method this one differs.
+        """
+        wanted, found = type(self.config.objective).__name__, type(config.objective).__name__
+        if wanted != found:
+            raise UserError(
+                f"{source}: objective: found !{found}, but method '{name}' is !{wanted}; "
+                "leave out one of the two"
+            )
+        for path in self.fixed:
+            want, have = (operator.attrgetter(path)(c) for c in (self.config, config))
+            same = (want > 0) == (have > 0) if path.endswith("mse_weight") else want == have
+            if not same:
+                raise UserError(
+                    f"{source}: {path}: found {have!r}, but method '{name}' has {want!r}; "
+                    "leave out one of the two"
+                )
+
+
+_MODEL = SpinnConfig(constant_mass=True)
+_KIND = ("model.stochastic", "model.coordinates", "model.diffusion")
+
+
+def _spinn(summary: str, objective: Any, *fixed: str, **settings: Any) -> Method:
+    config = TrainingConfig(objective=objective, model=_MODEL, **settings)
+    return Method(summary, config, (*_KIND, *(f"objective.{f}" for f in fixed)))
+
+
+def _euclidean(
+    summary: str,
+    objective: Any,
+    *fixed: str,
+    diffusion: DiffusionKind = "network",
+    **settings: Any,
+) -> Method:
+    model = replace(_MODEL, coordinates="euler", diffusion=diffusion)
+    config = TrainingConfig(objective=objective, model=model, **settings)
+    return Method(summary, config, (*_KIND, *(f"objective.{f}" for f in fixed)))
+
+
+_PUBLISHED = {"batch": 64, "learning_rate": 1e-2, "clip": 0.0, "refit_at": ()}
+"""Adam from 1e-2 without clipping, as the code of the distance-aware methods has it."""
+
+
+_FDM = ("pose_kernel", "mse_weight")
+
+METHODS: dict[str, Method] = {
+    "fdm-geodesic": _spinn(
+        "finite dimensional matching, geodesic kernel", Fdm("geodesic", mse_weight=0.0), *_FDM
+    ),
+    "fdm-geodesic+mse": _spinn("the same with a squared error", Fdm("geodesic"), *_FDM),
+    "fdm-chordal": _spinn(
+        "finite dimensional matching, chordal kernel", Fdm("chordal", mse_weight=0.0), *_FDM
+    ),
+    "fdm-chordal+mse": _spinn("the same with a squared error", Fdm("chordal"), *_FDM),
+    "moments": _spinn(
+        "moment matching: group mean and covariance, velocity moments",
+        Moments(),
+        "mse_weight",
+        batch=64,
+    ),
+    "moments+mse": _spinn(
+        "the same with a squared error", Moments(mse_weight=0.1), "mse_weight", batch=64
+    ),
+    "pinn": Method(
+        "the geometric network without diffusion, by squared error",
+        TrainingConfig(objective=Mse(), model=replace(_MODEL, stochastic=False)),
+        _KIND,
+    ),
+    "euclidean-fdm": _euclidean(
+        "finite dimensional matching in position and Euler angles", EuclideanFdm(), "mse_weight"
+    ),
+    "euclidean-moments": _euclidean(
+        "moment matching in position and Euler angles", EuclideanMoments(), "mse_weight", batch=64
+    ),
+    "euclidean-distance-aware": _euclidean(
+        "squared error with distance-aware diffusion (Djeumou et al. 2023)",
+        DistanceAware(),
+        diffusion="distance-aware",
+        **_PUBLISHED,
+    ),
+    "euclidean-unconstrained": _euclidean(
+        "likelihood with distance-aware diffusion (Koprulu et al. 2025)",
+        Unconstrained(),
+        diffusion="unconstrained",
+        **_PUBLISHED,
+    ),
+}
+"""All methods; `+mse` is the paper's ocean objective."""
+
+
+def method_config(name: str, settings: str | Path | None = None) -> TrainingConfig:
+    """The settings of a method, with those that a YAML file names in place of its own.
+
+    The file may set anything but what makes the method this one (`Method.fixed`), so neither
+    overrides the other silently.
+
+    Raises:
+        UserError: the name is unknown, or the file is wrong or contradicts the method.
+    """
+    if name not in METHODS:
+        raise UserError(f"method '{name}' is unknown; take one of {', '.join(METHODS)}")
+    method = METHODS[name]
+    if settings is None:
+        return method.config
+    config = yaml.load(TrainingConfig, settings, base=method.config)
+    method.check(name, config, str(settings))
+    return config

@@ -1,0 +1,128 @@
+"""Recordings as the arrays that a diagnosis works on."""
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from ...models.errors import UserError
+from ...models.recording import Recording
+from ...models.vehicle import Vehicle
+
+SEGMENT = 256
+"""Longest piece (samples) that a run is cut into; pieces are filtered side by side."""
+
+
+@dataclass(frozen=True)
+class Data:
+    """R pieces of runs, N steps each, component first and pieces last; short pieces are padded.
+
+    Attributes:
+        X: recorded poses (N + 1, 7, R).
+        V: recorded twists (N + 1, 6, R).
+        u: commanded thruster forces (N), held from n to n + 1 (N, 8, R).
+        voltage: relative to the vehicle's nominal one (N, R).
+        weight: 1 for steps that exist, else 0 (N, R).
+        scenario: index into `names` (R,).
+        run: which run a piece was cut from (R,): the unit of clustering.
+        names: scenarios.
+        dt: step (s).
+        command: what the commands were made of: thruster_force, pwm or F_Bo_B.
+        has_voltage: whether the voltage was recorded.
+    """
+
+    X: Float[np.ndarray, "M 7 R"]
+    V: Float[np.ndarray, "M 6 R"]
+    u: Float[np.ndarray, "N n R"]
+    voltage: Float[np.ndarray, "N R"]
+    weight: Float[np.ndarray, "N R"]
+    scenario: Int[np.ndarray, " R"]
+    run: Int[np.ndarray, " R"]
+    names: tuple[str, ...]
+    dt: float
+    command: str
+    has_voltage: bool
+
+    @property
+    def steps(self) -> int:
+        """Steps that exist."""
+        return int(self.weight.sum())
+
+
+def make_data(recording: Recording, vehicle: Vehicle, segment: int = SEGMENT) -> Data:
+    """Cut a recording into pieces and turn its commands into thruster forces.
+
+    Thruster forces are taken as they are; PWM goes through the vehicle's curve at the recorded
+    voltage; a wrench is split over the thrusters with the least effort.
+
+    Raises:
+        UserError: a channel of pose or twist is missing, or no run has two samples.
+    """
+    if lacking := recording.missing:
+        channels = ", ".join(f"{name} {'/'.join(which)}" for name, which in lacking.items())
+        raise UserError(f"recording: {channels} is missing; a diagnosis needs pose and twist")
+    thrusters = vehicle.thrusters()
+    data = recording.dataset
+    name = next(c for c in ("thruster_force", "pwm", "F_Bo_B") if c in recording.commands)
+    nominal = float(thrusters.nominal_voltage)
+    lengths = recording.lengths
+    pieces: dict[str, list[Any]] = {"X": [], "V": [], "u": [], "voltage": []}
+    scenario, run, sizes = [], [], []
+    has_voltage = "voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any())
+    for number, (j, k) in enumerate(np.argwhere(lengths >= 3)):
+        length = int(lengths[j, k])
+        values = {
+            "X": data["X_WB"].to_numpy()[j, k, :length],
+            "V": data["V_WB_B"].to_numpy()[j, k, :length],
+            "command": data[name].to_numpy()[j, k, :length],
+        }
+        volts = np.full(length, nominal)
+        if has_voltage:
+            measured = data["voltage"].to_numpy()[j, k, :length]
+            volts = np.where(np.isfinite(measured), measured, nominal)
+        u = _forces(values["command"], name, thrusters, volts)
+        count = -(-(length - 1) // segment)
+        edges = np.linspace(0, length - 1, count + 1).round().astype(int)
+        for a, b in itertools.pairwise(edges):
+            pieces["X"].append(values["X"][a : b + 1])
+            pieces["V"].append(values["V"][a : b + 1])
+            pieces["u"].append(u[a:b])
+            pieces["voltage"].append(volts[a:b] / nominal)
+            sizes.append(b - a)
+            scenario.append(j)
+            run.append(number)
+    if not sizes:
+        raise UserError("recording: no run is long enough for a diagnosis")
+    N = int(max(sizes))
+    weight = (np.arange(N)[:, None] < np.array(sizes)).astype(float)
+    return Data(
+        X=_stack(pieces["X"], N + 1),
+        V=_stack(pieces["V"], N + 1),
+        u=_stack(pieces["u"], N),
+        voltage=_stack(pieces["voltage"], N),
+        weight=weight,
+        scenario=np.array(scenario, int),
+        run=np.array(run, int),
+        names=recording.scenarios,
+        dt=recording.dt,
+        command=name,
+        has_voltage=has_voltage,
+    )
+
+
+def _forces(command: np.ndarray, name: str, thrusters: Any, volts: np.ndarray) -> np.ndarray:
+    values = jnp.asarray(np.nan_to_num(command.T))
+    if name == "pwm":
+        return np.asarray(thrusters.force(values, jnp.asarray(volts))).T
+    if name == "F_Bo_B":
+        return np.asarray(jnp.tensordot(thrusters.inverse, values, 1)).T
+    return np.nan_to_num(command)
+
+
+def _stack(parts: list[np.ndarray], length: int) -> np.ndarray:
+    """Parts side by side, the last value held to the common length."""
+    padded = [np.concatenate([p, np.repeat(p[-1:], length - len(p), axis=0)]) for p in parts]
+    return np.stack(padded, axis=-1)

@@ -1,0 +1,114 @@
+"""Errors of one-step predictions from every sample, and how they propagate."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...models import se3
+from ...models.effects.extended import Extended, Memory
+from ...models.effects.library import Library
+from ...models.effects.predict import advance
+from .data import Data
+
+SUBSTEPS = 2
+
+
+Arrays = tuple[Array, Array, Array, Array]
+"""Poses, twists, commands and voltages of `Data`."""
+
+
+def as_arrays(data: Data) -> Arrays:
+    """The arrays that compiled programs take."""
+    return jnp.asarray(data.X), jnp.asarray(data.V), jnp.asarray(data.u), jnp.asarray(data.voltage)
+
+
+class Predictions(NamedTuple):
+    """One step from every sample, under one set of effects.
+
+    Attributes:
+        error: r_n: pose error seen from the predicted body, then twist (N, 12, R).
+        X: predicted pose itself, before it is observed (N, 7, R).
+        V: predicted twist (N, 6, R).
+        jacobian: A_n, of errors (pose in B, twist) over a step (N, 12, 12, R).
+    """
+
+    error: Float[Array, "N 12 R"]
+    X: Float[Array, "N 7 R"]
+    V: Float[Array, "N 6 R"]
+    jacobian: Float[Array, "N 12 12 R"]
+
+
+def difference(
+    X: Float[Array, "7 *#b"], V: Float[Array, "6 *#b"], X2: Array, V2: Array
+) -> Float[Array, "12 *#b"]:
+    """(X2, V2) ⊖ (X, V)."""
+    return jnp.concatenate(jnp.broadcast_arrays(se3.local(X, X2), V2 - V))
+
+
+def settle(model: Extended, command: Array, dt: float, substeps: int) -> Memory:
+    """Initial memories broadcast to what a step makes of them."""
+    memory = model.remember(command)
+    after = jax.eval_shape(lambda m: model.actuate(m, command, dt, substeps)[0], memory)
+    return tuple(jnp.broadcast_to(m, s.shape) for m, s in zip(memory, after, strict=True))
+
+
+@eqx.filter_jit
+def _predict(model: Extended, effects: Any, arrays: Arrays, dt: float) -> Predictions:
+    X, V, u, voltage = arrays
+    model = model.with_effects(effects)
+    inertia = model.inertia()
+    plain = model.with_effects(())
+    rest = plain.inertia()
+
+    def body(memory: Memory, given: Any) -> Any:
+        X0, V0, X1, V1, command, volts = given
+        rate = (V1 - V0) / dt
+        x, v = model.infer(X0, V0, rate)
+        memory, Xp, Vp, a = advance(
+            model, inertia, memory, x, v, command, dt, SUBSTEPS, volts[None]
+        )
+        error = difference(*model.observe(Xp, Vp, a), X1, V1)
+        return memory, Predictions(
+            error, Xp, Vp, _jacobian(plain, rest, x, (v + Vp) / 2, command, dt)
+        )
+
+    start = settle(model, u[0], dt, SUBSTEPS)
+    return jax.lax.scan(body, start, (X[:-1], V[:-1], X[1:], V[1:], u, voltage))[1]
+
+
+def _jacobian(model: Extended, inertia: Any, X: Array, V: Array, u: Array, dt: float) -> Array:
+    """exp(J dt) of δ' = δV - ad_V δ, δV' = ∂a/∂x δ, to third order."""
+    F = model.allocate(u)
+    eye = jnp.eye(12, dtype=V.dtype)[3:]
+
+    def drift(d: Array) -> Array:
+        turned = se3.retract(X, jnp.concatenate([jnp.zeros_like(d[:3]), d[:3]]))
+        _, wrench = model.base.balance(turned, V + d[3:], F)
+        return jnp.tensordot(inertia.inverse, wrench, 1)
+
+    zero = jnp.zeros((9, *V.shape[1:]), V.dtype)
+    tangents = jnp.broadcast_to(
+        eye[:, 3:].reshape((9, 9) + (1,) * (V.ndim - 1)), (9, 9, *V.shape[1:])
+    )
+    columns = jax.vmap(lambda t: jax.jvp(drift, (zero,), (t,))[1])(tangents)  # (9, 6, R)
+    lower = jnp.moveaxis(columns, 0, 1)  # (6, 9, R)
+    ad = se3.ad(V)
+    unit = jnp.broadcast_to(
+        jnp.eye(6, dtype=V.dtype).reshape((6, 6) + (1,) * (V.ndim - 1)), ad.shape
+    )
+    top = jnp.concatenate([-ad, unit], axis=1)
+    bottom = jnp.concatenate([jnp.zeros_like(lower[:, :3]), lower], axis=1)
+    J = dt * jnp.concatenate([top, bottom])
+    JJ = jnp.einsum("ijr,jkr->ikr", J, J)
+    whole = jnp.eye(12, dtype=V.dtype)[:, :, None] + J + JJ / 2
+    return whole + jnp.einsum("ijr,jkr->ikr", JJ, J) / 6
+
+
+def predict(model: Extended, library: Library, theta: np.ndarray, data: Data) -> Predictions:
+    """Predictions of all samples with the effects' values `theta` (p,)."""
+    effects = library.filled(jnp.asarray(theta)[:, None])
+    return _predict(model, effects, as_arrays(data), data.dt)

@@ -1,0 +1,107 @@
+"""Which name to give: vetoes, nesting, echoes, ties."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ...models.effects.library import Library, kind
+from .hypotheses import Fit
+
+Hypothesis = tuple[str, str]
+"""(cause, where)"""
+
+MARGIN_NATS, MARGIN_SHARE = 10.0, 0.02
+ECHO_SHARE = 0.01
+CLEAR = 5.0
+"""Multiple of the threshold from which the robust p value is not asked: few runs bound it."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The name given, what it could as well be, and who came next."""
+
+    hypothesis: Hypothesis
+    fit: Fit
+    ties: tuple[Hypothesis, ...]
+    rivals: tuple[tuple[Hypothesis, float], ...]
+
+
+def admissible(library: Library, theta: Float[np.ndarray, " p"], fit: Fit) -> bool:
+    """Whether every estimate lies in its range; a sign that physics forbids vetoes a name."""
+    for i, change, error in zip(fit.parameters, fit.values, fit.errors, strict=True):
+        p = library.entries[i].parameter
+        value = theta[i] + change
+        one = len(fit.parameters) == 1
+        slack = 0.0 if one else 2 * float(error)
+        if not p.low - slack <= value <= p.high + slack or (one and value == 0):
+            return False
+    return True
+
+
+def margin(gain: float) -> float:
+    """How much a name with more freedom must win by."""
+    return max(MARGIN_NATS, MARGIN_SHARE * gain)
+
+
+def choose(
+    library: Library,
+    theta: Float[np.ndarray, " p"],
+    fits: Mapping[Hypothesis, Fit],
+    threshold: float,
+    alpha: float,
+    accepted: Mapping[str, float] | None = None,
+) -> Choice | None:
+    """The name that explains most, or None where nothing passes.
+
+    To pass, a name needs a held-out gain above `threshold` (calibrated for the number of names), a
+    robust p value that survives Bonferroni unless the gain is clear, and admissible estimates.
+    Echoes of names accepted before (with their gains) must win one per cent of those. Among the
+    rest the largest held-out gain leads; a simpler name replaces it unless clearly beaten. Ties are
+    names within two standard errors of the difference, clustered by run.
+    """
+    accepted = accepted or {}
+    passing: dict[Hypothesis, Fit] = {}
+    for hypothesis, fit in fits.items():
+        name = hypothesis[0]
+        needed = threshold
+        for other, gain in accepted.items():
+            if name in kind(other).echoes:
+                needed = max(needed, ECHO_SHARE * gain)
+        if (
+            fit.heldout_gain > needed
+            and (fit.p_value * len(fits) < alpha or fit.heldout_gain > CLEAR * threshold)
+            and admissible(library, theta, fit)
+        ):
+            passing[hypothesis] = fit
+    if not passing:
+        return None
+    order = sorted(passing, key=lambda h: (kind(h[0]).absorber, -passing[h].heldout_gain))
+    top = order[0]
+    best = passing[top].heldout_gain
+    simpler = [
+        h
+        for h in order
+        if h != top and _is_simpler(h, top) and passing[h].heldout_gain > best - margin(best)
+    ]
+    if simpler:
+        top = simpler[0]
+    ties = [h for h in order if h != top and _tied(passing[top], passing[h])]
+    rivals = [(h, passing[h].heldout_gain) for h in order if h != top][:5]
+    return Choice(top, passing[top], tuple(ties), tuple(rivals))
+
+
+def _is_simpler(a: Hypothesis, b: Hypothesis) -> bool:
+    return a[0] in kind(b[0]).simpler
+
+
+def _tied(a: Fit, b: Fit) -> bool:
+    difference = a.heldout - b.heldout
+    error = np.sqrt(len(difference)) * difference.std()
+    return bool(difference.sum() < 2 * error)
+
+
+def parameters_of(library: Library, hypotheses: Sequence[Hypothesis]) -> list[int]:
+    """Indices of all parameters of these causes."""
+    return [i for h in hypotheses for i in library.at(*h)]

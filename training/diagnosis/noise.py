@@ -1,0 +1,109 @@
+"""Diffusion and measurement noise, from what the errors of prediction have in common.
+
+With y = x + e, r_n = e_(n+1) - A e_n + w_n has the covariances C_0 = Q + R + A R Aᵀ, C_1 = -A R and
+none further on. A slow model error adds about the same to C_1 and C_2, so C_1 - C_2 is used.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+
+FLOOR = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4] * 3 + [1e-5] * 3)
+"""Least standard deviation of a record: m, rad, m/s, rad/s."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of the records (12,) and diffusion b (6,) in N√s, N·m√s."""
+
+    record: Float[np.ndarray, "12"]
+    diffusion: Float[np.ndarray, "6"]
+
+
+@dataclass(frozen=True)
+class Filter:
+    """Gains and whitening of the first N innovations, the same for all pieces.
+
+    Attributes:
+        keep: I - K_n before step n (N, 12, 12).
+        whiten: L_n⁻¹ with L Lᵀ the innovations' covariance after step n (N, 12, 12).
+        log_det: ½ log det of that covariance (N,).
+    """
+
+    keep: Float[np.ndarray, "N 12 12"]
+    whiten: Float[np.ndarray, "N 12 12"]
+    log_det: Float[np.ndarray, " N"]
+
+
+def mean_jacobian(jacobian: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, "12 12"]:
+    """A averaged over all steps that exist."""
+    return np.einsum("nijr,nr->ij", jacobian, weight) / weight.sum()
+
+
+def process_covariance(
+    A: Float[np.ndarray, "12 12"],
+    mass_inverse: Float[np.ndarray, "6 6"],
+    diffusion: Float[np.ndarray, "6"],
+    dt: float,
+) -> Float[np.ndarray, "12 12"]:
+    """Q = ∫ exp(J s) B Bᵀ exp(J s)ᵀ ds over a step, by three Gauss points."""
+    J = np.real(scipy.linalg.logm(A)) / dt
+    B = np.concatenate([np.zeros((6, 6)), mass_inverse * diffusion])
+    Q = np.zeros((12, 12))
+    for x, w in zip(*np.polynomial.legendre.leggauss(3), strict=True):
+        E = scipy.linalg.expm(J * dt * (1 + x) / 2) @ B
+        Q += w * dt / 2 * E @ E.T
+    return Q
+
+
+def estimate(
+    error: Float[np.ndarray, "N 12 R"],
+    weight: Float[np.ndarray, "N R"],
+    A: Float[np.ndarray, "12 12"],
+    mass: Float[np.ndarray, "6 6"],
+    dt: float,
+) -> Noise:
+    """Noise of records and process by moments."""
+    C = []
+    for lag in range(3):
+        w = weight[lag:] * weight[: len(weight) - lag]
+        a, b = error[lag:] * w[:, None], error[: len(error) - lag]
+        C.append(np.einsum("nir,njr->ij", a, b) / max(w.sum(), 1.0))
+    R = np.diag(-np.linalg.solve(A, C[1] - C[2]))
+    variance = np.maximum(R, FLOOR**2)
+    C0 = C[0] - (C[2] + C[2].T) / 2
+    Q = C0 - np.diag(variance) - A * variance @ A.T
+    unit = process_covariance(A, np.linalg.inv(mass), np.ones(6), dt)
+    wrench = np.diag(Q)[6:] / np.diag(unit)[6:]
+    least = 1e-4 * np.diag(C[0])[6:] / np.diag(unit)[6:]
+    return Noise(np.sqrt(variance), np.sqrt(np.maximum(wrench, least)))
+
+
+def make_filter(
+    noise: Noise,
+    A: Float[np.ndarray, "12 12"],
+    mass_inverse: Float[np.ndarray, "6 6"],
+    dt: float,
+    steps: int,
+) -> Filter:
+    """The Kalman filter that starts from the first record: gains of every step."""
+    Q = process_covariance(A, mass_inverse, noise.diffusion, dt)
+    R = np.diag(noise.record**2)
+    keep = np.zeros((steps, 12, 12))
+    whiten, log_det = np.zeros((steps, 12, 12)), np.zeros(steps)
+    P = R
+    gap = np.zeros((12, 12))  # I - K: the first record is believed as it is
+    for n in range(steps):
+        keep[n] = gap
+        prior = A @ P @ A.T + Q
+        S = prior + R
+        L = np.linalg.cholesky(S)
+        whiten[n] = np.linalg.inv(L)
+        log_det[n] = np.log(np.diag(L)).sum()
+        K = np.linalg.solve(S, prior).T
+        gap = np.eye(12) - K
+        P = gap @ prior
+        P = (P + P.T) / 2
+    return Filter(keep, whiten, log_det)

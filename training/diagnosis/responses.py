@@ -1,0 +1,137 @@
+"""How the innovations would change if an effect were there: probes through the same filter."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...models import se3
+from ...models.effects.base import Effect
+from ...models.effects.extended import Extended
+from ...models.effects.library import Library, kind
+from .data import Data
+from .innovations import Arrays, Predictions, as_arrays, settle
+from .noise import Filter
+
+LANES = 28
+"""Probes that one call of the compiled program runs side by side, besides the base."""
+
+
+@eqx.filter_jit
+def _respond(
+    model: Extended,
+    effects: Any,
+    predictions: Predictions,
+    arrays: Arrays,
+    filters: tuple[Array, Array, Array],
+    dt: float,
+    lanes: int,
+    instruments: bool,
+) -> Float[Array, "N 12 L R"]:
+    """Whitened innovations of lane 0 (the base) and changes of them in the other lanes."""
+    (X, V, u, voltage), (keep, whiten, weight) = arrays, filters
+    model = model.with_effects(effects)
+    inertia = model.inertia()
+
+    def body(carry: Any, given: Any) -> Any:
+        memory, nu = carry
+        p, X0, V0, command, volts, gap, white, exists = given
+        rate = ((p.V - V0) / dt)[:, None]
+        x, v = model.infer(X0[:, None], V0[:, None], rate)
+        kept = jnp.tensordot(gap, nu, 1)
+        if instruments:
+            seen = model.observe(p.X[:, None], p.V[:, None], rate)
+            direct = _apart(seen)
+            moved = kept - _apart((x, v))
+        else:
+            middle_V = (v + p.V[:, None]) / 2
+            middle_X = se3.retract(x, dt / 4 * (v + middle_V))
+            memory, level = model.actuate(memory, command[:, None], dt, 1)
+            a = model.drift(inertia, middle_X, middle_V, level[..., 0], volts[None, None])
+            direct = dt / 2 * jnp.concatenate([jnp.zeros_like(a), a - a[:, :1]])
+            moved = kept - direct
+        nu = jnp.sum(p.jacobian[:, :, None] * moved[None], axis=1) - direct
+        nu = nu.at[:, 0].add(p.error)
+        # lane 0 carries the base's own innovation: nothing was changed there
+        return (memory, nu), jnp.tensordot(white, nu, 1) * exists[None, None]
+
+    zero = jnp.zeros((12, lanes, V.shape[2]), V.dtype)
+    memory = () if instruments else settle(model, u[0][:, None], dt, 1)
+    start = (memory, zero)
+    xs = (predictions, X[:-1], V[:-1], u, voltage, keep, whiten, weight)
+    return jax.lax.scan(body, start, xs)[1].astype(jnp.float32)
+
+
+def respond(
+    model: Extended,
+    library: Library,
+    theta: Float[np.ndarray, " p"],
+    probes: Float[np.ndarray, "k p"],
+    data: Data,
+    predictions: Predictions,
+    kalman: Filter,
+    progress: Callable[[float], None] = lambda fraction: None,
+) -> Float[np.ndarray, "m N12 R"]:
+    """Whitened innovations at `theta`, then the changes that each row of `probes` makes in them.
+
+    Rows of `probes` are differences from `theta`. Those of instruments go through one compiled
+    program, all others through another one, `LANES` at a time: reading instruments costs several
+    times what a wrench costs.
+    """
+    arrays = as_arrays(data)
+    filters = (jnp.asarray(kalman.keep), jnp.asarray(kalman.whiten), jnp.asarray(data.weight))
+    reads = np.array([kind(e.cause).family == "measurement" for e in library.entries])
+    of_instruments = np.any((probes != 0) & reads, axis=1)
+    steps = data.u.shape[0] * 12
+    found = np.empty((1 + len(probes), steps, data.u.shape[2]), np.float32)
+    done = 0
+    for instruments in (False, True):
+        rows = np.flatnonzero(of_instruments == instruments)
+        size = LANES if len(rows) > LANES // 2 or not instruments else LANES // 2
+        for first in range(0, len(rows), size):
+            some = rows[first : first + size]
+            chunk = np.zeros((size + 1, library.size))
+            chunk[1 : 1 + len(some)] = probes[some]
+            effects = _values(library, theta, chunk, instruments)
+            z = np.asarray(
+                _respond(
+                    model, effects, predictions, arrays, filters, data.dt, size + 1, instruments
+                )
+            )
+            found[1 + some] = np.moveaxis(z[:, :, 1 : 1 + len(some)], 2, 0).reshape(
+                len(some), steps, -1
+            )
+            found[0] = z[:, :, 0].reshape(steps, -1)
+            done += len(some)
+            progress(done / len(probes))
+    return found
+
+
+def _values(
+    library: Library, theta: np.ndarray, chunk: np.ndarray, instruments: bool
+) -> tuple[Effect, ...]:
+    """Effects whose values differ from lane to lane where the chunk asks for it."""
+    lanes = library.filled(jnp.asarray((theta + chunk).T[:, :, None]))
+    alike = library.filled(jnp.asarray(theta[:, None, None]))
+    return tuple(
+        a if (a.family == "measurement") == instruments else b
+        for a, b in zip(lanes, alike, strict=True)
+    )
+
+
+def _apart(state: tuple[Array, Array]) -> Float[Array, "12 L R"]:
+    """How far the states of all lanes are from lane 0's, for angles well below a radian."""
+    X, V = state
+    inverse = se3.inverse(X[:, :1])
+    w, x, y, z = jnp.unstack(inverse[:4])
+    a, b, c, d = jnp.unstack(X[:4])
+    turned = [w * b + x * a + y * d - z * c, w * c - x * d + y * a + z * b,
+              w * d + x * c - y * b + z * a]  # fmt: skip
+    moved = se3.rotate_inverse(X[:, :1], X[4:] - X[4:, :1])
+    parts = [moved, 2 * jnp.stack(turned), V - V[:, :1]]
+    batch = jnp.broadcast_shapes(*(p.shape[1:] for p in parts))
+    return jnp.concatenate([jnp.broadcast_to(p, (p.shape[0], *batch)) for p in parts])

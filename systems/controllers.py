@@ -9,9 +9,11 @@ import importlib
 import importlib.util
 import inspect
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
@@ -190,27 +192,29 @@ class MppiImpedance(Controller):
 
     def dynamics(self, station: StationConfig) -> Dynamics:
         """The model to plan with."""
+        return self._model(station)[0]
+
+    def _model(self, station: StationConfig) -> tuple[Dynamics, Mapping[str, Any]]:
+        """The model to plan with and what its checkpoint says of it."""
         if self.model is not None:
-            return load_model(self.model, float)[0]
+            return load_model(self.model, float)
         vehicle = load_vehicle(self.vehicle or station.vehicle)
-        return vehicle.dynamics(np.array(self.diffusion))
+        return vehicle.dynamics(np.array(self.diffusion)), {}
 
     def build(self, station: StationConfig) -> Diagram:
         vehicle = station.load_vehicle()
-        model = self.dynamics(station)
-        limits = ThrusterLimits.create(
-            vehicle.thrusters(), station.voltage, self.planner.wrench_fraction
-        )
+        model, metadata = self._model(station)
+        c = self.planner.with_substeps_of(metadata)
+        limits = ThrusterLimits.create(vehicle.thrusters(), station.voltage, c.wrench_fraction)
         planner = MppiPlanner(
             model,
             limits,
             Cylinders.create(station.obstacles),
             SphereHull.cover(vehicle.size),
             self.goal.pose(),
-            config=self.planner,
-            tracking=self.tracking.gains.matrices(model) if self.planner.tracked else None,
+            config=c,
+            tracking=self.tracking.gains.matrices(model) if c.tracked else None,
         )
-        c = self.planner
         return self.tracking.build(station, Mppi(planner), c.layout, model, c.period)
 
 

@@ -8,7 +8,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from ..models import se3
 from ..models.disturbances import Disturbance
-from .jit import VectorFunction, value_or_zeros
+from .jit import VectorFunction, value_or_none, value_or_zeros
 
 
 class DisturbanceSource(LeafSystem):
@@ -58,41 +58,37 @@ class DisturbanceSource(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._initialise)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-        # Two calls, as XLA runs small programs in line and larger ones on its pool of threads.
-        def advance(X: Array, V: Array, when: Array, noise: Array, state: Array) -> Array:
+        def advance(
+            X: Array, V: Array, when: Array, noise: Array, state: Array
+        ) -> tuple[Array, Array, Array]:
             X, t = se3.retract(X, V * when[1]), when[0] + when[1]
-            return disturbance.advance(state, X, V, t, period, noise)
-
-        def show(X: Array, V: Array, when: Array, state: Array) -> tuple[Array, Array]:
-            X, t = se3.retract(X, V * when[1]), when[0] + when[1]
+            state = disturbance.advance(state, X, V, t, period, noise)
             flow = disturbance.flow(state, X, t)
             wrench = disturbance.wrench(state, X, V, t, flow)
-            return wrench, jnp.concatenate([flow.v_WC_W, flow.a_WC_W])
+            return state, wrench, jnp.concatenate([flow.v_WC_W, flow.a_WC_W])
 
         size = disturbance.state_size
         self._period = period
         self._start = VectorFunction(disturbance.initial, [sizes[1]], [size])
-        self._advance = VectorFunction(advance, [7, 6, 2, sizes[0], size], [size])
-        self._show = VectorFunction(show, [7, 6, 2, size], [6, 6])
+        self._advance = VectorFunction(advance, [7, 6, 2, sizes[0], size], [size, 6, 6])
 
     def _initialise(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = self._start.flat(value_or_zeros(self._initial_noise, context))
         self._move(context, discrete_state, state, 0.0)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = context.get_discrete_state(self._state).value()
+        state = context.get_discrete_state().value(0)
         self._move(context, discrete_state, state, self._period)
 
     def _move(
         self, context: Context, discrete_state: DiscreteValues, state: np.ndarray, ahead: float
     ) -> None:
         """Advance the state over the period that begins `ahead` of now and show what acts then."""
-        known = self._X.HasValue(context)
-        X = self._X.Eval(context) if known else np.array([1.0, 0, 0, 0, 0, 0, 0])
+        X = value_or_none(self._X, context)
+        if X is None:
+            X = np.array([1.0, 0, 0, 0, 0, 0, 0])
         V = value_or_zeros(self._V, context)
         when = np.array([context.get_time(), ahead])
-        state = self._advance.flat(X, V, when, value_or_zeros(self._noise, context), state)
-        wrench, water = self._show(X, V, when, state)
-        discrete_state.set_value(self._state, state)
-        discrete_state.set_value(self._wrench, wrench)
-        discrete_state.set_value(self._water, water)
+        results = self._advance(X, V, when, value_or_zeros(self._noise, context), state)
+        for index, value in enumerate(results):  # state, wrench, water in this order
+            discrete_state.set_value(index, value)

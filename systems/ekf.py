@@ -19,10 +19,11 @@ from .learned_plant import check_state
 class Ekf(LeafSystem):
     """Error-state Kalman filter on SE(3), driven by the IMU, at a delayed horizon.
 
-    At every IMU period it takes in the sample shown, which is that of one period ago, and fuses
-    DVL, depth and compass `config.horizon` in the past in the order of their times of validity
-    (`systems.filtering.delayed`). At `config.output_rate` it brings the estimate to the present
-    with the samples that wait. The error's order and frame are those of
+    At every IMU period it takes in the sample shown, which is that of one period ago. At
+    `config.output_rate` (more often if a sensor reads faster) it moves over the samples that came,
+    fuses DVL, depth and compass `config.horizon` in the past in the order of their times of
+    validity (`systems.filtering.delayed`), and brings the estimate to the present with the samples
+    that wait. The error's order and frame are those of
     `systems.filtering.error_state`: `covariance` is the 18 × 18 matrix by rows, whose first six
     rows and columns belong to [δp, δθ] in body axes. Horizontal position is dead reckoning: its
     variance grows. `status` has the components `STATUS`.
@@ -85,13 +86,15 @@ class Ekf(LeafSystem):
         start, unravel = ravel_pytree(core.init(jnp.asarray(X0), jnp.asarray(V0)))
         n = start.size
         outputs = {"X_WB": 7, "V_WB_B": 6, "covariance": ERRORS**2, "status": len(STATUS)}
+        self._ratio = round(ratio)
+        self._samples = core.samples_at_once(self._ratio)
         self._filter = self.DeclareDiscreteState(BasicVector(np.asarray(start).tolist()))
         self._outputs = [self.DeclareDiscreteState(size) for size in outputs.values()]
+        self._waiting = self.DeclareDiscreteState(6 * (self._samples - 1))
         for name, index in zip(outputs, self._outputs, strict=True):
             self.DeclareStateOutputPort(name, index)
         self.DeclareInitializationDiscreteUpdateEvent(self._initialise)
         self.DeclarePeriodicDiscreteUpdateEvent(core.period, 0.0, self._update)
-        self.DeclarePeriodicDiscreteUpdateEvent(1 / config.output_rate, 0.0, self._put_out)
 
         def initialise(w: Array) -> tuple[Array, ...]:
             error = core.deviations()[:9] * w
@@ -100,27 +103,34 @@ class Ekf(LeafSystem):
             state = core.init(X, V)
             return ravel_pytree(state)[0], *show(state, jnp.zeros((), w.dtype))
 
-        def advance(
-            flat: Array, imu: Array, dvl: Array, depth: Array, compass: Array, k: Array
-        ) -> tuple[Array, Array, Array]:
-            readings = Readings(imu, jnp.concatenate([dvl[:4], dvl[6:]]), depth, compass)
-            state, slot, due = core.advance(unravel(flat), readings, k[0])
-            return ravel_pytree(state)[0], slot, due.astype(flat.dtype)
+        def show(state: FilterState, t: Array) -> tuple[Array, Array, Array, Array]:
+            # The newest sample is one period old.
+            X, V, P = core.present(state, jnp.minimum(t, core.period))
+            return X, V, P.reshape(-1), core.status(state, jnp.round(t / core.period) - 1)
+
+        def take_in(flat: Array, *given: Array) -> tuple[Array, Array, Array]:
+            *samples, dvl, depth, compass, last = given
+            imu = jnp.concatenate(samples).reshape(-1, 6)
+            readings = Readings(imu[-1], jnp.concatenate([dvl[:4], dvl[6:]]), depth, compass)
+            state, slots = core.take_in(unravel(flat), imu, readings, last[0])
+            state, at = core.move(state, slots, jnp.zeros_like(last[0]))
+            return ravel_pytree(state)[0], at, slots
+
+        def move(flat: Array, slots: Array, first: Array) -> tuple[Array, Array]:
+            state, at = core.move(unravel(flat), slots.reshape(-1, SLOT), first[0])
+            return ravel_pytree(state)[0], at
 
         def fuse(flat: Array, slot: Array, k: Array) -> Array:
             return ravel_pytree(core.fuse(unravel(flat), slot, k[0]))[0]
 
-        def show(state: FilterState, t: Array) -> tuple[Array, Array, Array, Array]:
-            # The newest sample that the previous update took in is two periods old.
-            X, V, P = core.present(state, jnp.minimum(t, 2 * core.period))
-            k = jnp.round(t / core.period) - 2
-            return X, V, P.reshape(-1), core.status(state, k)
-
         results = list(outputs.values())
         self._start = VectorFunction(initialise, [9], [n, *results])
-        # Two calls, as XLA runs small programs in line and larger ones on its pool of threads: the
-        # first is small and frequent, the second is needed for some samples only.
-        self._advance = VectorFunction(advance, [n, *sizes.values(), 1], [n, SLOT, 1])
+        # Several calls, as XLA runs small programs in line and larger ones on its pool of threads.
+        m = self._samples
+        self._take_in = VectorFunction(
+            take_in, [n, 6 * (m - 1), *sizes.values(), 1], [n, 1, SLOT * m]
+        )
+        self._move = VectorFunction(move, [n, SLOT * m, 1], [n, 1])
         self._fuse = VectorFunction(fuse, [n, SLOT, 1], [n])
         self._show = VectorFunction(lambda x, t: show(unravel(x), t[0]), [n, 1], results)
 
@@ -136,17 +146,30 @@ class Ekf(LeafSystem):
             discrete_state.set_value(index, value)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        readings = [value_or_zeros(port, context) for port in self._readings]
-        state = context.get_discrete_state(self._filter).value()
-        # What is shown was sampled one period ago.
-        k = np.array([round(context.get_time() / self.filter.period) - 1.0])
-        state, slot, due = self._advance(state, *readings, k)
-        if due[0] > 0:
-            state = self._fuse.flat(state, slot, k)
-        discrete_state.set_value(self._filter, state)
-
-    def _put_out(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = context.get_discrete_state(self._filter).value()
-        results = self._show(state, np.array([context.get_time()]))
-        for index, value in zip(self._outputs, results, strict=True):
-            discrete_state.set_value(index, value)
+        """Keep the sample that is shown; with the last of several, step over all of them."""
+        t = context.get_time()
+        tick = round(t / self.filter.period)
+        phase = tick % self._samples
+        imu = value_or_zeros(self._readings[0], context)
+        if phase:
+            waiting = discrete_state.get_mutable_value(5)
+            waiting[6 * phase - 6 : 6 * phase] = imu
+            return
+        last = tick - 1.0  # what is shown was sampled one period ago
+        held = context.get_discrete_state()
+        readings = [value_or_zeros(port, context) for port in self._readings[1:]]
+        state, at, slots = self._take_in(
+            held.value(0), held.value(5), imu, *readings, np.array([last])
+        )
+        n, i = self._samples, int(at[0])
+        while i < n:
+            number = np.array([last - n + 1 + i])
+            state = self._fuse.flat(state, slots[SLOT * i : SLOT * (i + 1)], number)
+            if i == n - 1:
+                break
+            state, at = self._move(state, slots, np.array([i + 1.0]))
+            i = int(at[0])
+        discrete_state.set_value(0, state)
+        if tick % self._ratio == 0:
+            for index, value in enumerate(self._show(state, np.array([t])), 1):
+                discrete_state.set_value(index, value)

@@ -1,7 +1,5 @@
 """The vehicle as a discrete-time system around any model of its dynamics."""
 
-import math
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,7 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from ..models import integrate
 from ..models.dynamics import Dynamics, Flow
-from .jit import VectorFunction, value_or_zeros
+from .jit import VectorFunction, value_or_none, value_or_zeros
 
 
 class LearnedPlant(LeafSystem):
@@ -86,17 +84,18 @@ class LearnedPlant(LeafSystem):
             F_disturbance: Array,
             noise: Array,
             flow: Array | None = None,
-        ) -> tuple[Array, Array, Array]:
+        ) -> tuple[Array, ...]:
             start, F = V, F + F_disturbance
             dW = h**0.5 * noise.reshape(substeps, 6)
             for s in range(substeps):
                 water = None if flow is None else Flow(flow[:3] + s * h * flow[3:], flow[3:])
                 X, V = integrate.step(model, X, V, F, h, dW[s], water)
-            return X, V, (V - start) / period
+            finite = jnp.all(jnp.isfinite(jnp.concatenate([X, V])))
+            return X, V, (V - start) / period, finite.astype(V.dtype)
 
         sizes = [7, 6, 6, 6, 6 * substeps]
-        self._still = VectorFunction(advance, sizes, [7, 6, 6])
-        self._flowing = VectorFunction(advance, [*sizes, 6], [7, 6, 6])
+        self._still = VectorFunction(advance, sizes, [7, 6, 6, 1])
+        self._flowing = VectorFunction(advance, [*sizes, 6], [7, 6, 6, 1])
 
     def set_state(self, context: Context, X_WB: ArrayLike, V_WB_B: ArrayLike) -> None:
         """Write pose and twist into this system's context.
@@ -114,20 +113,20 @@ class LearnedPlant(LeafSystem):
         output.SetFromVector(np.concatenate([X.value(), V.value()]))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        X = context.get_discrete_state(self._X).value()
-        V = context.get_discrete_state(self._V).value()
-        parts = [X, V]
+        state = context.get_discrete_state()
+        parts = [state.value(0), state.value(1)]
         parts += [value_or_zeros(p, context) for p in (self._F, self._F_disturbance, self._noise)]
-        if self._flow.HasValue(context):
-            parts.append(self._flow.Eval(context))
-            result = self._flowing.flat(*parts)
-        else:
+        flow = value_or_none(self._flow, context)
+        if flow is None:
             result = self._still.flat(*parts)
-        if not math.isfinite(result.sum()):
+        else:
+            parts.append(flow)
+            result = self._flowing.flat(*parts)
+        if not result[19]:
             raise FloatingPointError(self._explain(context.get_time(), parts, result[7:13]))
-        discrete_state.set_value(self._X, result[:7])
-        discrete_state.set_value(self._V, result[7:13])
-        discrete_state.set_value(self._A, result[13:])
+        discrete_state.set_value(0, result[:7])
+        discrete_state.set_value(1, result[7:13])
+        discrete_state.set_value(2, result[13:19])
 
     def _explain(self, t: float, parts: list[np.ndarray], V: np.ndarray) -> str:
         names = ["X_WB", "V_WB_B", "F_Bo_B", "F_disturbance_Bo_B", "noise", "flow_W"]

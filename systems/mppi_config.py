@@ -1,10 +1,14 @@
 """Settings of the model predictive path integral planner."""
 
-from dataclasses import dataclass
-from typing import Literal
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from ..models.checks import Vector6, check_numbers, require
 from .plan import PlanLayout
+
+_SUBSTEPS = 2
 
 
 @dataclass(frozen=True)
@@ -16,6 +20,8 @@ class MppiConfig:
     Attributes:
         horizon: number of steps.
         dt: length of a step (s).
+        substeps: of the model in a step; null takes those a learned model was trained with, and 2
+            for physics. With a single one some learned models diverge.
         period: time between calls (s), a multiple of `dt`: the warm start shifts by it.
         sequences: control sequences sampled in a call.
         realisations: noise paths each of them meets, an even number (pairs of opposite sign); 1
@@ -54,6 +60,7 @@ class MppiConfig:
 
     horizon: int = 80
     dt: float = 0.05
+    substeps: int | None = None
     period: float = 0.2
     sequences: int = 250
     realisations: int = 4
@@ -84,6 +91,12 @@ class MppiConfig:
         check_numbers(self)
         for name in ("horizon", "sequences", "realisations", "shown_paths"):
             require(getattr(self, name) >= 1, self, name, "give a whole number of 1 or more")
+        require(
+            self.substeps is None or self.substeps >= 1,
+            self,
+            "substeps",
+            "give a whole number of 1 or more, or null",
+        )
         even = self.realisations == 1 or self.realisations % 2 == 0
         require(even, self, "realisations", "give 1 or an even number")
         positive = (
@@ -141,6 +154,18 @@ class MppiConfig:
             "period",
             f"give a multiple of dt = {self.dt}",
         )
+
+    def with_substeps_of(self, metadata: Mapping[str, Any]) -> "MppiConfig":
+        """These settings with the steps that a checkpoint's metadata names, unless given here."""
+        dt, substeps = metadata.get("dt"), metadata.get("substeps")
+        if self.substeps is not None or not dt or not substeps:
+            return self
+        return replace(self, substeps=max(1, math.ceil(self.dt / dt * substeps - 1e-6)))
+
+    @property
+    def steps_of_model(self) -> int:
+        """Steps of the model in one of the plan."""
+        return _SUBSTEPS if self.substeps is None else self.substeps
 
     @property
     def shift(self) -> int:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from ..models import se3
 from ..models.dynamics import Dynamics
 from ..models.integrate import cast, step
+from .held_model import HeldModel
 from .mppi_config import MppiConfig
 from .obstacles import Cylinders, SphereHull
 from .path_integral import (
@@ -153,7 +154,7 @@ class MppiPlanner(eqx.Module):
         mean = self._cut(jnp.sum(F * weights[None, None], axis=2))
         best = F[:, :, jnp.argmin(jnp.where(jnp.isfinite(cost), cost, jnp.inf))]
         candidates = jnp.stack([mean, best, nominal], axis=2)
-        quiet = None if dW is None else jnp.concatenate([dW, jnp.zeros_like(dW[:, :, :1])], axis=2)
+        quiet = None if dW is None else jnp.concatenate([dW, jnp.zeros_like(dW[..., :1])], axis=3)
         tried = self._rollouts(X, V, candidates, bias, quiet, lambda X, V: (X[:, -3:], V[:, -3:]))
         if dW is not None:
             tried = _Rollouts(tried.cost[:-1], tried.clearance[:-1], tried.kept)
@@ -223,7 +224,7 @@ class MppiPlanner(eqx.Module):
             total = total + c.risk_weight * (excess + missing)
         return total, probability
 
-    def _process_noise(self, key: Array) -> Float[Array, "horizon 6 r"] | None:
+    def _process_noise(self, key: Array) -> Float[Array, "horizon substeps 6 r"] | None:
         """Brownian increments (√s) for the realisations; None for a single one.
 
         Pairs have opposite signs, so the mean is that without noise. Where paths stray freely, each
@@ -233,12 +234,13 @@ class MppiPlanner(eqx.Module):
         c = self.config
         if c.realisations == 1:
             return None
-        shape = (c.horizon, 6, c.realisations // 2)
-        dW = jax.random.normal(key, shape, self.V_goal.dtype) * c.dt**0.5
+        m, h = c.steps_of_model, c.dt / c.steps_of_model
+        shape = (c.horizon * m, 6, c.realisations // 2)
+        dW = jax.random.normal(key, shape, self.V_goal.dtype) * h**0.5
         if self.tracking is None:
             sampled = jnp.mean(jnp.cumsum(dW, axis=0) ** 2, axis=(0, 2))
-            dW = dW * jnp.sqrt(c.dt * (c.horizon + 1) / 2 / sampled)[None, :, None]
-        return jnp.concatenate([dW, -dW], axis=2)
+            dW = dW * jnp.sqrt(h * (c.horizon * m + 1) / 2 / sampled)[None, :, None]
+        return jnp.concatenate([dW, -dW], axis=2).reshape(c.horizon, m, 6, c.realisations)
 
     def _pull(self, X: Array, V: Array, n: int) -> Array:
         """What tracking adds for n sequences: it draws each path to the middle of its pair."""
@@ -267,10 +269,11 @@ class MppiPlanner(eqx.Module):
         return cost
 
     def _rollouts(self, X0: Array, V0: Array, F: Array, bias: Array, dW: Array | None, keep):
-        """Sequences (horizon, 6, n) under all noise paths (horizon, 6, r), r-major in the batch."""
+        """Sequences (horizon, 6, n) under all noise paths (horizon, substeps, 6, r), r-major."""
         c = self.config
         n = F.shape[2]
-        r = 1 if dW is None else dW.shape[2]
+        r = 1 if dW is None else dW.shape[3]
+        h = c.dt / c.steps_of_model
         X = jnp.broadcast_to(X0[:, None], (7, r * n))
         V = jnp.broadcast_to(V0[:, None], (6, r * n))
         last = jnp.zeros(c.horizon, V.dtype).at[-1].set(c.terminal_time)
@@ -281,9 +284,10 @@ class MppiPlanner(eqx.Module):
             wrench = jnp.tile(F, (1, r)) + _in_body(X, bias)
             if self.tracking is not None and dW is not None:
                 wrench = wrench + self._pull(X, V, n)
-            X, V = step(
-                self.dynamics, X, V, wrench, c.dt, None if dW is None else jnp.repeat(dW, n, 1)
-            )
+            model = HeldModel(self.dynamics, V) if c.steps_of_model > 1 else self.dynamics
+            for i in range(c.steps_of_model):
+                noise = None if dW is None else jnp.repeat(dW[i], n, 1)
+                X, V = step(model, X, V, wrench, h, noise)
             distance = self.hull.clearance(X, self.cylinders)
             near = jnp.maximum(1 - distance / c.margin, 0)
             cost = cost + (c.dt + terminal) * self._state_cost(X, V)

@@ -1,13 +1,15 @@
 """The vehicle's sensors as one system with a rate for each."""
 
 from collections.abc import Callable
-from itertools import pairwise
+from dataclasses import dataclass
+from functools import cache
+from itertools import islice, pairwise
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from pydrake.common import RandomDistribution
-from pydrake.systems.framework import Context, DiscreteStateIndex, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from ..models.sensors import Compass, DepthSensor, Dvl, Imu, Sensor
 from .jit import VectorFunction, value_or_zeros
@@ -93,45 +95,74 @@ class SensorSuite(LeafSystem):
             X, V, A = motion
             return (dvl.measure(state, X, V, A, t, w[shares[1]]),)
 
-        states, shown = self._states, self._shown
-        self._declare(imu, tick, [states[0], states[1]], [states[0], shown[0], shown[1]])
-        self._declare(dvl, ping, [states[1]], [states[1]])
-        for i, sensor in ((2, depth), (3, compass)):
-            measure = _stamped(sensor, shares[i])
-            self._declare(sensor, measure, [states[i]], [states[i], shown[i]])
+        n = [int(index) for index in groups]
+        parts = [
+            _Part(imu.rate, tick, (n[0], n[1]), (n[0], n[4], n[5])),
+            _Part(dvl.rate, ping, (n[1],), (n[1],)),
+            _Part(depth.rate, _stamped(depth, shares[2]), (n[2],), (n[2], n[6])),
+            _Part(compass.rate, _stamped(compass, shares[3]), (n[3],), (n[3], n[7])),
+        ]
+        # Sensors whose period is a multiple of the IMU's share its events and its calls.
+        shared = [part for part in parts if _divides(part.rate, imu.rate)]
+        self._declare(shared)
+        for part in parts:
+            if part not in shared:
+                self._declare([part])
 
-    def _declare(
-        self,
-        sensor: Sensor,
-        measure: Callable[..., Outputs],
-        reads: list[DiscreteStateIndex],
-        writes: list[DiscreteStateIndex],
-    ) -> None:
-        """Declare a sensor's event: one compiled call from the motion to states and readings."""
+    def _declare(self, parts: list["_Part"]) -> None:
+        """Declare events at the first part's rate; the others take part in every so many."""
         ports = (self._X, self._V, self._A, self._noise)
+        period = 1 / parts[0].rate
+        every = [round(parts[0].rate / part.rate) for part in parts]
 
-        def packed(t: Array, X: Array, V: Array, A: Array, w: Array, *own: Array) -> Outputs:
-            return measure((X, V, A), t[0], w, *own)
+        @cache
+        def call(due: tuple[bool, ...]) -> tuple[VectorFunction, list[int], list[int]]:
+            """One compiled call from the motion and the states read to what is written."""
+            used = [part for part, now in zip(parts, due, strict=True) if now]
+            reads = [index for part in used for index in part.reads]
+            writes = [index for part in used for index in part.writes]
 
-        def size(index: DiscreteStateIndex) -> int:
-            return self._sizes[int(index)]
+            def packed(t: Array, X: Array, V: Array, A: Array, w: Array, *own: Array) -> Outputs:
+                values = iter(own)
+                return sum(
+                    (p.measure((X, V, A), t[0], w, *islice(values, len(p.reads))) for p in used), ()
+                )
 
-        inputs = [1, 7, 6, 6, self._noise.size(), *map(size, reads)]
-        call = VectorFunction(packed, inputs, [size(index) for index in writes])
+            inputs = [1, 7, 6, 6, self._noise.size(), *(self._sizes[i] for i in reads)]
+            function = VectorFunction(packed, inputs, [self._sizes[i] for i in writes])
+            return function, reads, writes
 
         def update(context: Context, discrete_state: DiscreteValues) -> None:
-            t = np.array([context.get_time()])
-            parts = [value_or_zeros(port, context) for port in ports]
-            parts += [context.get_discrete_state(index).value() for index in reads]
-            for index, value in zip(writes, call(t, *parts), strict=True):
+            t = context.get_time()
+            tick = round(t / period)
+            function, reads, writes = call(tuple([tick % m == 0 for m in every]))
+            state = context.get_discrete_state()
+            values = [value_or_zeros(port, context) for port in ports]
+            results = function(np.array([t]), *values, *[state.value(i) for i in reads])
+            for index, value in zip(writes, results, strict=True):
                 discrete_state.set_value(index, value)
 
-        self.DeclarePeriodicDiscreteUpdateEvent(1 / sensor.rate, 0.0, update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, update)
 
     def _initialise(self, context: Context, discrete_state: DiscreteValues) -> None:
         w = value_or_zeros(self._initial_noise, context)
         for index, value in zip(self._states, self._start(w), strict=True):
             discrete_state.set_value(index, value)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What one sensor does in its event, with the state groups that it reads and writes."""
+
+    rate: float
+    measure: Callable[..., Outputs]
+    reads: tuple[int, ...]
+    writes: tuple[int, ...]
+
+
+def _divides(rate: float, of: float) -> bool:
+    ratio = of / rate
+    return ratio > 0.5 and abs(ratio - round(ratio)) < 1e-9 * ratio
 
 
 def _stamped(sensor: Sensor, share: slice) -> Callable[..., Outputs]:

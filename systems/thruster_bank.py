@@ -12,7 +12,7 @@ from pydrake.systems.framework import (
 
 from ..models import integrate
 from ..models.thrusters import Thrusters
-from .jit import VectorFunction
+from .jit import VectorFunction, value_or_none
 
 
 class ThrustAllocation(LeafSystem):
@@ -124,12 +124,13 @@ class ThrusterBank(LeafSystem):
         self._advance = VectorFunction(advance, [count, 1, count, count], [*sizes.values(), count])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        given = self._pwm.HasValue(context), self._voltage.HasValue(context)
+        pwm, voltage = value_or_none(self._pwm, context), value_or_none(self._voltage, context)
+        state = context.get_discrete_state()
         results = self._advance(
-            self._pwm.Eval(context) if given[0] else self._neutral,
-            self._voltage.Eval(context) if given[1] else self._nominal,
-            context.get_discrete_state(self._shown[1]).value(),
-            context.get_discrete_state(self._waited).value(),
+            self._neutral if pwm is None else pwm,
+            self._nominal if voltage is None else voltage,
+            state.value(1),
+            state.value(3),
         )
-        for index, value in zip([*self._shown, self._waited], results, strict=True):
+        for index, value in enumerate(results):
             discrete_state.set_value(index, value)

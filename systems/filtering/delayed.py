@@ -9,15 +9,14 @@ applying the waiting samples' preintegrated increment (Khosravian et al. 2015 gi
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Float
 from scipy.stats import chi2
 
 from ...models import se3
@@ -29,6 +28,7 @@ from .error_state import Navigation
 
 SLOT = 15  # has sample, force 3, rate 3 | has dvl, v 3 | has depth, depth | has compass, yaw
 _DVL, _DEPTH, _COMPASS = 7, 11, 13
+_FLAGS = np.array([_DVL, _DEPTH, _COMPASS])
 _FEW = 5  # samples whose mean force is held beyond the newest one
 _LONGEST = 0.1  # s that the covariance waits at most for a reading
 
@@ -70,7 +70,7 @@ class EkfConfig:
     attitude_std: Vector3 = (0.01, 0.01, 0.03)
     velocity_std: Vector3 = (0.02, 0.02, 0.02)
     imu_factor: float = 1.5
-    horizon: float = 0.25
+    horizon: float = 0.24
     gate: float = 0.999
     patience: int = 10
     output_rate: float = 20.0
@@ -147,6 +147,15 @@ class DelayedFilter(eqx.Module):
         """Samples that wait."""
         return math.ceil(self.config.horizon * self.imu.rate - 1e-9)
 
+    def samples_at_once(self, most: int) -> int:
+        """How many samples `steps` may take, a divisor of `most`, so that no reading is missed."""
+        dvl = 1 / self.dvl.rate - (self.dvl.latest_latency - self.dvl.earliest_latency)
+        shortest = min(dvl, 1 / self.depth.rate, 1 / self.compass.rate)
+        fit = [
+            n for n in range(1, most + 1) if most % n == 0 and n * self.period <= shortest + 1e-9
+        ]
+        return max(fit, default=1)
+
     @property
     def _noisy_imu(self) -> Imu:
         f, imu = self.config.imu_factor, self.imu
@@ -185,110 +194,36 @@ class DelayedFilter(eqx.Module):
         moves with every sample; the covariance follows, with the samples' mean, where a reading is
         fused and every 0.1 s.
         """
-        state, slot, due = self.advance(state, readings, k)
-        return jax.lax.cond(due, lambda s: self.fuse(s, slot, k), lambda s: s, state)
+        state, slots = self.take_in(state, readings.imu[None], readings, k)
+        state, at = self.move(state, slots, jnp.zeros((), k.dtype))
+        return jax.lax.cond(at < 1, lambda s: self.fuse(s, slots[0], k), lambda s: s, state)
 
-    def advance(
-        self, state: FilterState, readings: Readings, k: Float[Array, ""]
-    ) -> tuple[FilterState, Float[Array, "15"], Bool[Array, ""]]:
-        """The first half of `step`: also the slot that left the ring, and if `fuse` is due."""
-        ring, rate = self._enqueue(state, readings, k)
-        slot = ring[0]
-        dt = slot[0] * self.period
-        x = state.nominal
-        force, omega = slot[1:4] - x.accel_bias, slot[4:7] - x.gyro_bias
-        sample = error_state.sample_increment(force, omega, dt)
-        decay = jnp.exp(-dt / self.compass.wander_time)
-        x = error_state.apply(x, sample, self.imu.gravity)
-        x = x._replace(sensors=jnp.concatenate([x.sensors[:2], decay * x.sensors[2:]]))
-        gone = jnp.concatenate([dt[None], force * dt, omega * dt])
-        since = jnp.concatenate([state.since[:7] + gone, state.since[7:]])
-        state = state._replace(nominal=x, ring=ring[1:], since=since, rate=rate)
-        due = (slot[_DVL] > 0) | (slot[_DEPTH] > 0) | (slot[_COMPASS] > 0)
-        return state, slot, due | (since[0] > _LONGEST - self.period / 2)
+    def take_in(
+        self,
+        state: FilterState,
+        samples: Float[Array, "n 6"],
+        readings: Readings,
+        last: Float[Array, ""],
+    ) -> tuple[FilterState, Float[Array, "n 15"]]:
+        """Put samples that end with number `last` into the ring; return the slots that leave it.
 
-    def fuse(
-        self, state: FilterState, slot: Float[Array, "15"], k: Float[Array, ""]
-    ) -> FilterState:
-        """The second half of `step`: bring P up to date and use the slot's readings."""
-        dtype = state.P.dtype
-        state = state._replace(P=self._covariance(state, state.nominal, state.since[:7]))
-        time = (k - self.slots) * self.period
-
-        def dvl(x: Navigation) -> measurement.Innovation:
-            return measurement.dvl_innovation(self.dvl, x, slot[4:7], slot[_DVL + 1 : _DEPTH])
-
-        def depth(x: Navigation) -> measurement.Innovation:
-            return measurement.depth_innovation(self.depth, x, slot[_DEPTH + 1 : _COMPASS])
-
-        def compass(x: Navigation) -> measurement.Innovation:
-            return measurement.compass_innovation(self.compass, x, slot[_COMPASS + 1 :])
-
-        def correct(
-            state: FilterState,
-            i: int,
-            own: slice,
-            innovation: Callable[[Navigation], measurement.Innovation],
-        ) -> FilterState:
-            found = innovation(state.nominal)
-            limit = jnp.asarray(chi2.ppf(self.config.gate, found.residual.size), dtype)
-            # A filter that lost its way: what the sensor measures counts as unknown from here on.
-            H = found.H[:, own]
-            lost = state.rejected[i] >= self.config.patience
-            doubt = jnp.where(lost, found.residual**2, 0)
-            P = state.P.at[own, own].add(H.T @ (doubt[:, None] * H))
-            nominal, P, nis, accepted = measurement.update(state.nominal, P, found, limit)
-            count = jnp.where(accepted, 0, state.rejected[i] + 1)
-            last = jnp.where(accepted, time, state.accepted_at[i])
-            return state._replace(
-                nominal=nominal,
-                P=P,
-                nis=state.nis.at[i].set(nis),
-                rejected=state.rejected.at[i].set(count),
-                accepted_at=state.accepted_at.at[i].set(last),
-            )
-
-        kinds = (
-            (_DVL, error_state.VELOCITY, dvl),
-            (_DEPTH, error_state.POSITION, depth),
-            (_COMPASS, error_state.ROTATION, compass),
-        )
-        for i, (flag, own, innovation) in enumerate(kinds):
-            use = partial(correct, i=i, own=own, innovation=innovation)
-            state = jax.lax.cond(slot[flag] > 0, use, lambda state: state, state)
-        zero = jnp.zeros(7, dtype)
-        return state._replace(since=jnp.concatenate([zero, state.nominal.v_B]))
-
-    def _covariance(
-        self, state: FilterState, after: Navigation, gone: Float[Array, "7"]
-    ) -> Float[Array, "18 18"]:
-        """P after the time and the sums of force · dt and rate · dt of `gone`."""
-        time = gone[0]
-        some = jnp.maximum(time, self.period)
-        before = state.nominal._replace(v_B=state.since[7:])
-        F, Q = error_state.transition(
-            before, after, gone[1:4] / some, gone[4:] / some, time, self._noisy_imu, self.compass
-        )
-        P = F @ state.P @ F.T + Q
-        return (P + P.T) / 2
-
-    def _enqueue(
-        self, state: FilterState, readings: Readings, k: Array
-    ) -> tuple[Float[Array, "_ 15"], Float[Array, "3"]]:
-        """The ring with the new slot at its end and every reading in the slot of its time."""
-        dtype, h = state.ring.dtype, self.period
+        `samples` are the IMU's, oldest first; of `readings` only the other sensors count. The slots
+        are then passed by `move`, and where it stops `fuse`, until all are: `step` for n samples.
+        """
+        dtype, h, n = state.ring.dtype, self.period, samples.shape[0]
         X_BS = self.imu.mount(dtype)
-        rate = se3.rotate(X_BS, readings.imu[3:])
-        force = se3.rotate(X_BS, readings.imu[:3])
+        rate = se3.rotate(X_BS, samples[:, 3:].T)
+        force = se3.rotate(X_BS, samples[:, :3].T)
+        number = last - (self.slots + n - 1) + jnp.arange(self.slots + n, dtype=dtype)
+        rate = jnp.where(number[None, self.slots :] >= 0, rate, state.rate[:, None])
+        before = jnp.concatenate([state.rate[:, None], rate[:, :-1]], axis=1)
         if any(self.imu.position):  # from the sensor's place to Bo
-            r = X_BS[4:]
+            r = jnp.broadcast_to(X_BS[4:, None], rate.shape)
             spin = velocity_at(r, jnp.concatenate([jnp.zeros_like(rate), rate]))
-            force = force - se3.cross(rate, spin) - se3.cross((rate - state.rate) / h, r)
-        mean = (rate + state.rate) / 2
-        moves = (k >= 1).astype(dtype)
-        new = jnp.concatenate([moves[None], force, mean, jnp.zeros(8, dtype)])
-        ring = jnp.concatenate([state.ring, new[None]])
-        number = k - self.slots + jnp.arange(self.slots + 1, dtype=dtype)
+            force = force - se3.cross(rate, spin) - se3.cross((rate - before) / h, r)
+        moves = (number[None, self.slots :] >= 1).astype(dtype)
+        new = [moves, force, (rate + before) / 2, jnp.zeros((8, n), dtype)]
+        ring = jnp.concatenate([state.ring, jnp.concatenate(new).T])
 
         def place(old: Array, reading: Array) -> Array:
             """The columns with [1, value] in the slot of a valid reading's time."""
@@ -302,8 +237,84 @@ class DelayedFilter(eqx.Module):
             place(ring[:, _DEPTH:_COMPASS], readings.depth),
             place(ring[:, _COMPASS:], readings.compass),
         ]
-        rate = jnp.where(k >= 0, rate, state.rate)
-        return jnp.concatenate(columns, axis=1), rate
+        ring = jnp.concatenate(columns, axis=1)
+        return state._replace(ring=ring[n:], rate=rate[:, -1]), ring[:n]
+
+    def move(
+        self, state: FilterState, slots: Float[Array, "n 15"], first: Float[Array, ""]
+    ) -> tuple[FilterState, Float[Array, ""]]:
+        """Move the nominal state from slot `first` on over the next one that needs `fuse`.
+
+        Returns the number of that slot, or n.
+        """
+        n, h, dtype = slots.shape[0], self.period, slots.dtype
+        order = jnp.arange(n, dtype=dtype)
+        ahead = order >= first
+        due = ahead & jnp.any(slots[:, _FLAGS] > 0, axis=1)
+        late = state.since[0] + h * jnp.sum(jnp.where(ahead, slots[:, 0], 0)) > _LONGEST - h / 2
+        due = due.at[-1].set(due[-1] | (late & ~jnp.any(due)))
+        at = jnp.min(jnp.where(due, order, n))
+        times = jnp.where(ahead & (order <= at), h * slots[:, 0], 0)
+
+        def over(
+            given: tuple[Navigation, Array], slot: tuple[Array, Array]
+        ) -> tuple[tuple[Navigation, Array], None]:
+            x, since = given
+            dt, values = slot
+            force, omega = values[1:4] - x.accel_bias, values[4:7] - x.gyro_bias
+            sample = error_state.sample_increment(force, omega, dt)
+            decay = jnp.exp(-dt / self.compass.wander_time)
+            x = error_state.apply(x, sample, self.imu.gravity)
+            x = x._replace(sensors=jnp.concatenate([x.sensors[:2], decay * x.sensors[2:]]))
+            gone = jnp.concatenate([dt[None], force * dt, omega * dt])
+            return (x, jnp.concatenate([since[:7] + gone, since[7:]])), None
+
+        (x, since), _ = jax.lax.scan(over, (state.nominal, state.since), (times, slots))
+        return state._replace(nominal=x, since=since), at
+
+    def fuse(
+        self, state: FilterState, slot: Float[Array, "15"], k: Float[Array, ""]
+    ) -> FilterState:
+        """Bring P up to date and use the readings of the slot that left with sample number k."""
+        x = state.nominal
+        P = self._covariance(state, x, state.since[:7])
+        found = (
+            measurement.dvl_innovation(self.dvl, x, slot[4:7], slot[_DVL + 1 : _DEPTH]),
+            measurement.depth_innovation(self.depth, x, slot[_DEPTH + 1 : _COMPASS]),
+            measurement.compass_innovation(self.compass, x, slot[_COMPASS + 1 :]),
+        )
+        used = jnp.stack([slot[flag] > 0 for flag in (_DVL, _DEPTH, _COMPASS)])
+        # A filter that lost its way: what the sensor measures counts as unknown from here on.
+        lost = used & (state.rejected >= self.config.patience)
+        own = (error_state.VELOCITY, error_state.POSITION, error_state.ROTATION)
+        for i, (each, part) in enumerate(zip(found, own, strict=True)):
+            doubt = jnp.where(lost[i], each.residual**2, 0)
+            H = each.H[:, part]
+            P = P.at[part, part].add(H.T @ (doubt[:, None] * H))
+        gates = [float(chi2.ppf(self.config.gate, each.residual.size)) for each in found]
+        x, P, nis, accepted = measurement.update(x, P, found, used, gates)
+        time = (k - self.slots) * self.period
+        return state._replace(
+            nominal=x,
+            P=P,
+            since=jnp.concatenate([jnp.zeros(7, P.dtype), x.v_B]),
+            nis=jnp.where(used, nis, state.nis),
+            rejected=jnp.where(accepted, 0, state.rejected + used.astype(P.dtype)),
+            accepted_at=jnp.where(accepted, time, state.accepted_at),
+        )
+
+    def _covariance(
+        self, state: FilterState, after: Navigation, gone: Float[Array, "7"]
+    ) -> Float[Array, "18 18"]:
+        """P after the time and the sums of force · dt and rate · dt of `gone`."""
+        time = gone[0]
+        some = jnp.maximum(time, self.period)
+        before = state.nominal._replace(v_B=state.since[7:])
+        F, Q = error_state.transition(
+            before, after, gone[1:4] / some, gone[4:] / some, time, self._noisy_imu, self.compass
+        )
+        P = F @ state.P @ F.T + Q
+        return (P + P.T) / 2
 
     def status(self, state: FilterState, k: Float[Array, ""]) -> Float[Array, "10"]:
         """The status vector after `step` number k; see `STATUS`."""

@@ -10,8 +10,12 @@ so the pose's error lives in the body frame (left-invariant; Barrau and Bonnabel
 order of every twist here; the rest adds. This module handles one state; batches go through `vmap`.
 """
 
+import math
+from collections.abc import Callable
+from operator import itemgetter
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -84,25 +88,32 @@ def chain(first: Increment, second: Increment) -> Increment:
 
 
 def chain_all(increments: Increment) -> Increment:
-    """The increment over a batch (n,) of intervals in order, by halving: log₂ n operations."""
+    """The increment over a batch (n,) of intervals in order, √n runs of them at a time."""
     n = increments.time.shape[0]
-    while n > 1:
-        tail = None
-        if n % 2:
-            tail = Increment(increments.X[:, -1:], increments.v[:, -1:], increments.time[-1:])
-        even = Increment(
-            increments.X[:, : n - 1 : 2], increments.v[:, : n - 1 : 2], increments.time[: n - 1 : 2]
-        )
-        odd = Increment(increments.X[:, 1:n:2], increments.v[:, 1:n:2], increments.time[1:n:2])
-        increments = chain(even, odd)
-        if tail is not None:
-            increments = Increment(
-                jnp.concatenate([increments.X, tail.X], axis=1),
-                jnp.concatenate([increments.v, tail.v], axis=1),
-                jnp.concatenate([increments.time, tail.time]),
-            )
-        n = (n + 1) // 2
-    return Increment(increments.X[:, 0], increments.v[:, 0], increments.time[0])
+    runs = math.isqrt(n - 1) + 1
+    length = -(-n // runs)
+    rest = Increment(
+        jnp.broadcast_to(se3.identity(increments.v.dtype)[:, None], (7, runs * length - n)),
+        jnp.zeros((3, runs * length - n), increments.v.dtype),
+        jnp.zeros(runs * length - n, increments.v.dtype),
+    )
+
+    def spread(all_of: Array, none: Array) -> Array:
+        """Place in the run first, then component, then run."""
+        together = jnp.concatenate([all_of, none], axis=-1)
+        return jnp.moveaxis(together.reshape(*all_of.shape[:-1], runs, length), -1, 0)
+
+    def over(first: Increment, second: Increment) -> tuple[Increment, None]:
+        return chain(first, second), None
+
+    steps = jax.tree.map(spread, increments, rest)
+    ends = _chained(over, steps)
+    return _chained(over, jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), ends))
+
+
+def _chained(over: Callable, steps: Increment) -> Increment:
+    first, others = (jax.tree.map(itemgetter(part), steps) for part in (0, slice(1, None)))
+    return jax.lax.scan(over, first, others)[0]
 
 
 def apply(nominal: Navigation, increment: Increment, gravity: float) -> Navigation:

@@ -1,6 +1,7 @@
 """Measurement updates of an error-state filter: gate, gain, Joseph form."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import jax
@@ -22,12 +23,17 @@ class Innovation(NamedTuple):
 
 def _along_pose(h: Callable[[Array], Array], X_WB: Float[Array, "7"]) -> tuple[Array, Array]:
     """Value of h at a pose and its Jacobian in the pose's error, by forward differentiation."""
-    zero = jnp.zeros(6, X_WB.dtype)
+    value, slope = jax.linearize(h, X_WB)
+    return value, jax.vmap(slope, in_axes=1, out_axes=1)(_tangents(X_WB))
 
-    def along(direction: Array) -> tuple[Array, Array]:
-        return jax.jvp(lambda xi: h(se3.retract(X_WB, xi)), (zero,), (direction,))
 
-    return jax.vmap(along, out_axes=(None, 1))(jnp.eye(6, dtype=X_WB.dtype))
+def _tangents(X_WB: Float[Array, "7"]) -> Float[Array, "7 6"]:
+    """The derivative of X exp(ξ) at ξ = 0: q̇ = q (0, δθ) / 2, ṗ = R δp."""
+    w, x, y, z = jnp.unstack(X_WB[:4] / 2)
+    turns = jnp.stack([-x, -y, -z, w, -z, y, z, w, -x, -y, x, w]).reshape(4, 3)
+    zero = jnp.zeros((3, 3), X_WB.dtype)
+    moves = jnp.concatenate([se3.rotation_matrix(X_WB), zero], axis=1)
+    return jnp.concatenate([jnp.concatenate([jnp.zeros_like(turns), turns], axis=1), moves])
 
 
 def _noise(std: float, size: int, like: Array) -> Array:
@@ -72,35 +78,77 @@ def _pose_row(H: Float[Array, "1 6"], sensor: int) -> Float[Array, "1 18"]:
 
 
 def small_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Inverse of a 1 × 1 or 3 × 3 matrix in plain arithmetic."""
-    if S.shape[0] == 1:
+    """Inverse of a positive matrix of 1, 3 or up to 6 rows in plain arithmetic, by blocks."""
+    m = S.shape[0]
+    if m == 1:
         return 1 / S
-    adjugate = jnp.stack([se3.cross(S[1], S[2]), se3.cross(S[2], S[0]), se3.cross(S[0], S[1])], 1)
-    return adjugate / (S[0] @ adjugate[:, 0])
+    if m == 2:
+        (a, b), (c, d) = S
+        return jnp.stack([d, -b, -c, a]).reshape(2, 2) / (a * d - b * c)
+    if m == 3:
+        columns = [se3.cross(S[1], S[2]), se3.cross(S[2], S[0]), se3.cross(S[0], S[1])]
+        adjugate = jnp.stack(columns, 1)
+        return adjugate / (S[0] @ adjugate[:, 0])
+    A, B, C = S[:3, :3], S[:3, 3:], S[3:, 3:]
+    A = small_inverse(A)
+    AB = A @ B
+    rest = small_inverse(C - B.T @ AB)
+    corner = AB @ rest
+    return jnp.concatenate(
+        [
+            jnp.concatenate([A + corner @ AB.T, -corner], axis=1),
+            jnp.concatenate([-corner.T, rest], axis=1),
+        ]
+    )
+
+
+def together(found: Sequence[Innovation]) -> Innovation:
+    """Several sensors' innovations as one; their noises are independent."""
+    sizes = [each.residual.size for each in found]
+    R = jnp.zeros((sum(sizes), sum(sizes)), found[0].R.dtype)
+    for each, end in zip(found, accumulate(sizes), strict=True):
+        own = slice(end - each.residual.size, end)
+        R = R.at[own, own].set(each.R)
+    residuals, rows = [each.residual for each in found], [each.H for each in found]
+    return Innovation(jnp.concatenate(residuals), jnp.concatenate(rows), R)
 
 
 def update(
     nominal: Navigation,
     P: Float[Array, "18 18"],
-    innovation: Innovation,
-    gate: Float[Array, ""] | float,
-) -> tuple[Navigation, Float[Array, "18 18"], Float[Array, ""], Bool[Array, ""]]:
-    """Correct with a measurement unless its NIS exceeds `gate`; returns the NIS and if it passed.
+    found: Sequence[Innovation],
+    used: Bool[Array, " n"],
+    gates: Sequence[float],
+) -> tuple[Navigation, Float[Array, "18 18"], Float[Array, " n"], Bool[Array, " n"]]:
+    """Correct with the readings `used` of n sensors unless a sensor's NIS exceeds its gate.
 
+    Returns the state, each sensor's NIS and whether its reading was used and passed.
     NIS = rᵀ S⁻¹ r with S = H P Hᵀ + R is chi-square with m degrees of freedom (Bar-Shalom et al.
     2001, section 5.4). The covariance takes Joseph's form (I − K H) P (I − K H)ᵀ + K R Kᵀ and
     moves to the corrected state with Γ = I − ½ ad(δ) on the pose's error.
     """
-    r, H, R = innovation
+    r, H, R = together(found)
     PH = P @ H.T
-    S_inverse = small_inverse(H @ PH + R)
-    nis = r @ S_inverse @ r
-    accepted = nis <= gate
-    K = jnp.where(accepted, PH @ S_inverse, 0)
-    delta = K @ r
+    S = H @ PH + R
+    scores, marks = [], []
+    for i, (each, end) in enumerate(
+        zip(found, accumulate(each.residual.size for each in found), strict=True)
+    ):
+        own = slice(end - each.residual.size, end)
+        nis = each.residual @ small_inverse(S[own, own]) @ each.residual
+        accepted = used[i] & (nis <= gates[i])
+        scores.append(nis)
+        marks.append(jnp.broadcast_to(accepted, each.residual.shape))
+    mark = jnp.concatenate(marks)
+    both = mark[:, None] & mark[None]
+    S_inverse = small_inverse(jnp.where(both, S, jnp.eye(r.size, dtype=P.dtype)))
+    # Rows that don't count have no gain: the inverse holds them apart from the others.
+    K = jnp.where(mark[None], PH @ jnp.where(both, S_inverse, 0), 0)
+    delta = K @ jnp.where(mark, r, 0)
     eye = jnp.eye(ERRORS, dtype=P.dtype)
     gamma = eye.at[POSE, POSE].add(-se3.ad(delta[POSE]) / 2)
     L = gamma @ (eye - K @ H)
     GK = gamma @ K
     P = L @ P @ L.T + GK @ R @ GK.T
-    return retract(nominal, delta), (P + P.T) / 2, nis, accepted
+    accepted = jnp.stack([each[0] for each in marks])
+    return retract(nominal, delta), (P + P.T) / 2, jnp.stack(scores), accepted

@@ -9,11 +9,14 @@ import tyro
 
 from ..models.errors import UserError
 from .commands.demo import Demo
+from .commands.diagnose import Diagnose
 from .commands.evaluate import Evaluate
 from .commands.generate import Generate
 from .commands.import_log import Import
 from .commands.run import Run
+from .commands.study import Study
 from .commands.train import Train
+from .compile_cache import keep_compiled
 
 Command = (
     Annotated[Import, tyro.conf.subcommand("import")]
@@ -21,13 +24,17 @@ Command = (
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Diagnose, tyro.conf.subcommand("diagnose")]
+    | Annotated[Study, tyro.conf.subcommand("study")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
 
 _DESCRIPTION = """Learned stochastic dynamics and control for underwater vehicles.
 
 The usual order: `import` a log (or `generate` one), `train` a model on it, `evaluate` the model on
-data it has not seen, `run` a mission with it. `demo` does all of this on a log that comes along.
+data it has not seen, `run` a mission with it. `diagnose` names what a simulation gets wrong,
+`study` compares the methods of training on simulated data, `demo` goes the whole way from a log
+that comes along to a dive.
 `spinndrift COMMAND --help` explains each."""
 
 
@@ -40,6 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     command = tyro.cli(Command, args=given, prog="spinndrift", description=_DESCRIPTION)
     import jax
 
+    keep_compiled()
     jax.config.update("jax_enable_x64", True)
     # Small programs then run in line: a call from a diagram costs 10 µs instead of up to 40.
     jax.config.update("jax_cpu_enable_async_dispatch", False)

@@ -22,8 +22,14 @@ class Train:
     """Recording (.nc), log (.tlog, .BIN) or CSV folder."""
     out: Path = Path("runs/train")
     """Folder for model.spinn, metrics.csv, evaluation.csv, report.html."""
+    method: str | None = None
+    """Method of training by name: fdm-geodesic, fdm-chordal, moments (each also with +mse), pinn;
+    baselines in position and Euler angles: euclidean-fdm, euclidean-moments,
+    euclidean-distance-aware, euclidean-unconstrained. By default what `--config` says, else
+    fdm-geodesic+mse."""
     config: Path | None = None
-    """Training settings (YAML); the run's own config.yaml shows all of them with their defaults."""
+    """Training settings (YAML); the run's own config.yaml shows all of them with their defaults.
+    With `--method` they are laid over the method's, and may not contradict what makes it."""
     vehicle: str | None = None
     """Preset name or YAML file to start from; by default what the data name."""
     steps: int | None = None
@@ -39,11 +45,15 @@ class Train:
         from ...models.vehicle import load_vehicle
         from ...systems.mavlink.logs import load_data
         from ...training.config import TrainingConfig
+        from ...training.methods import method_config
         from ..learning import learn
         from ..learning_report import add_data, add_evaluation, add_training
         from ..pages import Page
 
-        config = TrainingConfig() if self.config is None else load(TrainingConfig, self.config)
+        if self.method is not None:
+            config = method_config(self.method, self.config)
+        else:
+            config = TrainingConfig() if self.config is None else load(TrainingConfig, self.config)
         changes = {"steps": self.steps, "seed": self.seed}
         config = replace(config, **{k: v for k, v in changes.items() if v is not None})
         if (self.out / "checkpoint.npz").exists() and not self.resume:

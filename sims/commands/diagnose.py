@@ -1,0 +1,67 @@
+"""`spinndrift diagnose`: what a simulation gets wrong, by name."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+from ...models.errors import UserError
+from ..progress import console, progress_bar
+
+
+@dataclass(frozen=True)
+class Diagnose:
+    """Compare measured data with the simulation you believe, and name the causes of differences.
+
+    Writes into the folder `--out`: `diagnosis.json`, `report.html`, and `extended/model.spinn`, a
+    model with the causes in it that other commands take as any other.
+    """
+
+    data: Positional[Path]
+    """Recording (.nc), CSV folder or log (.tlog, .BIN)."""
+    vehicle: str | None = None
+    """Preset name or YAML file; by default what the data name."""
+    model: Path | None = None
+    """Model file (.spinn) to believe instead of the preset."""
+    alpha: float = 0.01
+    """Rate of false alarms over all names together."""
+    refit: Literal["none", "scales", "linear"] = "none"
+    """Coefficients that are fitted before any cause is named."""
+    out: Path = Path("diagnosis")
+    """Folder to write."""
+
+    def run(self) -> None:
+        """Load, diagnose, write."""
+        import json
+
+        from ...models.checkpoint import load_model, save_model
+        from ...models.vehicle import load_vehicle
+        from ...systems.mavlink.logs import load_data
+        from ...training.diagnosis.diagnose import DiagnoseConfig, diagnose
+        from ...training.diagnosis.result import schema
+        from ..diagnosis_report import diagnosis_page
+
+        if self.out.exists() and not self.out.is_dir():
+            raise UserError(f"--out {self.out}: is a file; name a folder")
+        config = DiagnoseConfig(alpha=self.alpha, refit=self.refit)
+        with progress_bar(f"reading {self.data.name}") as update:
+            recording = load_data(self.data, vehicle=self.vehicle, progress=update)
+        base = None if self.model is None else load_model(self.model, dtype=float)[0]
+        vehicle = load_vehicle(self.vehicle or recording.vehicle or "bluerov2_heavy")
+        with progress_bar("diagnosing") as update:
+            finding = diagnose(recording, vehicle, base, config, update)
+        finding.diagnosis.save(self.out / "diagnosis.json")
+        (self.out / "diagnosis.schema.json").write_text(json.dumps(schema(), indent=2) + "\n")
+        save_model(
+            self.out / "extended" / "model.spinn",
+            finding.extended,
+            {"vehicle": vehicle.name, "source": str(self.data), "dt": recording.dt},
+        )
+        diagnosis_page(finding, f"Diagnosis of {self.data.name}").write(self.out / "report.html")
+        shown = console()
+        shown.print(finding.diagnosis.sentence)
+        for cause in finding.diagnosis.causes:
+            values = ", ".join(f"{k} {v.value:.4g} {v.unit}" for k, v in cause.parameters.items())
+            shown.print(f"  {cause.name} ({cause.where}): {values}")
+        shown.print(f"wrote {self.out}")

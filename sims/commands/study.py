@@ -1,0 +1,81 @@
+"""`spinndrift study`: the paper's simulation study, rerun."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from ...models.errors import UserError
+from ..progress import console, progress_bar
+
+
+@dataclass(frozen=True)
+class Study:
+    """Train every method on simulated data of a known law, compare what they learned with it.
+
+    Each run (method, seed) has its folder under `--out` and is done once: the same command goes on
+    where it was interrupted, and more seeds or methods are added to what is there. In the end
+    report.html, ablation.md, figures and tables are written from all runs found.
+    """
+
+    name: Annotated[Positional[Literal["ablation"]], arg(metavar="ablation")] = "ablation"
+    """The study: `ablation`, the paper's simulation experiments."""
+    regime: tuple[Literal["rich", "sparse"], ...] = ("rich", "sparse")
+    """Data to learn from: `rich` (one maneuver, 100 trajectories), `sparse` (ten maneuvers,
+    20 trajectories each)."""
+    seeds: int = 5
+    """Number of seeds; each has data and training of its own."""
+    methods: tuple[str, ...] = ()
+    """Methods to train, by name; by default all."""
+    scale: Literal["full", "small", "tiny"] = "full"
+    """How much of everything: `full` as in the paper, `small` for a look, `tiny` for a test."""
+    config: Path | None = None
+    """Settings of the study (YAML) in place of `--scale`; `study.yaml` in `--out` shows all."""
+    out: Path = Path("runs/ablation")
+    """Folder of all runs, tables and pages."""
+    workers: int = 0
+    """Worker processes on this machine; 0 runs all in this one."""
+    cluster: str | None = None
+    """Address of a Dask scheduler (tcp://host:port) whose workers see `--out` too."""
+    together: int = 1
+    """Seeds that one task trains."""
+    docs: Path | None = None
+    """Markdown file to write the verdicts into as well, such as docs/ablation.md."""
+    render_only: Annotated[
+        bool, FlagCreatePairsOff, arg(help="Run nothing, write tables and pages anew.")
+    ] = False
+
+    def run(self) -> None:
+        """Train, judge, tell."""
+        from ...models.config import load
+        from ...training.methods import METHODS
+        from ..study.config import StudyConfig, scaled
+        from ..study.pages import render
+        from ..study.run import run_study
+        from ..study.task import make_tasks
+
+        if self.docs is not None and self.docs.suffix != ".md":
+            raise UserError(f"--docs {self.docs}: end the name in .md")
+        shown = console()
+        failed = []
+        if not self.render_only:
+            study = scaled(self.scale) if self.config is None else load(StudyConfig, self.config)
+            tasks = make_tasks(
+                self.regime, self.methods or tuple(METHODS), self.seeds, self.together
+            )
+            with progress_bar("study") as update:
+                failed = run_study(
+                    study, tasks, self.out, update, cluster=self.cluster, workers=self.workers
+                )
+        for one in failed:
+            shown.print(f"{one.task} was given up: {one.reason}")
+        with progress_bar("writing tables and pages"):
+            rows = render(self.out, self.docs)
+        successes = sum(row["success"] for row in rows)
+        shown.print(f"{successes} of {len(rows)} runs succeeded")
+        shown.print(f"wrote {self.out / 'table.csv'}; open {self.out / 'report.html'}")
+        if failed:
+            raise UserError(
+                f"{len(failed)} tasks were given up (see above); the same command tries them again"
+            )

@@ -1,0 +1,38 @@
+"""Compiled programs kept on disk, so that the second run of a command starts at once."""
+
+import hashlib
+import platform
+from pathlib import Path
+
+import jax
+from platformdirs import user_cache_path
+
+_LARGEST = 2**30  # bytes; what was used longest ago goes first
+
+
+def keep_compiled(folder: Path | None = None) -> None:
+    """Let JAX keep what it compiles in `folder`, by default the user's cache folder.
+
+    A folder chosen before (`JAX_COMPILATION_CACHE_DIR`) stays. A bounded size makes JAX take a file
+    lock around every read and write, so that processes may share it.
+    """
+    if compiled_folder() is not None:
+        return
+    base = user_cache_path("spinndrift") / "jax" if folder is None else folder
+    jax.config.update("jax_compilation_cache_dir", str(base / f"{jax.__version__}-{_processor()}"))
+    jax.config.update("jax_compilation_cache_max_size", _LARGEST)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+def compiled_folder() -> str | None:
+    """The folder where JAX keeps compiled programs, if one was chosen."""
+    return jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _processor() -> str:
+    """A short name of this processor: compiled code may use what another one lacks."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else [platform.processor()]
+    told = next((line for line in lines if line.startswith(("flags", "Features"))), lines[0])
+    model = next((line for line in lines if line.startswith("model name")), "")
+    return hashlib.sha256(f"{platform.machine()}{model}{told}".encode()).hexdigest()[:12]

@@ -1,0 +1,166 @@
+"""Figures of a diagnosis: what is wrong, which name explains it, what naming it wins."""
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from ..training.diagnosis.diagnose import Finding, Look
+from ..training.diagnosis.result import Diagnosis
+from .figures import FLOWN, INK, PLANNED, QUIET, legend, panels, styled
+
+_TWIST = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+_BINS = 12
+
+
+@styled
+def names_figure(finding: Finding, most: int = 14) -> Figure:
+    """Held-out gain of the best names tried alone, and the line that noise stays below."""
+    order = sorted(finding.fits.items(), key=lambda item: -item[1].heldout_gain)[:most][::-1]
+    named = {(c.name, c.where) for c in finding.diagnosis.causes}
+    figure, axes = panels(1, 1, 0.6 + 0.26 * len(order))
+    ax = axes[0, 0]
+    gains = [max(fit.heldout_gain, 0.1) for _, fit in order]
+    colors = [FLOWN if h in named else QUIET for h, _ in order]
+    ax.barh(range(len(order)), gains, color=colors, height=0.7)
+    ax.set_yticks(range(len(order)), [f"{n.replace('_', ' ')} · {w}" for (n, w), _ in order])
+    ax.axvline(finding.diagnosis.threshold, color=PLANNED, lw=1.2, ls="--")
+    ax.set_xscale("log")
+    ax.set_xlim(left=0.1)
+    ax.set_xlabel("nats won on scenarios left out (dashed: what noise alone can win)")
+    ax.set_title("Every name tried alone: the best ones")
+    return figure
+
+
+@styled
+def residual_figure(finding: Finding) -> Figure:
+    """Variance and autocorrelation of the innovations by axis: belief and explained."""
+    figure, axes = panels(1, 2, 2.9)
+    x = np.arange(12)
+    labels = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
+    w = finding.data.weight
+    for k, (look, name, color) in enumerate(
+        ((finding.base, "belief", PLANNED), (finding.final, "with the causes", FLOWN))
+    ):
+        z = look.z * w[:, None]
+        variance = (z**2).sum(axis=(0, 2)) / w.sum()
+        memory = (z[1:] * z[:-1]).sum(axis=(0, 2)) / np.maximum((z**2).sum(axis=(0, 2)), 1e-300)
+        for ax, values in zip(axes[0], (variance, memory), strict=True):
+            ax.bar(x + 0.38 * (k - 0.5), values, 0.36, color=color, label=name)
+    axes[0, 0].axhline(1, color=INK, lw=1, ls="--")
+    axes[0, 0].set_title("Variance against the noise's (1)")
+    axes[0, 1].set_title("Correlation at one step (0)")
+    for ax in axes[0]:
+        ax.set_xticks(x, labels, rotation=45)
+    legend(axes[0, 1])
+    return figure
+
+
+def _variables(finding: Finding) -> dict[str, Float[np.ndarray, "N R"]]:
+    d = finding.data
+    qw, qx, qy, qz = (d.X[:-1, i] for i in range(4))
+    N, R = d.weight.shape
+    found = {n: d.V[:-1, i] for i, n in enumerate(("u", "v", "w", "p", "q", "r"))}
+    found["heading"] = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2))
+    found |= {"east": d.X[:-1, 4], "north": d.X[:-1, 5], "height": d.X[:-1, 6]}
+    found["voltage"] = d.voltage
+    found["effort"] = np.abs(d.u).sum(axis=1)
+    found["time"] = np.broadcast_to(np.arange(N)[:, None] * d.dt, (N, R))
+    return found
+
+
+def error_map(
+    look: Look, variables: dict[str, np.ndarray], weight: np.ndarray
+) -> Float[np.ndarray, "6 k"]:
+    """Nats by axis and variable: ½ Σ n m² of means m in bins of equal counts, less the bins.
+
+    White innovations give about zero; what depends on a variable gives much.
+    """
+    exists = weight > 0
+    found = np.zeros((6, len(variables)))
+    for k, values in enumerate(variables.values()):
+        own = values[exists]
+        edges = np.unique(np.quantile(own, np.linspace(0, 1, _BINS + 1)))
+        if len(edges) < 3:
+            continue
+        bins = np.clip(np.searchsorted(edges, own, side="right") - 1, 0, len(edges) - 2)
+        counts = np.bincount(bins, minlength=len(edges) - 1)
+        for i in range(6):
+            z = look.z[:, 6 + i][exists]
+            sums = np.bincount(bins, weights=z, minlength=len(counts))
+            nats = (sums**2 / np.maximum(counts, 1)).sum() / 2 - len(counts) / 2
+            found[i, k] = max(float(nats), 0.0)
+    return found
+
+
+@styled
+def map_figure(finding: Finding) -> Figure:
+    """Where the error lives: axis against state and input, belief and explained."""
+    variables = _variables(finding)
+    figure, axes = panels(1, 2, 3.1, sharey=True)
+    maps = [error_map(k, variables, finding.data.weight) for k in (finding.base, finding.final)]
+    top = max(10.0, float(np.max(maps[0])))
+    images = []
+    for ax, values, title in zip(axes[0], maps, ("Belief", "With the causes"), strict=True):
+        image = ax.imshow(np.log10(1 + values), vmin=0, vmax=np.log10(1 + top), cmap="PuBu")
+        images.append(image)
+        ax.set_aspect("auto")
+        ax.set_xticks(range(len(variables)), list(variables), rotation=60)
+        ax.set_yticks(range(6), _TWIST)
+        ax.grid(visible=False)
+        ax.set_title(title)
+    bar = figure.colorbar(images[0], ax=axes[0].tolist(), shrink=0.9)
+    ticks = [t for t in range(8) if t <= np.log10(1 + top)]
+    bar.set_ticks(ticks, labels=[f"{10**t:g}" for t in ticks])
+    bar.set_label("nats")
+    return figure
+
+
+@styled
+def horizon_figure(diagnosis: Diagnosis) -> Figure:
+    """Errors of simulations against their horizon, on scenarios left out, with 95 % intervals."""
+    figure, axes = panels(1, 3, 2.7)
+    titles = ("position / m", "rotation / rad", "velocity / (m/s)")
+    colors = {"base": PLANNED, "extended": FLOWN}
+    for name, gain in diagnosis.gain.items():
+        tables = (gain.position_rmse, gain.rotation_rmse, gain.velocity_rmse)
+        for ax, table, title in zip(axes[0], tables, titles, strict=True):
+            h = [float(k) for k in table]
+            value = [v.value for v in table.values()]
+            low, high = np.array([v.interval95 for v in table.values()]).T
+            ax.fill_between(h, low, high, color=colors[name], alpha=0.16, lw=0)
+            ax.plot(h, value, "o-", ms=3.5, color=colors[name], label=name)
+            ax.set_title(title)
+            ax.set_xlabel("horizon / s")
+            ax.set_ylim(bottom=0)
+    legend(axes[0, 2])
+    return figure
+
+
+@styled
+def innovations_figure(finding: Finding) -> Figure:
+    """Mean innovation over time in the scenario that the belief explains worst."""
+    d = finding.data
+    score = (finding.base.z**2).sum(axis=(0, 1))
+    worst = int(np.argmax([score[d.scenario == s].mean() for s in range(len(d.names))]))
+    own = d.scenario == worst
+    figure, axes = panels(2, 3, 3.9, sharex=True, sharey=True)
+    t = np.arange(len(d.u)) * d.dt
+    n = np.sqrt(own.sum())
+    for i, ax in enumerate(axes.flat):
+        ax.axhspan(-2, 2, color=QUIET, alpha=0.15, lw=0)
+        for look, name, color in (
+            (finding.base, "belief", PLANNED),
+            (finding.final, "with the causes", FLOWN),
+        ):
+            ax.plot(t, look.z[:, 6 + i][:, own].sum(axis=1) / n, color=color, lw=0.9, label=name)
+        ax.set_title(_TWIST[i])
+    for ax in axes[-1]:
+        ax.set_xlabel("t / s")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("standard errors")
+    figure.suptitle(
+        f"Mean innovation of {int(own.sum())} runs of '{d.names[worst]}'; grey: what noise does",
+        fontsize=9.5, x=0.01, ha="left",
+    )  # fmt: skip
+    legend(axes[0, 2])
+    return figure

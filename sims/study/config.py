@@ -1,0 +1,189 @@
+"""What a study consists of: a true vehicle, a belief to start from, regimes of data, sizes."""
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal
+
+from ...models.checks import Vector6, check_numbers, require
+from ...models.errors import UserError
+from ...training.config import TrainingConfig
+from ...training.generate import GenerateConfig
+from ...training.law_metrics import GroundMetric
+from ...training.maneuvers import MANEUVERS
+
+Regime = Literal["rich", "sparse"]
+Scale = Literal["full", "small", "tiny"]
+REGIMES: tuple[Regime, ...] = ("rich", "sparse")
+
+
+@dataclass(frozen=True)
+class TruthConfig:
+    """The law to be learned: a preset with a constant diagonal diffusion b (N√s, N·m√s).
+
+    With the default b and efforts every scenario's law stays within the logarithm's domain about
+    its mean for ten seconds, as the paper's geodesic kernel asks for.
+    """
+
+    vehicle: str = "bluerov2_heavy"
+    diffusion: Vector6 = (1.0, 1.0, 1.0, 0.05, 0.05, 0.05)
+    substeps: int = 10
+    """Integration steps a sample."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+        require(min(self.diffusion) > 0, self, "diffusion", "give six positive numbers")
+        require(self.substeps >= 1, self, "substeps", "give at least 1")
+
+
+@dataclass(frozen=True)
+class RegimeConfig:
+    """The trajectories that a model learns from; all start at rest and upright."""
+
+    maneuvers: tuple[str, ...] = tuple(MANEUVERS)
+    trajectories: int = 20
+    """Trajectories of each maneuver."""
+    duration: float = 10.0
+    """Seconds of each, and of the motions that laws are compared over."""
+    rate: float = 20.0
+    """Samples a second."""
+    effort: float = 0.3
+    """Share of the largest wrench in each maneuver's direction."""
+
+    def generate_config(self, truth: TruthConfig, seed: int) -> GenerateConfig:
+        """The simulation of one seed's trajectories."""
+        return GenerateConfig(
+            maneuvers=self.maneuvers,
+            trajectories=self.trajectories,
+            duration=self.duration,
+            rate=self.rate,
+            substeps=truth.substeps,
+            effort=self.effort,
+            diffusion=truth.diffusion,
+            seed=seed,
+        )
+
+
+@dataclass(frozen=True)
+class SizeConfig:
+    """What a scaled-down study changes in every method's training; null leaves the method's own."""
+
+    steps: int | None = None
+    batch: int | None = None
+    samples: int | None = None
+    """Predicted motions of each window, where the objective has them."""
+    width: int | None = None
+    depth: int | None = None
+    pretrain_steps: int | None = None
+    drift_iterations: int | None = None
+    length_s: float | None = None
+    """Seconds of each window."""
+    stride_s: float | None = None
+
+    def apply(self, config: TrainingConfig, seed: int) -> TrainingConfig:
+        """A method's settings at this size."""
+        steps = config.steps if self.steps is None else self.steps
+        drift = config.drift
+        if self.length_s is not None:
+            drift = replace(drift, length_s=min(drift.length_s, self.length_s))
+        return replace(
+            config,
+            objective=_changed(config.objective, {"samples": self.samples}),
+            model=_changed(config.model, {"width": self.width, "depth": self.depth}),
+            windows=_changed(
+                config.windows, {"length_s": self.length_s, "stride_s": self.stride_s}
+            ),
+            pretrain=_changed(config.pretrain, {"steps": self.pretrain_steps}),
+            drift=_changed(drift, {"iterations": self.drift_iterations}),
+            steps=steps,
+            batch=config.batch if self.batch is None else self.batch,
+            warm_up=min(config.warm_up, steps // 4),
+            validate_every=min(config.validate_every, max(1, steps // 4)),
+            checkpoint_every=min(config.checkpoint_every, max(1, steps // 4)),
+            seed=seed,
+        )
+
+
+def _changed(part: Any, values: dict[str, Any]) -> Any:
+    """The dataclass `part` with those of the values that it has and that are not None."""
+    known = {field.name for field in fields(part)}
+    return replace(part, **{k: v for k, v in values.items() if v is not None and k in known})
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """How learned laws are compared with the true one."""
+
+    samples: int = 350
+    """Motions a scenario, from the true and from the learned law."""
+    times: int = 50
+    """Evenly spaced times of the horizon at which laws are compared."""
+    metric: GroundMetric = field(default_factory=GroundMetric)
+    shown: tuple[str, ...] = ("surge-forward", "surge-yaw-left", "surge-sway-heave")
+    """Scenarios whose laws are drawn (those that the regime has)."""
+    shown_samples: int = 750
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+        require(self.samples >= 20, self, "samples", "give at least 20")
+        for name in ("times", "shown_samples"):
+            require(getattr(self, name) >= 1, self, name, "give at least 1")
+
+
+@dataclass(frozen=True)
+class StudyConfig:
+    """All settings of an ablation study but which part of it is to be run."""
+
+    truth: TruthConfig = field(default_factory=TruthConfig)
+    belief: str = "bluerov2_heavy_ng"
+    """The preset (or YAML file) that networks are pre-trained to; not the true one."""
+    rich: RegimeConfig = field(
+        default_factory=lambda: RegimeConfig(maneuvers=("surge-forward",), trajectories=100)
+    )
+    sparse: RegimeConfig = field(default_factory=RegimeConfig)
+    size: SizeConfig = field(default_factory=SizeConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    validation: float = 0.15
+    """Share of the trajectories that choose a run's best step; none of them is learned from."""
+
+    def __post_init__(self) -> None:
+        require(0 < self.validation < 1, self, "validation", "give a fraction between 0 and 1")
+        for name in REGIMES:
+            for maneuver in self.regime(name).maneuvers:
+                if maneuver not in MANEUVERS:
+                    raise UserError(
+                        f"StudyConfig.{name}.maneuvers: '{maneuver}' is unknown; take some of "
+                        f"{', '.join(MANEUVERS)}"
+                    )
+            self.regime(name).generate_config(self.truth, 0)
+
+    def regime(self, name: Regime) -> RegimeConfig:
+        """The data of a regime."""
+        return self.rich if name == "rich" else self.sparse
+
+
+def scaled(scale: Scale) -> StudyConfig:
+    """The study in full, in small (a look in minutes a run) or tiny (a test of its machinery)."""
+    if scale == "full":
+        return StudyConfig()
+    if scale == "small":
+        return StudyConfig(
+            size=SizeConfig(steps=150, samples=8),
+            evaluation=EvaluationConfig(samples=120, times=20, shown_samples=200),
+        )
+    tiny = RegimeConfig(("surge-forward", "yaw-left"), trajectories=4, duration=2.0, rate=10.0)
+    return StudyConfig(
+        truth=TruthConfig(substeps=5),
+        rich=replace(tiny, maneuvers=("surge-forward",), trajectories=6),
+        sparse=tiny,
+        size=SizeConfig(
+            steps=8,
+            batch=4,
+            samples=4,
+            width=4,
+            depth=1,
+            pretrain_steps=0,
+            drift_iterations=0,
+            length_s=1.0,
+            stride_s=0.5,
+        ),
+        evaluation=EvaluationConfig(samples=39, times=4, shown_samples=39),
+    )

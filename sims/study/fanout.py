@@ -1,0 +1,123 @@
+"""Tasks one after the other in this process, or spread by Dask over processes and machines."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from ...models.errors import UserError
+from ..progress import Update
+
+T = TypeVar("T")
+_ATTEMPTS = 3
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A task that raised, or whose worker died, each time it was tried."""
+
+    task: Any
+    reason: str
+
+
+def run_here(
+    work: Callable[[T, Update], None], tasks: Sequence[T], progress: Update
+) -> list[Failed]:
+    """Run tasks in this process, one by one; an error in one is kept and the next one begun.
+
+    Raises:
+        UserError: bad input; the tasks after it are not tried.
+    """
+    failed = []
+    for number, task in enumerate(tasks):
+
+        def report(fraction: float, remark: str = "", /, done: int = number) -> None:
+            progress((done + fraction) / len(tasks), remark)
+
+        report(0.0, str(task))
+        try:
+            work(task, report)
+        except UserError:
+            raise
+        except Exception as error:  # noqa: BLE001 - whatever it was, other tasks don't depend on it
+            failed.append(Failed(task, f"{type(error).__name__}: {error}"))
+    return failed
+
+
+def run_on_cluster(
+    work: Callable[[T], None],
+    tasks: Sequence[T],
+    progress: Update,
+    *,
+    address: str | None = None,
+    workers: int = 2,
+) -> list[Failed]:
+    """Run tasks on the scheduler at `address`, or on `workers` new processes of this machine.
+
+    A task whose worker dies is begun anew on another one, as often as the scheduler allows, three
+    times over; other tasks don't notice. `work` must be importable on the workers, which must see
+    the same files as this process.
+
+    Raises:
+        UserError: Dask is not installed, nothing answers at the address, or bad input.
+    """
+    with _client(address, workers) as client:
+        from distributed import as_completed
+        from distributed.scheduler import KilledWorker
+
+        left = {client.submit(work, task, pure=False): (task, 1) for task in tasks}
+        finished, failed = 0, []
+        try:
+            waiting = as_completed(list(left), loop=client.loop)
+            for future in waiting:
+                task, attempt = left.pop(future)
+                error = future.exception()
+                if isinstance(error, KilledWorker) and attempt < _ATTEMPTS:
+                    again = client.submit(work, task, pure=False)
+                    left[again] = (task, attempt + 1)
+                    waiting.add(again)
+                    continue
+                if isinstance(error, UserError):
+                    raise error
+                if error is not None:
+                    failed.append(Failed(task, f"{type(error).__name__}: {error}"))
+                finished += 1
+                progress(finished / len(tasks), f"{finished} of {len(tasks)} tasks, last: {task}")
+        finally:
+            client.cancel(list(left))
+    return failed
+
+
+@contextmanager
+def _client(address: str | None, workers: int) -> Iterator[Any]:
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise UserError(
+            "a cluster needs Dask, which is not installed: pip install 'spinndrift[cluster]'"
+        ) from error
+    if address is not None:
+        try:
+            client = Client(address, timeout=5, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            raise UserError(
+                f"--cluster {address}: no scheduler answers there; start one with "
+                "`dask scheduler` and give the address that it prints"
+            ) from error
+        with client:
+            yield client
+        return
+    if workers < 1:
+        raise UserError(f"workers is {workers}: give at least 1")
+    with (
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            memory_limit=0,
+            host="127.0.0.1",
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client

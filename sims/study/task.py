@@ -1,0 +1,165 @@
+"""One task of a study and its folders: whole or absent, never run twice at once, resumable."""
+
+import fcntl
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...models import config as yaml
+from ...models.errors import UserError
+from ...models.files import atomic_path
+from ...training.config import TrainingConfig
+from ...training.methods import METHODS, method_config
+from .config import REGIMES, Regime, StudyConfig
+
+
+@dataclass(frozen=True)
+class Task:
+    """The runs of one method on one regime for some seeds, which one worker does together."""
+
+    regime: Regime
+    method: str
+    seeds: tuple[int, ...]
+
+    def __str__(self) -> str:
+        seeds = ", ".join(map(str, self.seeds))
+        return f"{self.regime} {self.method} seed{'s' * (len(self.seeds) > 1)} {seeds}"
+
+    def runs(self, study: StudyConfig, out: str | os.PathLike[str]) -> "list[RunPath]":
+        """Where its runs lie.
+
+        Raises:
+            UserError: there is no such method.
+        """
+        settings = (RunSettings.of(study, self.regime, self.method, s) for s in self.seeds)
+        return [RunPath(out, one) for one in settings]
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What decides the numbers of one run; written beside them as settings.yaml."""
+
+    regime: Regime
+    method: str
+    seed: int
+    study: StudyConfig
+    training: TrainingConfig
+
+    @classmethod
+    def of(cls, study: StudyConfig, regime: Regime, method: str, seed: int) -> "RunSettings":
+        """The settings of a run.
+
+        Raises:
+            UserError: there is no such method.
+        """
+        return cls(regime, method, seed, study, study.size.apply(method_config(method), seed))
+
+
+def make_tasks(
+    regimes: tuple[Regime, ...], methods: tuple[str, ...], seeds: int, together: int = 1
+) -> list[Task]:
+    """All tasks of a study, `together` seeds each; one seed of every method comes first.
+
+    Raises:
+        UserError: a method or regime is unknown, or a number is below 1.
+    """
+    for name in methods:
+        if name not in METHODS:
+            raise UserError(f"method '{name}' is unknown; take some of {', '.join(METHODS)}")
+    for name in regimes:
+        if name not in REGIMES:
+            raise UserError(f"regime '{name}' is unknown; take some of {', '.join(REGIMES)}")
+    if seeds < 1 or together < 1:
+        raise UserError(f"seeds is {seeds}: give at least 1")
+    starts = range(0, seeds, together)
+    return [
+        Task(regime, method, tuple(range(first, min(first + together, seeds))))
+        for first in starts
+        for regime in dict.fromkeys(regimes)
+        for method in dict.fromkeys(methods)
+    ]
+
+
+class RunPath:
+    """Where one run lies: `final` once it is done, `partial` until then.
+
+    `final` holds settings.yaml, result.json, metrics.nc, motions.nc (first seed) and training/.
+    """
+
+    def __init__(self, out: str | os.PathLike[str], settings: RunSettings):
+        self.settings = settings
+        parent = Path(out) / settings.regime / settings.method
+        self.final = parent / f"seed-{settings.seed}"
+        self.partial = parent / f".seed-{settings.seed}.partial"
+        self._lock = parent / f".seed-{settings.seed}.lock"
+
+    @property
+    def done(self) -> bool:
+        """Whether all of the run is there."""
+        return (self.final / "result.json").exists()
+
+    def check(self) -> None:
+        """Refuse what other settings left here.
+
+        Raises:
+            UserError: naming the folder and the first setting that differs.
+        """
+        for folder in (self.final, self.partial):
+            path = folder / "settings.yaml"
+            if not path.exists():
+                continue
+            there, here = path.read_text("utf-8"), yaml.dump(self.settings)
+            if there != here:
+                raise UserError(
+                    f"{folder}: was made with other settings ({_difference(there, here)}); name "
+                    "another folder with --out, or remove this one"
+                )
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other processes off this run; waits while one that is alive holds it."""
+        self._lock.parent.mkdir(parents=True, exist_ok=True)
+        with self._lock.open("w") as handle:
+            fcntl.flock(handle, fcntl.LOCK_EX)  # goes with the process that took it
+            yield
+
+    def begin(self) -> Path:
+        """The folder to work in, with what an interrupted attempt left there.
+
+        Raises:
+            UserError: other settings were at work here.
+        """
+        self.check()
+        self.partial.mkdir(parents=True, exist_ok=True)
+        with atomic_path(self.partial / "settings.yaml") as path:
+            path.write_text(yaml.dump(self.settings), encoding="utf-8")
+        return self.partial
+
+    def finish(self, result: dict[str, Any]) -> None:
+        """Write result.json and give the folder its final name."""
+        with atomic_path(self.partial / "result.json") as path:
+            path.write_text(json.dumps(_plain(result), indent=2) + "\n", encoding="utf-8")
+        os.replace(self.partial, self.final)
+        self._lock.unlink(missing_ok=True)
+
+
+def _difference(there: str, here: str) -> str:
+    for old, new in zip(there.splitlines(), here.splitlines(), strict=False):
+        if old != new:
+            return f"'{old.strip()}' there, '{new.strip()}' now"
+    return "one has more of them"
+
+
+def _plain(value: Any) -> Any:
+    """JSON knows no NaN: what is not finite becomes null."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not abs(value) < float("inf"):
+        return None
+    return value

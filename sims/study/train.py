@@ -1,0 +1,196 @@
+"""The training stage of a task: every seed's data, start and fit, and whether it went well."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...models.checkpoint import load_model, save_model
+from ...models.dynamics import Dynamics
+from ...models.errors import UserError
+from ...models.vehicle import load_vehicle
+from ...training.config import TrainingConfig
+from ...training.ensemble import fit_ensemble
+from ...training.fit import Progress, TrainingResult, fit
+from ...training.generate import generate
+from ...training.guard import TrainingError, not_finite
+from ...training.start import starting_model
+from ...training.windows import Windows, make_windows
+from ..progress import Update
+from .task import RunSettings
+
+_DRIFT = 0.2  # of the time, about, for the start that fits the drift alone
+
+
+@dataclass(frozen=True)
+class Data:
+    """Windows to learn from, and of other trajectories to choose the best step by."""
+
+    learn: Windows
+    validation: Windows
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What training ended with.
+
+    Attributes:
+        model: the best one on the validation windows; None if training was given up.
+        result: what `fit` returned.
+        failure: why it was given up, or empty.
+        finite: whether it went to its end with finite parameters.
+        converged: whether it is `finite` and the loss `descended`.
+        seconds: wall time of the stage (of a resumed run, of the last attempt); runs of one batch
+            share it equally.
+    """
+
+    model: Dynamics | None
+    result: TrainingResult | None
+    failure: str
+    finite: bool
+    converged: bool
+    seconds: float
+
+
+def descended(loss: np.ndarray, refit_at: tuple[float, ...] = ()) -> bool:
+    """Whether the loss at the end is no higher than at the start, but for its own scatter.
+
+    Compared are medians of the last and of the first tenth of the steps since the last fraction
+    of `refit_at` (where bandwidths, and so the loss' scale, changed); the end may be higher by the
+    scatter (median absolute deviation) of that first tenth. Steps that were not finite don't count,
+    unless more than half of them were not.
+    """
+    first = round(max(refit_at, default=0.0) * len(loss))
+    kept = loss[first:]
+    good = kept[np.isfinite(kept)]
+    if good.size < max(2, len(kept) / 2):
+        return False
+    tenth = max(1, good.size // 10)
+    start, end = good[:tenth], good[-tenth:]
+    scatter = np.median(np.abs(start - np.median(start)))
+    return bool(np.median(end) <= np.median(start) + scatter)
+
+
+def make_data(settings: RunSettings) -> Data:
+    """One seed's simulated trajectories, as windows.
+
+    Raises:
+        UserError: they are too short or too few.
+    """
+    study, windows = settings.study, settings.training.windows
+    vehicle = load_vehicle(study.truth.vehicle)
+    config = study.regime(settings.regime).generate_config(study.truth, settings.seed)
+    learn, validation = generate(config, vehicle).split(study.validation, "run", windows.gap_s)
+
+    def cut(part, stride: float) -> Windows:
+        return make_windows(
+            part,
+            vehicle,
+            length_s=windows.length_s,
+            stride_s=stride,
+            normalise=windows.normalise,
+        )
+
+    return Data(cut(learn, windows.stride_s), cut(validation, windows.length_s))
+
+
+def train_seeds(
+    settings: Sequence[RunSettings],
+    data: Sequence[Data],
+    folders: Sequence[Path],
+    progress: Update,
+) -> list[Trained]:
+    """Train the runs of one task, several seeds in one batched program (`training.ensemble`).
+
+    Each resumes from the start and the checkpoint in its folder. Starts are made one by one.
+    """
+    belief = load_vehicle(settings[0].study.belief)
+    began, count = time.monotonic(), len(settings)
+    starts: list[Dynamics | str] = []
+    for number, (one, windows) in enumerate(zip(settings, data, strict=True)):
+
+        def started(step: int, total: int, loss: float, done: int = number) -> None:
+            progress(_DRIFT * (done + step / total) / count, "drift first")
+
+        kept = folders[number] / "start.spinn"
+        if kept.exists():
+            starts.append(load_model(kept)[0])
+            continue
+        try:
+            start = starting_model(one.training, belief, windows.learn, started)
+        except UserError as error:
+            starts.append(str(error))
+            continue
+        save_model(kept, start)
+        starts.append(start)
+
+    def stepped(step: int, total: int, loss: float) -> None:
+        progress(_DRIFT + (1 - _DRIFT) * step / total, f"loss {loss:.3g}")
+
+    good = [i for i, start in enumerate(starts) if not isinstance(start, str)]
+    fitted = _fit(
+        [(settings[i].training, starts[i], data[i], folders[i]) for i in good],
+        {"vehicle": belief.name, "substeps": settings[0].training.objective.substeps},
+        stepped,
+    )
+    ends: list[TrainingResult | str] = [start if isinstance(start, str) else "" for start in starts]
+    for i, end in zip(good, fitted, strict=True):
+        ends[i] = end
+    seconds = (time.monotonic() - began) / count
+    return [_trained(end, one.training, seconds) for end, one in zip(ends, settings, strict=True)]
+
+
+def _fit(
+    runs: Sequence[tuple[TrainingConfig, Any, Data, Path]],
+    metadata: dict[str, Any],
+    progress: Progress,
+) -> list[TrainingResult | str]:
+    """Results, or why training was given up: that a method can't be trained is a finding."""
+    if len(runs) > 1:
+        configs, models, data, folders = zip(*runs, strict=True)
+        try:
+            found = fit_ensemble(
+                configs[0],
+                [config.seed for config in configs],
+                models,
+                [d.learn for d in data],
+                folders,
+                validation=[d.validation for d in data],
+                progress=progress,
+                resume=True,
+                metadata=metadata,
+            )
+            return [str(end) if isinstance(end, TrainingError) else end for end in found]
+        except UserError:
+            pass  # one of them is at fault: the runs one by one tell which
+    ends: list[TrainingResult | str] = []
+    for config, model, windows, folder in runs:
+        try:
+            ends.append(
+                fit(
+                    config,
+                    model,
+                    windows.learn,
+                    folder,
+                    validation=windows.validation,
+                    progress=progress,
+                    resume=True,
+                    metadata=metadata,
+                )
+            )
+        except (TrainingError, UserError) as error:
+            if str(error).startswith(str(folder)):  # files at fault, not the method
+                raise
+            ends.append(str(error))
+    return ends
+
+
+def _trained(end: TrainingResult | str, config: TrainingConfig, seconds: float) -> Trained:
+    if isinstance(end, str):
+        return Trained(None, None, end, False, False, seconds)
+    finite = not not_finite(end.last)
+    converged = finite and descended(end.metrics["loss"], config.refit_at)
+    return Trained(end.model, end, "", finite, converged, seconds)

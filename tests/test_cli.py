@@ -26,7 +26,7 @@ TINY = TrainingConfig(
     model=SpinnConfig(width=4, depth=1, constant_mass=True),
     windows=WindowConfig(length_s=0.5, stride_s=0.5, gap_s=0.25),
     pretrain=PretrainConfig(steps=2, batch=8),
-    drift=DriftConfig(steps=2, batch=2, length_s=0.25),
+    drift=DriftConfig(iterations=1, pieces=4, length_s=0.25),
     steps=4,
     batch=2,
     validate_every=2,

@@ -118,7 +118,7 @@ def test_measurement_jacobians_agree_with_finite_differences():
     np.testing.assert_allclose(H, jnp.stack(columns, axis=1), atol=1e-8)
 
 
-@pytest.mark.parametrize("size", [1, 3])
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 6])
 def test_small_inverse(size):
     A = RNG.standard_normal((size, size))
     S = A @ A.T + np.eye(size)
@@ -135,28 +135,37 @@ def random_covariance() -> Array:
     return jnp.asarray(A @ A.T + 1e-4 * np.eye(es.ERRORS))
 
 
-def test_an_update_is_the_conditional_gaussian():
+@pytest.mark.parametrize("used", [(True, True, True), (True, False, False), (False, True, True)])
+def test_an_update_is_the_conditional_gaussian(used):
     """Without the move to the corrected pose: P − P Hᵀ S⁻¹ H P, and δ = P Hᵀ S⁻¹ r."""
     x, P = navigation(), random_covariance()
-    found = _innovations(x)[0]
-    found = found._replace(residual=jnp.array([0.01, -0.02, 0.005]))
-    after, P_after, nis, accepted = measurement.update(x, P, found, jnp.inf)
-    S = found.H @ P @ found.H.T + found.R
-    K = P @ found.H.T @ jnp.linalg.inv(S)
-    np.testing.assert_allclose(es.error(x, after), K @ found.residual, atol=1e-9)
-    np.testing.assert_allclose(nis, found.residual @ jnp.linalg.solve(S, found.residual), rtol=1e-9)
-    assert accepted
-    delta = K @ found.residual
-    gamma = jnp.eye(18).at[:6, :6].add(-se3.ad(delta[:6]) / 2)
+    found = [
+        each._replace(residual=jnp.asarray(0.02 * RNG.standard_normal(each.residual.size)))
+        for each in _innovations(x)
+    ]
+    gates = [np.inf] * 3
+    after, P_after, nis, accepted = measurement.update(x, P, found, jnp.array(used), gates)
+    np.testing.assert_array_equal(accepted, used)
+    r, H, R = measurement.together([f for f, use in zip(found, used, strict=True) if use])
+    S = H @ P @ H.T + R
+    K = P @ H.T @ jnp.linalg.inv(S)
+    np.testing.assert_allclose(es.error(x, after), K @ r, atol=1e-9)
+    gamma = jnp.eye(18).at[:6, :6].add(-se3.ad((K @ r)[:6]) / 2)
     np.testing.assert_allclose(P_after, gamma @ (P - K @ S @ K.T) @ gamma.T, atol=1e-11)
+    for each, score in zip(found, nis, strict=True):
+        S = each.H @ P @ each.H.T + each.R
+        expected = each.residual @ jnp.linalg.solve(S, each.residual)
+        np.testing.assert_allclose(score, expected, rtol=1e-9)
 
 
 def test_a_gated_reading_changes_nothing():
     x, P = navigation(), random_covariance()
-    found = _innovations(x)[1]._replace(residual=jnp.array([1e3]))
-    after, P_after, nis, accepted = measurement.update(x, P, found, chi2.ppf(0.999, 1))
-    assert not accepted
-    assert nis > 1e3
+    found = _innovations(x)
+    found[1] = found[1]._replace(residual=jnp.array([1e3]))
+    used, gates = jnp.array([False, True, False]), [float(chi2.ppf(0.999, 1))] * 3
+    after, P_after, nis, accepted = measurement.update(x, P, found, used, gates)
+    assert not np.any(accepted)
+    assert nis[1] > 1e3
     np.testing.assert_allclose(P_after, P, rtol=1e-12)
     np.testing.assert_allclose(es.error(x, after), np.zeros(18), atol=1e-15)
 

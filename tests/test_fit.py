@@ -17,14 +17,15 @@ from spinndrift.models.errors import UserError
 from spinndrift.models.spinn import Spinn, SpinnConfig
 from spinndrift.models.vehicle import load_vehicle
 from spinndrift.training.config import PretrainConfig, TrainingConfig
-from spinndrift.training.fit import _Run, fit
+from spinndrift.training.fit import Run, fit
+from spinndrift.training.groups import batch_indices
 from spinndrift.training.guard import TrainingError
 from spinndrift.training.losses import Fdm, Mse
 from spinndrift.training.objective import Batch
 from spinndrift.training.pretrain import coefficient_error, pretrain
 from spinndrift.training.run_folder import RunFolder
 from spinndrift.training.start import estimate_diffusion
-from spinndrift.training.step import TrainStep, batch_indices, learning_rate, partition
+from spinndrift.training.step import TrainStep, learning_rate, partition
 
 TRUTH = Diagonal.of(mass=10.0, drag=8.0, diffusion=1.0)
 START = Diagonal.of(mass=14.0, drag=5.0, diffusion=2.0)
@@ -142,6 +143,7 @@ def test_a_resumed_run_ends_with_the_same_bits(windows, validation, tmp_path):
     assert_same_bits(again.last, whole.last)
 
 
+@pytest.mark.slow
 def test_a_kill_costs_the_steps_since_the_checkpoint_alone(windows, tmp_path):
     whole = fit(CONFIG, START, windows)
 
@@ -211,7 +213,7 @@ def test_a_poisoned_window_is_named_left_out_and_survived(windows, tmp_path):
 
 
 def test_a_poisoned_parameter_is_named_and_restored(windows):
-    run = _Run(CONFIG, START, windows, None, None, None)
+    run = Run(CONFIG, START, windows, None, None, None)
 
     def poison(step, total, loss):
         if step == 8:
@@ -250,7 +252,7 @@ def test_it_gives_up_after_so_many_bad_steps_and_keeps_the_good_state(windows, t
     spoilt.V[0, :, ::3] = 1e30
     with pytest.raises(TrainingError, match=r"runs away.*more than 3 bad steps.*checkpoint.npz"):
         fit(CONFIG, START, spoilt, tmp_path)
-    run = _Run(CONFIG, START, spoilt, tmp_path, None, None)
+    run = Run(CONFIG, START, spoilt, tmp_path, None, None)
     RunFolder(tmp_path).load(run.state, CONFIG, run.data_id)
     assert_same_bits(run.state.params, partition(START)[0])
 

@@ -65,6 +65,7 @@ def settle(planner, X, V, count, seed=0, bias=NONE):
 # ------------------------------------------------------------------------------------- optimality
 
 FREE = MppiConfig(
+    substeps=1,  # the steps of the optimum it is compared with
     horizon=40,
     dt=0.1,
     sequences=400,
@@ -148,7 +149,7 @@ def test_weights_sum_to_one_and_the_plan_is_the_models_own_path():
     assert plan.paths.shape == (40, 3, 7)
     assert plan.valid
     X, V = rollout(
-        planner.dynamics, plan.X_WB[:, 0], plan.V_WB_B[:, 0], plan.F_Bo_B.T, 0.1, remat=False
+        planner.dynamics, plan.X_WB[:, 0], plan.V_WB_B[:, 0], plan.F_Bo_B.T, 0.1, substeps=2
     )
     np.testing.assert_allclose(plan.X_WB[:, 1:].T, X, atol=2e-5)
     np.testing.assert_allclose(plan.V_WB_B[:, 1:].T, V, atol=2e-5)
@@ -190,10 +191,10 @@ def test_process_noise_makes_the_plan_keep_its_distance():
 def test_noise_paths_have_the_brownian_mean_and_spread():
     dW = among()._process_noise(jax.random.key(4))
     assert dW is not None
-    assert dW.shape == (40, 6, 8)
-    W = jnp.cumsum(dW, axis=0)
+    assert dW.shape == (40, 2, 6, 8)
+    W = jnp.cumsum(dW.reshape(80, 6, 8), axis=0)
     np.testing.assert_allclose(jnp.mean(W, axis=2), 0, atol=1e-6)
-    times = 0.1 * np.arange(1, 41)
+    times = 0.05 * np.arange(1, 81)
     np.testing.assert_allclose(jnp.mean(W**2, axis=(0, 2)), np.mean(times), rtol=1e-5)
 
 

@@ -1,0 +1,143 @@
+"""Structure that no name of the diagnosis explains. `parameters` tell what it is nevertheless."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from .effect import AXES, Effect, Latent, Moment, Parameters, around, one_axis, sign, value
+from .rotations import cross
+
+
+@dataclass(frozen=True)
+class _Unknown(Effect):
+    cause = "unknown"
+    kind: ClassVar[str] = ""
+    variables: ClassVar[tuple[str, ...]] = ()
+    """What a description has to mention, in the columns' names."""
+
+
+@dataclass(frozen=True)
+class Swirl(_Unknown):
+    """An eddy stands in the water: v_θ = V (r/a) exp(½ (1 − r²/a²)), largest at r = a.
+
+    A Taylor vortex; the water's acceleration is centripetal, −v_θ²/r.
+    """
+
+    kind = "swirl"
+    variables = ("x", "y")
+    x: float = 0.0
+    y: float = 0.0
+    speed: float = 0.0
+    radius: float = 0.8
+
+    @property
+    def where(self) -> str:
+        return "W"
+
+    def parameters(self) -> Parameters:
+        told = {"x": value(self.x, "m"), "y": value(self.y, "m")}
+        return told | {"speed": value(self.speed, "m/s"), "radius": value(self.radius, "m")}
+
+    def neutral(self) -> bool:
+        return self.speed == 0
+
+    def flow(self, p: np.ndarray, t: float, latent: Latent) -> tuple[np.ndarray, np.ndarray]:
+        dx, dy = p[0] - self.x, p[1] - self.y
+        turn = self.speed / self.radius * np.exp(0.5 * (1 - (dx**2 + dy**2) / self.radius**2))
+        zero = np.zeros_like(dx)
+        return np.stack([-turn * dy, turn * dx, zero]), np.stack(
+            [-(turn**2) * dx, -(turn**2) * dy, zero]
+        )
+
+    @classmethod
+    def drawn(cls, rng: Any, size: float) -> "Swirl":
+        x, y = rng.uniform(-0.5, 0.5, 2)
+        return cls(float(x), float(y), sign(rng) * around(rng, 0.2 * size), rng.uniform(0.6, 1.0))
+
+
+@dataclass(frozen=True)
+class Appendage(_Unknown):
+    """A mass on a spring hangs on the hull: s̈ + 2ζΩṡ + Ω²s = −n·a, force m (2ζΩṡ + Ω²s) n at r.
+
+    a is the acceleration of Bo in the inertial frame, v̇ + ω × v; n is an axis of B.
+    """
+
+    kind = "appendage"
+    states = 2
+    axis: int = 1
+    mass: float = 0.0
+    frequency: float = 1.0
+    damping: float = 0.03
+    arm: tuple[float, float, float] = (0.2, 0.0, 0.0)
+
+    @property
+    def where(self) -> str:
+        return AXES[self.axis]
+
+    def parameters(self) -> Parameters:
+        told = {"mass": value(self.mass, "kg"), "frequency": value(self.frequency, "Hz")}
+        return told | {"damping": value(self.damping, "1")}
+
+    def neutral(self) -> bool:
+        return self.mass == 0
+
+    def _pull(self, state: np.ndarray) -> np.ndarray:
+        omega = 2 * np.pi * self.frequency
+        return 2 * self.damping * omega * state[1] + omega**2 * state[0]
+
+    def wrench(self, now: Moment, latent: Latent, state: np.ndarray) -> np.ndarray:
+        force = one_axis(self.axis, self.mass * self._pull(state))[:3]
+        return np.concatenate([force, cross(np.array(self.arm)[:, None] + 0 * force, force)])
+
+    def derivative(
+        self, now: Moment, nu_dot: np.ndarray, latent: Latent, state: np.ndarray
+    ) -> np.ndarray:
+        a = nu_dot[:3] + cross(now.nu[3:], now.nu[:3])
+        return np.stack([state[1], -self._pull(state) - a[self.axis]])
+
+    @classmethod
+    def drawn(cls, rng: Any, size: float) -> "Appendage":
+        return cls(int(rng.integers(3)), around(rng, 1.0 * size), rng.uniform(0.7, 1.5))
+
+
+@dataclass(frozen=True)
+class Memory(_Unknown):
+    """The flow remembers: F = −∫ K(s) ν_r(t − s) ds, K = A e^(−s/T) cos Ωs (Cummins 1962).
+
+    The integral is the real part of a state with ż = (−1/T + iΩ) z + ν_r.
+    """
+
+    kind = "memory"
+    states = 2
+    axis: int = 1
+    strength: float = 0.0
+    decay: float = 1.5
+    frequency: float = 0.35
+
+    @property
+    def where(self) -> str:
+        return AXES[self.axis]
+
+    def parameters(self) -> Parameters:
+        unit = "N/m" if self.axis < 3 else "N m/rad"
+        told = {"strength": value(self.strength, unit), "decay": value(self.decay, "s")}
+        return told | {"frequency": value(self.frequency, "Hz")}
+
+    def neutral(self) -> bool:
+        return self.strength == 0
+
+    def wrench(self, now: Moment, latent: Latent, state: np.ndarray) -> np.ndarray:
+        return one_axis(self.axis, -self.strength * state[0])
+
+    def derivative(
+        self, now: Moment, nu_dot: np.ndarray, latent: Latent, state: np.ndarray
+    ) -> np.ndarray:
+        omega = 2 * np.pi * self.frequency
+        decay = -state / self.decay
+        return decay + np.stack([-omega * state[1] + now.nu_r[self.axis], omega * state[0]])
+
+    @classmethod
+    def drawn(cls, rng: Any, size: float) -> "Memory":
+        axis = int(rng.choice([0, 1, 2, 5]))
+        return cls(axis, around(rng, (40.0 if axis < 3 else 1.5) * size), rng.uniform(1.0, 2.0))

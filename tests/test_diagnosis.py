@@ -1,0 +1,264 @@
+"""The diagnosis: innovations are white on a null, causes are named first, the JSON is as told."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hidden.draw import draw
+from hidden.scenarios import Plan
+
+from spinndrift.models.effects import KINDS, Library
+from spinndrift.models.recording_csv import read_csv
+from spinndrift.models.vehicle import load_vehicle
+from spinndrift.training.diagnosis.diagnose import DiagnoseConfig, Diagnoser
+from spinndrift.training.diagnosis.hypotheses import Fit
+from spinndrift.training.diagnosis.innovations import predict
+from spinndrift.training.diagnosis.laws import find_laws
+from spinndrift.training.diagnosis.naming import admissible, choose
+from spinndrift.training.diagnosis.noise import Noise, make_filter
+from spinndrift.training.diagnosis.result import Diagnosis, schema
+
+VEHICLE = load_vehicle("bluerov2_heavy")
+PLAN = Plan(runs=2, seconds=6.0)
+
+
+def recorded(tmp_path, seed, kind="single", **options):
+    case = draw(seed, kind, plan=PLAN, **options)
+    case.write(tmp_path / "data")
+    return case, read_csv(tmp_path / "data")
+
+
+def test_the_filter_whitens_a_linear_system():
+    """Innovations from gain-one errors are those of the Kalman filter: unit, white Gaussians."""
+    rng = np.random.default_rng(0)
+    J = np.zeros((12, 12))
+    J[:6, 6:] = np.eye(6)
+    J[6:, 6:] = -1.5 * np.eye(6)
+    dt, N, R = 0.05, 60, 2000
+    import scipy.linalg
+
+    A = scipy.linalg.expm(J * dt)
+    noise = Noise(np.full(12, 0.02), np.full(6, 1.0))
+    kalman = make_filter(noise, A, np.eye(6) / 10, dt, N)
+    from spinndrift.training.diagnosis.noise import process_covariance
+
+    root = np.linalg.cholesky(process_covariance(A, np.eye(6) / 10, noise.diffusion, dt))
+    x = np.zeros((12, R))
+    y = [x + 0.02 * rng.standard_normal((12, R))]
+    for _ in range(N):
+        x = A @ x + root @ rng.standard_normal((12, R))
+        y.append(x + 0.02 * rng.standard_normal((12, R)))
+    nu, z = np.zeros((12, R)), []
+    for n in range(N):
+        nu = y[n + 1] - A @ y[n] + A @ (kalman.keep[n] @ nu)
+        z.append(kalman.whiten[n] @ nu)
+    z = np.array(z)
+    error = 1 / np.sqrt(z.size)
+    assert np.mean(z**2) == pytest.approx(1, abs=6 * error)
+    for lag in (1, 2, 5):
+        assert np.mean(z[lag:] * z[:-lag]) == pytest.approx(0, abs=6 * error)
+    assert np.mean(z[1:, :6] * z[:-1, 6:]) == pytest.approx(0, abs=8 * error)
+
+
+@pytest.fixture(scope="module")
+def null(tmp_path_factory):
+    """Two nulls, looked at."""
+    found = []
+    for seed in (1, 2):
+        folder = tmp_path_factory.mktemp("null")
+        _, recording = recorded(folder, seed, "null")
+        diagnoser = Diagnoser(recording, VEHICLE)
+        found.append((diagnoser, diagnoser.look(diagnoser.believed)))
+    return found
+
+
+def test_noise_is_found_and_innovations_are_white_on_a_null(null):
+    """Two minutes of data: levels within what so few samples allow, whiteness to a few sigma."""
+    for diagnoser, look in null:
+        record, b = look.noise.record, look.noise.diffusion
+        np.testing.assert_allclose(record[:3], 0.005, rtol=0.2)
+        np.testing.assert_allclose(record[3:6], 0.0017, rtol=0.2)
+        np.testing.assert_allclose(b[:3], 1.0, rtol=0.25)
+        np.testing.assert_allclose(b[3:], 0.03, rtol=0.25)
+        z = look.z
+        n = np.sqrt(z.shape[0] * z.shape[2])
+        assert np.abs(z.mean(axis=(0, 2)) * n).max() < 4.5
+        acf = (z[1:] * z[:-1]).mean(axis=(0, 2)) / (z**2).mean(axis=(0, 2))
+        assert np.abs(acf).max() * n < 6
+        assert diagnoser.data.steps == 20 * 120
+
+
+def test_nulls_are_adequate(null):
+    """No name wins what noise can't: the calibrated threshold holds on data of another maker."""
+    for diagnoser, look in null:
+        library = diagnoser.library
+        sets = {h: library.at(*h) for h in library.hypotheses(single=False)}
+        threshold = look.evidence.null_quantile(
+            list(sets.values()), [], 0.01, np.random.default_rng(0)
+        )
+        assert 3 < threshold < 20
+        fits = {h: look.evidence.fit(s) for h, s in sets.items()}
+        assert choose(library, diagnoser.believed, fits, threshold, 0.01) is None
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["thruster_dead_zone", "thruster_gain", "net_buoyancy", "current_steady", "dvl_misalignment"],
+)
+def test_causes_are_named_first(tmp_path, name):
+    case, recording = recorded(tmp_path, 11, names=(name,))
+    diagnoser = Diagnoser(recording, VEHICLE)
+    look = diagnoser.look(diagnoser.believed)
+    library = diagnoser.library
+    fits = {h: look.evidence.fit(library.at(*h)) for h in library.hypotheses(single=False)}
+    choice = choose(library, diagnoser.believed, fits, 8.0, 0.01)
+    assert choice is not None
+    assert choice.hypothesis[0] == name
+    del case
+
+
+def test_a_lag_is_named_measured_and_extended(tmp_path):
+    """The whole way: name, value inside three standard errors, gain, JSON as its schema says."""
+    case, recording = recorded(tmp_path, 5, names=("thruster_lag",))
+    seen = []
+    finding = Diagnoser(
+        recording, VEHICLE, config=DiagnoseConfig(most=1, horizon=2.0),
+        progress=lambda fraction, remark: seen.append(fraction),
+    ).run()  # fmt: skip
+    d = finding.diagnosis
+    assert d.verdict == "explained"
+    assert d.causes[0].name == "thruster_lag"
+    truth = case.answer()["causes"][0]
+    found = d.causes[0].parameters["time_constant"]
+    if truth["where"] == "all":
+        error = (found.interval95[1] - found.interval95[0]) / 3.92
+        assert abs(found.value - truth["parameters"]["time_constant"]["value"]) < 3 * error + 1e-3
+    assert (
+        d.gain["extended"].position_rmse["1"].value < 0.9 * d.gain["base"].position_rmse["1"].value
+    )
+    assert [effect.name for effect in finding.extended.effects] == ["thruster_lag"]
+    assert seen == sorted(seen)
+    assert seen[-1] == 1
+    check(json.loads(d.as_json()), schema())
+
+
+def check(value, rule, root=None):
+    """As much of JSON Schema as ours uses."""
+    root = rule if root is None else root
+    if "$ref" in rule:
+        rule = root["$defs"][rule["$ref"].split("/")[-1]]
+    if "enum" in rule:
+        assert value in rule["enum"]
+        return
+    kinds = {"object": dict, "array": list, "string": str, "integer": int, "number": (int, float),
+             "null": type(None)}  # fmt: skip
+    names = rule["type"] if isinstance(rule["type"], list) else [rule["type"]]
+    assert any(isinstance(value, kinds[name]) for name in names), (value, rule)
+    if isinstance(value, dict):
+        known = rule.get("properties", {})
+        assert set(rule.get("required", ())) <= set(value)
+        for key, part in value.items():
+            if known:
+                assert key in known
+                check(part, known[key], root)
+            else:
+                check(part, rule["additionalProperties"], root)
+    if isinstance(value, list):
+        assert rule.get("minItems", 0) <= len(value) <= rule.get("maxItems", len(value))
+        for part in value:
+            check(part, rule["items"], root)
+
+
+def test_the_schema_is_that_of_the_dataclasses():
+    told = schema(Diagnosis)
+    assert told["$ref"] == "#/$defs/Diagnosis"
+    assert told["$defs"]["Diagnosis"]["properties"]["verdict"]["enum"][0] == "adequate"
+    assert set(told["$defs"]) >= {"Cause", "Value", "ModelGain", "DataSummary"}
+
+
+LIBRARY = Library(
+    [KINDS[n].neutral() for n in ("thruster_lag", "thrust_curve", "thrust_scale", "clock_offset")]
+)
+
+
+def fit(name, where, gain, values, spread=0.0, seed=0):
+    heldout = np.full(40, gain / 40)
+    heldout += spread * np.random.default_rng(seed).standard_normal(40)
+    heldout += (gain - heldout.sum()) / 40
+    rows = LIBRARY.at(name, where)
+    return Fit(tuple(rows), np.array(values), {}, np.full(len(rows), 1e-3), gain, heldout, 1e-9)
+
+
+def test_names_follow_the_rules():
+    zero = np.zeros(LIBRARY.size)
+    scale, curve = ("thrust_scale", "all"), ("thrust_curve", "all")
+    fits = {scale: fit(*scale, 500.0, [0.1]), curve: fit(*curve, 505.0, [0.01, 0.1])}
+    choice = choose(LIBRARY, zero, fits, 8.0, 0.01)
+    assert choice is not None
+    assert choice.hypothesis == scale, "the simpler name wins unless beaten by 10 nats"
+    fits[curve] = fit(*curve, 600.0, [0.05, 0.1])
+    choice = choose(LIBRARY, zero, fits, 8.0, 0.01)
+    assert choice is not None
+    assert choice.hypothesis == curve
+    lag, clock = ("thruster_lag", "all"), ("clock_offset", "twist")
+    assert not admissible(LIBRARY, zero, fit(*lag, 50.0, [-0.05])), "a negative lag is vetoed"
+    fits = {clock: fit(*clock, 50.0, [0.01])}
+    assert choose(LIBRARY, zero, fits, 8.0, 0.01) is not None
+    assert choose(LIBRARY, zero, fits, 8.0, 0.01, {"thruster_lag": 1e4}) is None, "an echo"
+    tied = {lag: fit(*lag, 52.0, [0.1], 1.0), clock: fit(*clock, 50.0, [0.01], 1.0, seed=1)}
+    choice = choose(LIBRARY, zero, tied, 8.0, 0.01)
+    assert choice is not None
+    assert choice.ties == (clock,)
+
+
+def test_laws_of_what_is_left():
+    """White noise has no law; blows, speed dependence and slow parts are told apart."""
+    rng = np.random.default_rng(4)
+    N, R = 120, 60
+    weight, fold = np.ones((N, R)), np.repeat(np.arange(6), R // 6)
+    speed = np.abs(rng.normal(0.4, 0.2, (N, R)))
+
+    def best(change):
+        z = rng.standard_normal((N, 12, R))
+        z[:, 7] = change(z[:, 7])
+        return find_laws(z, speed, weight, fold, 0.05)[0]
+
+    assert best(lambda z: z).heldout_gain < 6
+    blows = best(lambda z: z * np.where(rng.random(z.shape) < 0.01, 8.0, 1.0))
+    assert (blows.name, blows.where) == ("disturbance_impacts", "sway")
+    grows = best(lambda z: z * np.sqrt(1 + 4 * speed**2))
+    assert (grows.name, grows.where) == ("disturbance_state_dependence", "sway")
+    slow = np.zeros((N, R))
+    for n in range(1, N):
+        slow[n] = 0.96 * slow[n - 1] + 0.12 * rng.standard_normal(R)
+    coloured = best(lambda z: z + slow)
+    assert (coloured.name, coloured.where) == ("disturbance_colour", "sway")
+
+
+def test_predictions_without_noise_have_no_error():
+    """Data of the model itself: one-step errors are those of the integrator alone."""
+    from spinndrift.models.effects import Extended
+    from spinndrift.training.diagnosis.data import Data
+
+    rng = np.random.default_rng(7)
+    model = Extended.create(VEHICLE.dynamics(), (), VEHICLE.thrusters())
+    N, R, fine = 120, 20, 8
+    u = np.repeat(rng.normal(0, 2, (N // 10, 8, R)), 10, axis=0)
+    X0 = np.zeros((7, R))
+    X0[0] = 1
+    commands = jnp.asarray(np.repeat(u, fine, axis=0))
+    X, V = model.rollout(jnp.asarray(X0), jnp.zeros((6, R)), commands, 0.05 / fine)
+    X = np.concatenate([X0[None], np.asarray(X)[fine - 1 :: fine]])
+    V = np.concatenate([np.zeros((1, 6, R)), np.asarray(V)[fine - 1 :: fine]])
+    data = Data(
+        X, V, u, np.ones((N, R)), np.ones((N, R)), np.zeros(R, int), np.arange(R), ("one",),
+        0.05, "thruster_force", True,
+    )  # fmt: skip
+    library = Library([KINDS["net_buoyancy"].neutral()])
+    p = predict(model, library, np.zeros(library.size), data)
+    # a hundredth of what the process noise of one step makes of the twist
+    step = np.repeat([1.0, 0.03], 3) * np.sqrt(0.05) / np.diag(np.asarray(model.inertia().matrix))
+    error = np.abs(np.asarray(p.error)).max(axis=(0, 2))
+    assert np.all(error[6:] < 0.01 * step)
+    assert np.all(error[:6] < 0.01 * step * 0.05)

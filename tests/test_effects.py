@@ -1,0 +1,329 @@
+"""Every effect is absent at zero, and acts as its own equation says."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from spinndrift.models import se3
+from spinndrift.models.checkpoint import load_model, save_model
+from spinndrift.models.effects import KINDS, Extended, Library
+from spinndrift.models.effects.drag import COUPLINGS
+from spinndrift.models.effects.predict import advance
+from spinndrift.models.effects.thrust import REFERENCE
+from spinndrift.models.errors import UserError
+from spinndrift.models.integrate import rollout
+from spinndrift.models.vehicle import load_vehicle
+
+VEHICLE = load_vehicle("bluerov2_heavy")
+BASE = VEHICLE.dynamics()
+THRUSTERS = VEHICLE.thrusters()
+RNG = np.random.default_rng(3)
+N = 5
+
+
+def states(seed=0, n=N):
+    rng = np.random.default_rng(seed)
+    X = se3.exp(jnp.asarray(0.5 * rng.normal(size=(6, n))))
+    V = jnp.asarray(0.5 * rng.normal(size=(6, n)))
+    u = jnp.asarray(8 * rng.normal(size=(8, n)))
+    return X.at[6].add(-4), V, u
+
+
+X, V, U = states()
+UP = np.asarray(se3.rotate_inverse(X, jnp.broadcast_to(jnp.eye(3)[2][:, None], (3, N))))
+PLAIN = Extended.create(BASE, (), THRUSTERS)
+PLANT = PLAIN.plant
+
+
+def cross(a, b):
+    return np.cross(np.asarray(a), np.asarray(b), axis=0)
+
+
+@pytest.fixture(scope="module")
+def everything():
+    return Library([kind.neutral() for kind in KINDS.values()])
+
+
+def test_all_effects_at_zero_change_nothing(everything):
+    """The program that holds every effect equals the base to the last bits."""
+    model = PLAIN.with_effects(everything.filled(jnp.zeros(everything.size)))
+
+    @jax.jit
+    def both(model, X, V, u):
+        a = advance(model, model.inertia(), model.remember(u), *model.infer(X, V, V), u, 0.05, 2)
+        b = advance(PLAIN, PLAIN.inertia(), (), X, V, u, 0.05, 2)
+        return model.observe(*a[1:]), b[1:3]
+
+    with_all, without = both(model, X, V, U)
+    for a, b in zip(with_all, without, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=2e-15)
+    np.testing.assert_allclose(
+        model.acceleration(X, V, PLAIN.allocate(U)), PLAIN.acceleration(X, V, PLAIN.allocate(U)),
+        atol=1e-13,
+    )  # fmt: skip
+
+
+def test_prediction_is_of_fourth_order_and_agrees_with_the_integrator():
+    """Halving the step divides the error by 16; small Lie-Euler steps come to the same motion."""
+    inertia = PLAIN.inertia()
+
+    def end(substeps):
+        X1, V1 = X, V
+        for _ in range(substeps):
+            X1, V1 = once(X1, V1, 0.2 / substeps)
+        return np.concatenate([X1, V1])
+
+    @jax.jit
+    def once(X, V, h):
+        return advance(PLAIN, inertia, (), X, V, U, h)[1:3]
+
+    fine = end(64)
+    errors = [np.abs(end(s) - fine).max() for s in (4, 8)]
+    assert 10 < errors[0] / errors[1] < 28
+    F = PLAIN.allocate(U)
+    steps = []
+    for count in (400, 800):
+        F_T = jnp.broadcast_to(F, (count, 6, N))
+        steps.append(np.concatenate([a[-1] for a in rollout(BASE, X, V, F_T, 0.2 / count)]))
+    np.testing.assert_allclose(2 * steps[1] - steps[0], fine, atol=2e-5)
+
+
+def thrust(effect, voltage=None):
+    relative = jnp.ones((1, N)) if voltage is None else voltage
+    return np.asarray(effect.thrust(U, V, relative, PLANT))
+
+
+def test_static_thrust_effects():
+    u = np.asarray(U)
+    of = {name: KINDS[name].of for name in KINDS}
+    lost = np.sign(u) * np.maximum(np.abs(u) - 1.2, 0)
+    np.testing.assert_allclose(thrust(of["thruster_dead_zone"](width=1.2)), lost)
+    curve = thrust(of["thrust_curve"](exponent=0.1, gain=-0.2))
+    np.testing.assert_allclose(
+        curve, 0.8 * REFERENCE * np.sign(u) * np.abs(u / REFERENCE) ** 1.1, rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        thrust(of["thrust_asymmetry"](reverse_gain=-0.2)), np.where(u < 0, 0.8 * u, u)
+    )
+    weak = thrust(of["thruster_gain"]("3", gain=-2.0))
+    np.testing.assert_allclose(weak, u * np.where(np.arange(8) == 2, -1, 1)[:, None])
+    np.testing.assert_allclose(thrust(of["thrust_scale"](scale=0.1)), 1.1 * u)
+    sagged = thrust(of["voltage_sag"](exponent=1.5), jnp.full((1, N), 0.8))
+    np.testing.assert_allclose(sagged, u * 0.8**1.5)
+    load = np.sum(np.abs(u) ** 1.5, axis=0) / (8 * 40**1.5)
+    np.testing.assert_allclose(thrust(of["load_droop"](loss=0.5)), u * (1 - 0.5 * load))
+    lever = cross(PLANT.positions, PLANT.directions)
+    along = np.asarray(PLANT.directions).T @ np.asarray(V[:3]) + lever.T @ np.asarray(V[3:])
+    np.testing.assert_allclose(
+        thrust(of["inflow_thrust_loss"](loss=0.3)), u - 0.3 * np.sqrt(np.abs(u)) * along
+    )
+
+
+def test_lag_and_delay_are_exact_over_held_commands():
+    """Means over substeps of the exact responses to a staircase."""
+    commands = jnp.asarray(np.random.default_rng(1).normal(size=(6, 8)))
+    dt, tau, delay = 0.05, 0.08, 0.07
+    lag = KINDS["thruster_lag"].of(time_constant=tau)
+    late = KINDS["actuation_delay"].of(delay=delay)
+    fine = 5000
+    t = (np.arange(6 * fine) + 0.5) * dt / fine
+    staircase = np.repeat(np.asarray(commands), fine, axis=0)
+    shifted = np.asarray(commands)[np.clip(np.floor((t - delay) / dt), 0, None).astype(int)]
+    follows = np.empty_like(staircase)
+    f = np.asarray(commands[0])
+    for i, u in enumerate(staircase):
+        middle = u + (f - u) * np.exp(-dt / fine / tau / 2)
+        f = u + (f - u) * np.exp(-dt / fine / tau)
+        follows[i] = middle
+    for effect, expected in ((lag, follows), (late, shifted)):
+        memory = effect.initial(commands[0])
+        for n in range(6):
+            level = jnp.broadcast_to(commands[n][:, None], (8, 2))
+            memory, means = effect.actuate(memory, level, jnp.asarray(dt))
+            pieces = expected[n * fine : (n + 1) * fine].reshape(2, -1, 8).mean(axis=1)
+            np.testing.assert_allclose(means.T, pieces, atol=2e-6)
+
+
+def wrench(name, where=None, **parameters):
+    return np.asarray(KINDS[name].of(where, **parameters).wrench(X, V, PLANT))
+
+
+def on(axis, values):
+    full = np.zeros((6, N))
+    full[axis] = values
+    return full
+
+
+def test_wrenches_of_body_and_environment():
+    v = np.asarray(V)
+    np.testing.assert_allclose(wrench("net_buoyancy", force=2.0)[:3], 2 * UP)
+    shift = wrench("centre_of_gravity", "y", shift=0.01)
+    lever = np.array([0, 0.01, 0])[:, None]
+    np.testing.assert_allclose(shift[3:], cross(lever, -VEHICLE.weight * UP), atol=1e-12)
+    load = wrench("payload", mass=0.0, weight=3.0, moment_x=0.6, moment_y=-0.3)
+    np.testing.assert_allclose(load[:3], -3 * UP, atol=1e-12)
+    lever = np.array([0.2, -0.1, 0])[:, None]
+    np.testing.assert_allclose(load[3:], cross(lever, -3 * UP), atol=1e-12)
+    np.testing.assert_allclose(wrench("linear_drag", "heave", change=3.0), on(2, -3 * v[2]))
+    np.testing.assert_allclose(
+        wrench("quadratic_drag", "yaw", change=3.0), on(5, -3 * np.abs(v[5]) * v[5])
+    )
+    np.testing.assert_allclose(
+        wrench("drag_asymmetry", "surge", difference=2.0), on(0, -2 * v[0] ** 2)
+    )
+    np.testing.assert_allclose(wrench("cubic_drag", "sway", coefficient=2.0), on(1, -2 * v[1] ** 3))
+    for place, i, j in COUPLINGS:
+        expected = on(i, -(2 * np.abs(v[j]) + 0.5) * v[j])
+        np.testing.assert_allclose(
+            wrench("drag_coupling", place, quadratic=2.0, linear=0.5), expected
+        )
+    np.testing.assert_allclose(
+        wrench("lift", "heave_from_surge", coefficient=4.0), on(2, 4 * v[0] ** 2)
+    )
+    munk = wrench("added_mass_coupling", "munk", change=0.5)
+    momentum = np.diag([13.5 + a for a in VEHICLE.added_mass[:3]]) @ v[:3]
+    np.testing.assert_allclose(munk[3:], 0.5 * cross(momentum, v[:3]), atol=1e-12)
+    spring = wrench("tether", stiffness=2.0, pull_east=1.0, pull_north=-3.0)
+    F_W = np.asarray(se3.rotate(X, jnp.asarray(spring[:3])))
+    p = np.asarray(X[4:])
+    np.testing.assert_allclose(F_W, [1 - 2 * p[0], -3 - 2 * p[1], 0 * p[0]], atol=1e-12)
+    near = wrench("proximity", "surface", force=5.0, drag=0.0)
+    np.testing.assert_allclose(near[:3], 5 * np.exp(p[2] / 0.3) * UP, atol=1e-12)
+
+
+def test_added_mass_acts_as_a_heavier_base():
+    """An extended model and a base built with the larger mass accelerate alike."""
+    from dataclasses import replace
+
+    added = list(VEHICLE.added_mass)
+    added[1] += 4.0
+    heavier = replace(VEHICLE, added_mass=tuple(added)).dynamics()
+    model = PLAIN.with_effects((KINDS["added_mass"].of("sway", change=4.0),))
+    F = PLAIN.allocate(U)
+    np.testing.assert_allclose(
+        model.acceleration(X, V, F), heavier.acceleration(X, V, F), atol=1e-12
+    )
+    drift = model.drift(model.inertia(), X, V, U)
+    np.testing.assert_allclose(drift, heavier.acceleration(X, V, F), atol=1e-12)
+
+
+def test_a_steady_current_carries_the_vehicle_like_the_base_in_moving_water():
+    from spinndrift.models.dynamics import Flow
+
+    model = PLAIN.with_effects((KINDS["current_steady"].of(east=0.3, north=-0.2),))
+    flow = Flow(jnp.asarray([0.3, -0.2, 0.0])[:, None], jnp.zeros((3, 1)))
+    F = PLAIN.allocate(U)
+    expected = BASE.acceleration(X, V, F, flow)
+    np.testing.assert_allclose(model.drift(model.inertia(), X, V, U), expected, atol=1e-11)
+    np.testing.assert_allclose(model.acceleration(X, V, F), expected, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("name", "where", "values"),
+    [
+        ("dvl_lever_arm", "y", {"offset": 0.2}),
+        ("dvl_misalignment", "yaw", {"angle": 0.1}),
+        ("dvl_scale", None, {"scale": 0.05}),
+        ("gyro_bias", "z", {"bias": 0.02}),
+        ("heading_error", None, {"sine": 0.02, "cosine": -0.01, "offset": 0.2}),
+        ("clock_offset", "twist", {"delay": 0.02}),
+        ("clock_offset", "pose", {"delay": -0.02}),
+    ],
+)
+def test_measurement_effects_invert(name, where, values):
+    effect = KINDS[name].of(where, **values)
+    A = 0.3 * V[::-1]
+    X1, V1 = effect.measure(X, V, A)
+    assert np.abs(np.asarray(X1 - X)).max() + np.abs(np.asarray(V1 - V)).max() > 1e-4
+    X2, V2 = effect.unmeasure(X1, V1, A)
+    np.testing.assert_allclose(X2, X, atol=1e-5)
+    np.testing.assert_allclose(V2, V, atol=1e-12)
+
+
+def test_measurements_by_hand():
+    none = jnp.zeros_like(V)
+    _, far = KINDS["dvl_lever_arm"].of("x", offset=0.3).measure(X, V, none)
+    arm = np.array([0.3, 0, 0])[:, None]
+    np.testing.assert_allclose(far[:3], np.asarray(V[:3]) + cross(V[3:], arm))
+    _, turned = KINDS["dvl_misalignment"].of("yaw", angle=0.3).measure(X, V, none)
+    np.testing.assert_allclose(turned[0], np.cos(0.3) * V[0] + np.sin(0.3) * V[1])
+    off, _ = KINDS["heading_error"].of(sine=0.1).measure(X, V, none)
+    np.testing.assert_allclose(se3.yaw(off), se3.yaw(X) + 0.1 * np.sin(se3.yaw(X)), atol=1e-12)
+
+
+def test_noise_laws_have_their_moments():
+    n = 20000
+    w = jnp.asarray(np.random.default_rng(5).normal(size=(12, n)))
+    colour = KINDS["disturbance_colour"].of("heave", std=2.0, time_constant=1.0)
+    a = colour.advance(jnp.zeros((6, n)), w[:6], jnp.asarray(50.0))
+    b = colour.advance(a, w[6:], jnp.asarray(0.5))
+    assert np.std(a[2]) == pytest.approx(2.0, rel=0.02)
+    assert np.mean(a[2] * b[2]) == pytest.approx(4 * np.exp(-0.5), rel=0.05)
+    assert np.abs(np.delete(np.asarray(a), 2, axis=0)).max() == 0
+    blows = KINDS["disturbance_impacts"].of("surge", impulse=0.5, rate=2.0)
+    F = blows.advance(jnp.zeros((6, n)), w, jnp.asarray(0.05))
+    assert np.mean(F[0] != 0) == pytest.approx(0.1, rel=0.1)
+    assert np.std(0.05 * F[0][F[0] != 0]) == pytest.approx(0.5, rel=0.05)
+    grows = KINDS["disturbance_state_dependence"].of("yaw", growth=3.0)
+    b = grows.diffusion(V, jnp.ones((6, 1)))
+    np.testing.assert_allclose(b[5], np.sqrt(1 + 3 * np.sum(np.asarray(V[:3]) ** 2, axis=0)))
+
+
+def test_columns_of_values_are_hypotheses():
+    """A batch of values gives what each gives alone: one program serves all hypotheses."""
+    names = ("quadratic_drag", "added_mass", "thruster_dead_zone")
+    everything = Library([KINDS[name].neutral() for name in names])
+    theta = np.zeros((everything.size, 3, 1))
+    theta[everything.index("quadratic_drag", "surge", "change"), 1] = 30
+    theta[everything.index("added_mass", "yaw", "change"), 2] = 0.3
+    model = PLAIN.with_effects(everything.filled(jnp.asarray(theta)))
+    together = model.drift(model.inertia(), X[:, None], V[:, None], U[:, None])
+    for column in range(3):
+        alone = PLAIN.with_effects(everything.used(theta[:, column, 0]))
+        np.testing.assert_allclose(
+            together[:, column], alone.drift(alone.inertia(), X, V, U), atol=1e-10
+        )
+
+
+def test_an_extended_model_is_stored_and_rolls_out(tmp_path):
+    effects = (
+        KINDS["thruster_lag"].of(time_constant=0.1),
+        KINDS["disturbance_colour"].of("yaw", std=0.2, time_constant=2.0),
+        KINDS["net_buoyancy"].of(force=1.0),
+    )
+    model = Extended.create(VEHICLE.dynamics(np.ones(6)), effects, THRUSTERS)
+    save_model(tmp_path / "model.spinn", model, {"vehicle": "bluerov2_heavy"})
+    again, _ = load_model(tmp_path / "model.spinn")
+    assert isinstance(again, Extended)
+    w = jnp.asarray(np.random.default_rng(2).normal(size=(20, model.noise_size, N)))
+    U_T = jnp.broadcast_to(U[None], (20, 8, N))
+    first, second = (m.rollout(X, V, U_T, 0.05, w) for m in (model, again))
+    np.testing.assert_array_equal(first[0], second[0])
+    quiet = model.rollout(X, V, U_T, 0.05)
+    assert np.abs(np.asarray(quiet[1] - first[1])).max() > 1e-3
+    assert np.isfinite(np.asarray(first[0])).all()
+
+
+def test_effects_by_hand_refuse_what_they_do_not_know():
+    with pytest.raises(UserError, match="take one of surge"):
+        KINDS["linear_drag"].of("up", change=1.0)
+    with pytest.raises(UserError, match="say where"):
+        KINDS["linear_drag"].of(change=1.0)
+    with pytest.raises(UserError, match="give 0 to"):
+        KINDS["thruster_lag"].of(time_constant=-1.0)
+    with pytest.raises(UserError, match="has no 'lag'"):
+        KINDS["thruster_lag"].of(lag=1.0)
+
+
+def test_further_fields_are_stored(tmp_path):
+    near = KINDS["proximity"].of("bottom", force=3.0, options={"floor": -4.5})
+    late = KINDS["actuation_delay"].of(delay=0.3, options={"steps": 30})
+    model = Extended.create(BASE, (near, late), THRUSTERS)
+    save_model(tmp_path / "model.spinn", model)
+    again, _ = load_model(tmp_path / "model.spinn")
+    assert isinstance(again, Extended)
+    np.testing.assert_array_equal(
+        again.extra_wrench(X, V), model.extra_wrench(X, V)
+    )  # the bottom lies where it was
+    assert again.remember(U)[0].shape == (240, N)

@@ -11,9 +11,9 @@ INSTALLED := .venv/.installed-$(shell printf %s "$(CURDIR)" | cksum | cut -d' ' 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-# One thread a test worker: pytest runs one worker a core.
+# One thread a test worker: pytest runs one worker a core. Level 1 compiles a third faster.
 ONE_THREAD := NPROC=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
-	XLA_FLAGS="--xla_cpu_multi_thread_eigen=false $(XLA_FLAGS)"
+	XLA_FLAGS="--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=1 $(XLA_FLAGS)"
 
 .PHONY: help
 help: ## list the targets
@@ -56,6 +56,10 @@ lint: $(INSTALLED) ## ruff (lint and format) and basedpyright
 .PHONY: unit
 unit: $(INSTALLED) ## all tests, one worker a core
 	$(ONE_THREAD) $(BIN)/python -m pytest -n auto --dist worksteal --durations 10
+
+.PHONY: slow
+slow: $(INSTALLED) ## the tests left out of `make test` for the time they take
+	$(ONE_THREAD) $(BIN)/python -m pytest -n auto -m slow
 
 # `-P` and another working folder keep the tree out; a test checks which copy was imported.
 .PHONY: smoke

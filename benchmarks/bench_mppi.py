@@ -26,10 +26,11 @@ def model(kind: str):
     return Spinn.create(config, physics, jax.random.key(0))
 
 
+@pytest.mark.parametrize("substeps", [1, 2])
 @pytest.mark.parametrize("sequences", [1000, 250])
 @pytest.mark.parametrize("kind", ["physics", "spinn", "spinn, constant mass"])
-def test_mppi_call(benchmark, kind, sequences):
-    config = MppiConfig(sequences=sequences, realisations=1000 // sequences)
+def test_mppi_call(benchmark, kind, sequences, substeps):
+    config = MppiConfig(sequences=sequences, realisations=1000 // sequences, substeps=substeps)
     planner = MppiPlanner(
         model(kind),
         ThrusterLimits.create(VEHICLE.thrusters(), fraction=config.wrench_fraction),

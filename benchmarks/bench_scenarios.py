@@ -17,9 +17,9 @@ def _as_the_command_sets_it():
 
 
 @pytest.mark.parametrize("name", ["station_keeping_calm", "station_keeping_harbour"])
-def bench_speed_without_planner(benchmark, name):
+def test_speed_without_planner(benchmark, name):
     """The clock of `simulate` leaves building and compiling out; so does the figure given."""
-    scenario = load_scenario(name, "duration: 30")
+    scenario = load_scenario(name, "duration: 60")
     speeds = []
 
     def fly():
@@ -29,7 +29,7 @@ def bench_speed_without_planner(benchmark, name):
     benchmark.extra_info["times real time"] = max(speeds)
 
 
-def bench_pylon_crossing(benchmark):
+def test_pylon_crossing(benchmark):
     """Twenty seeds of the crossing in a harbour's waves, wake and current."""
     found = {}
 

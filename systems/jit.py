@@ -1,9 +1,11 @@
 """Compiled calls from Drake events: one flat NumPy vector in, one out."""
 
+import hashlib
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import Any
+from weakref import WeakValueDictionary
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +17,28 @@ _INLINE = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 (54 µs to 14 µs for one call of the impedance law)."""
 
 
+class _Program:
+    """Compiled code, which every function of the same text shares."""
+
+    def __init__(self, lowered: Any):
+        try:
+            self.call = lowered.compile(_INLINE)
+        except jax.errors.JaxRuntimeError:  # another version's compiler without this option
+            self.call = lowered.compile()
+
+
+_PROGRAMS: WeakValueDictionary[bytes, _Program] = WeakValueDictionary()
+
+
 class VectorFunction:
     """A pure function of vectors, compiled once for its sizes and called with NumPy arrays.
 
     All arguments travel as one float64 vector and all results as one: the cost of a call is that of
     one conversion each way, some 10 µs, whatever the number of ports. What the function closes over
     (parameters, configurations) becomes constants of the compiled code. Compilation happens at the
-    first call, so that building a diagram is cheap.
+    first call, so that building a diagram is cheap; diagrams that compute the same share what one
+    of them compiled, so that many runs cost one compilation (and the memory of one: systems with
+    ports are never freed by pydrake).
     """
 
     def __init__(
@@ -55,17 +72,19 @@ class VectorFunction:
         return jnp.concatenate([result.reshape(-1) for result in results])
 
     @cached_property
-    def _compiled(self) -> Any:
+    def _program(self) -> _Program:
         size = jax.ShapeDtypeStruct((sum(self._inputs),), np.float64)
         lowered = jax.jit(self._packed).lower(size)
-        try:
-            return lowered.compile(_INLINE)
-        except jax.errors.JaxRuntimeError:  # another version's compiler without this option
-            return lowered.compile()
+        text = lowered.as_text()  # whole, with all digits of all constants
+        key = hashlib.sha256(text.encode()).digest()
+        program = _PROGRAMS.get(key)
+        if program is None:
+            program = _PROGRAMS[key] = _Program(lowered)
+        return program
 
     def flat(self, *parts: Float[np.ndarray, "_"]) -> Float[np.ndarray, "m"]:
         """Call with one array for each input and return all results in one (read-only) array."""
-        return np.asarray(self._compiled(np.concatenate(parts)))
+        return np.asarray(self._program.call(np.concatenate(parts)))
 
     def __call__(self, *parts: Float[np.ndarray, "_"]) -> list[Float[np.ndarray, "_"]]:
         """Call with one array for each input and return one array for each output."""

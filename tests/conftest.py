@@ -1,9 +1,12 @@
 """Settings that every test runs under; nothing in the library sets them."""
 
+import gc
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
 import jax
+import pytest
 
 from spinndrift.sims.compile_cache import keep_compiled
 
@@ -23,3 +26,15 @@ hypothesis.settings.register_profile(
     print_blob=True,
 )
 hypothesis.settings.load_profile("spinndrift")
+
+_MAPS = Path("/proc/self/maps")
+_MOST_MAPS = 20_000  # Linux gives a process 65530, and a compiler that gets no more crashes
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_compiled_programs() -> Iterator[None]:
+    """Forget compiled programs before their pages, several maps a kernel, use up the process's."""
+    yield
+    if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()

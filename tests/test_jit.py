@@ -36,6 +36,22 @@ def test_nothing_is_compiled_before_the_first_call():
     assert calls == [1]
 
 
+def test_equal_functions_share_one_program_and_others_don_t():
+    def scaled(factor):
+        return VectorFunction(lambda a: factor * a, [2], [2])
+
+    many = np.linspace(0, 1, 5000)
+    other = many.copy()
+    other[2500] += 1e-15
+    functions = [scaled(2.0), scaled(2.0), scaled(2.0 + 1e-15)]
+    functions += [VectorFunction(lambda a, c=c: a + jnp.sum(c), [1], [1]) for c in (many, other)]
+    for f in functions:
+        f(np.ones(2 if f in functions[:3] else 1))
+    first, twin, near, long, long_near = (f._program for f in functions)
+    assert first is twin
+    assert len({id(p) for p in (first, near, long, long_near)}) == 4
+
+
 def test_single_precision_is_refused_with_a_remedy():
     with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
         VectorFunction(lambda a: a, [1], [1])

@@ -10,11 +10,11 @@ from pydrake.systems.primitives import RandomSource
 
 from spinndrift.models.disturbances import preset
 from spinndrift.models.vehicle import load_vehicle
+from spinndrift.systems.allocation import ThrustAllocation
 from spinndrift.systems.disturbance_source import DisturbanceSource
 from spinndrift.systems.ekf import Ekf
 from spinndrift.systems.learned_plant import LearnedPlant
 from spinndrift.systems.sensor_suite import SensorSuite
-from spinndrift.systems.thruster_bank import ThrustAllocation, ThrusterBank
 
 SIMULATED = 2.0
 
@@ -30,9 +30,10 @@ def build(parts: set[str]) -> Simulator:
     """A diagram of the named parts at 100 Hz, after 0.5 s."""
     vehicle = load_vehicle("bluerov2_heavy")
     builder = DiagramBuilder()
-    plant = builder.AddNamedSystem(
-        "plant", LearnedPlant(vehicle.dynamics(np.full(6, 0.1)), X0_WB=[1, 0, 0, 0, 0, 0, -2])
-    )
+    thrusters = vehicle.thrusters() if "thrusters" in parts else None
+    dynamics = vehicle.dynamics(np.full(6, 0.1))
+    body = LearnedPlant(dynamics, X0_WB=[1, 0, 0, 0, 0, 0, -2], thrusters=thrusters)
+    plant = builder.AddNamedSystem("plant", body)
     systems = [plant]
     links = []
     if "disturbance" in parts:
@@ -48,10 +49,9 @@ def build(parts: set[str]) -> Simulator:
             ekf = builder.AddNamedSystem("ekf", Ekf(X0_WB=[1, 0, 0, 0, 0, 0, -2]))
             systems.append(ekf)
             links += [(sensors, name, ekf) for name in ("imu", "dvl", "depth", "compass")]
-    if "thrusters" in parts:
-        allocation = builder.AddNamedSystem("mix", ThrustAllocation(vehicle.thrusters()))
-        bank = builder.AddNamedSystem("bank", ThrusterBank(vehicle.thrusters()))
-        links += [(allocation, "pwm", bank), (bank, "F_Bo_B", plant)]
+    if thrusters is not None:
+        allocation = builder.AddNamedSystem("mix", ThrustAllocation(thrusters))
+        links.append((allocation, "pwm", plant))
         source = builder.AddNamedSystem(
             "command", RandomSource(RandomDistribution.kGaussian, 6, 0.02)
         )

@@ -1,5 +1,7 @@
 """The vehicle as a discrete-time system around any model of its dynamics."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -9,6 +11,8 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from ..models import integrate
 from ..models.dynamics import Dynamics, Flow
+from ..models.thruster_curves import NEUTRAL
+from ..models.thrusters import Thrusters
 from .jit import VectorFunction, value_or_none, value_or_zeros
 
 
@@ -21,6 +25,14 @@ class LearnedPlant(LeafSystem):
     over the last period, which is what an accelerometer integrates. Unconnected inputs count as
     zero. The state at time t is the output at t, before that time's update.
 
+    With `thrusters` the update at t first moves their forces over [t, t + period] towards the
+    curve's at the pulse widths `pwm` (µs) and the battery's voltage under load
+    (`Thrusters.lag_from_rest`); the body feels the mean of the forces at both ends, without a lag
+    the force at the end, on top of `F_Bo_B`. `voltage` is the battery's open-circuit voltage (V),
+    nominal while unconnected; with `pwm` unconnected the thrusters stand still. `thruster_force`
+    (N) and `voltage_loaded` (V), what remains of the voltage under load, are those of the end of
+    the last period. These four ports exist with thrusters only.
+
     .. pydrake_system::
 
         name: LearnedPlant
@@ -29,11 +41,15 @@ class LearnedPlant(LeafSystem):
         - F_disturbance_Bo_B
         - flow_W
         - noise
+        - pwm
+        - voltage
         output_ports:
         - X_WB
         - V_WB_B
         - A_WB_B
         - state
+        - thruster_force
+        - voltage_loaded
 
     """
 
@@ -44,8 +60,9 @@ class LearnedPlant(LeafSystem):
         substeps: int = 2,
         X0_WB: ArrayLike | None = None,
         V0_WB_B: ArrayLike | None = None,
+        thrusters: Thrusters | None = None,
     ):
-        """Start at pose `X0_WB` (the identity) with twist `V0_WB_B` (at rest).
+        """Start at pose `X0_WB` (the identity) with twist `V0_WB_B` (at rest), thrusters at rest.
 
         Raises:
             ValueError: `period` or `substeps` is not positive, or the start is no state.
@@ -73,29 +90,66 @@ class LearnedPlant(LeafSystem):
         self.DeclareStateOutputPort("A_WB_B", self._A)
         self.DeclareVectorOutputPort("state", 13, self._calc_state, {self.xd_ticket()})
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self._thrusters = None if thrusters is None else integrate.cast(thrusters, jnp.float64)
+        bank = self._declare_thrusters(self._thrusters) if self._thrusters is not None else []
 
+        sizes = [7, 6, 6, 6, 6 * substeps, *bank]
+        results = [7, 6, 6, 1, *bank[2:]]
         model = integrate.cast(dynamics, jnp.float64)
+        self._still = VectorFunction(self._step(model, False), sizes, results)
+        self._flowing = VectorFunction(self._step(model, True), [*sizes, 6], results)
+
+    def _declare_thrusters(self, thrusters: Thrusters) -> list[int]:
+        """Add the thrusters' ports and state; sizes of pwm, of voltage, and of the state."""
+        n = len(thrusters.motor_directions)
+        self._nominal = np.array([float(thrusters.nominal_voltage)])
+        self._neutral = np.full(n, NEUTRAL)
+        self._pwm = self.DeclareVectorInputPort("pwm", n)
+        self._voltage = self.DeclareVectorInputPort("voltage", 1)
+        start = np.concatenate([np.zeros(2 * n), self._nominal])
+        self._bank = self.DeclareDiscreteState(BasicVector(start.tolist()))
+        for name, part in (("thruster_force", slice(0, n)), ("voltage_loaded", slice(2 * n, None))):
+
+            def show(context: Context, output: BasicVector, part: slice = part) -> None:
+                output.SetFromVector(context.get_discrete_state(self._bank).value()[part])
+
+            size = len(start[part])
+            self.DeclareVectorOutputPort(name, size, show, {self.xd_ticket()})
+        return [n, 1, 2 * n + 1]
+
+    def _step(self, model: Dynamics, flowing: bool) -> Callable[..., tuple[Array, ...]]:
+        """One update as a pure function of the vectors that `_update` gathers."""
+        period, substeps, thrusters = self.period, self.substeps, self._thrusters
         h = period / substeps
 
+        def push(pwm: Array, voltage: Array, bank: Array) -> tuple[Array, Array]:
+            """The thrusters' wrench over the period and their state at its end."""
+            assert thrusters is not None
+            before, waited = bank[: pwm.size], bank[pwm.size : 2 * pwm.size]
+            loaded = thrusters.loaded_voltage(pwm, voltage[0])
+            command = thrusters.force(pwm, loaded)
+            after, waited = thrusters.lag_from_rest(before, waited, command, period)
+            mean = jnp.where(thrusters.time_constant > 0, (before + after) / 2, after)
+            return thrusters.wrench(mean), jnp.concatenate([after, waited, loaded[None]])
+
         def advance(
-            X: Array,
-            V: Array,
-            F: Array,
-            F_disturbance: Array,
-            noise: Array,
-            flow: Array | None = None,
+            X: Array, V: Array, F: Array, F_disturbance: Array, noise: Array, *more: Array
         ) -> tuple[Array, ...]:
-            start, F = V, F + F_disturbance
+            start, F, bank = V, F + F_disturbance, ()
+            if thrusters is not None:
+                F_thrusters, *bank = push(*more[:3])
+                F = F + F_thrusters
             dW = h**0.5 * noise.reshape(substeps, 6)
             for s in range(substeps):
-                water = None if flow is None else Flow(flow[:3] + s * h * flow[3:], flow[3:])
+                water = None
+                if flowing:
+                    flow = more[-1]
+                    water = Flow(flow[:3] + s * h * flow[3:], flow[3:])
                 X, V = integrate.step(model, X, V, F, h, dW[s], water)
             finite = jnp.all(jnp.isfinite(jnp.concatenate([X, V])))
-            return X, V, (V - start) / period, finite.astype(V.dtype)
+            return X, V, (V - start) / period, finite.astype(V.dtype), *bank
 
-        sizes = [7, 6, 6, 6, 6 * substeps]
-        self._still = VectorFunction(advance, sizes, [7, 6, 6, 1])
-        self._flowing = VectorFunction(advance, [*sizes, 6], [7, 6, 6, 1])
+        return advance
 
     def set_state(self, context: Context, X_WB: ArrayLike, V_WB_B: ArrayLike) -> None:
         """Write pose and twist into this system's context.
@@ -115,7 +169,15 @@ class LearnedPlant(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = context.get_discrete_state()
         parts = [state.value(0), state.value(1)]
-        parts += [value_or_zeros(p, context) for p in (self._F, self._F_disturbance, self._noise)]
+        # Beside thrusters this wrench is seldom connected, and asking costs less than failing.
+        parts.append(self._F.Eval(context) if self._F.HasValue(context) else np.zeros(6))
+        parts += [value_or_zeros(port, context) for port in (self._F_disturbance, self._noise)]
+        if self._thrusters is not None:
+            pwm = value_or_none(self._pwm, context)
+            voltage = value_or_none(self._voltage, context)
+            parts.append(self._neutral if pwm is None else pwm)
+            parts.append(self._nominal if voltage is None else voltage)
+            parts.append(state.value(3))
         flow = value_or_none(self._flow, context)
         if flow is None:
             result = self._still.flat(*parts)
@@ -127,10 +189,14 @@ class LearnedPlant(LeafSystem):
         discrete_state.set_value(0, result[:7])
         discrete_state.set_value(1, result[7:13])
         discrete_state.set_value(2, result[13:19])
+        if self._thrusters is not None:
+            discrete_state.set_value(3, result[20:])
 
     def _explain(self, t: float, parts: list[np.ndarray], V: np.ndarray) -> str:
-        names = ["X_WB", "V_WB_B", "F_Bo_B", "F_disturbance_Bo_B", "noise", "flow_W"]
-        told = dict(zip(names, parts, strict=False))
+        names = ["X_WB", "V_WB_B", "F_Bo_B", "F_disturbance_Bo_B", "noise"]
+        if self._thrusters is not None:
+            names += ["pwm", "voltage", "thruster_force"]
+        told = dict(zip([*names, "flow_W"], parts, strict=False))
         bad = [name for name, part in told.items() if not np.all(np.isfinite(part))]
         cause = (
             f"its {' and '.join(bad)} already was not finite"

@@ -4,12 +4,12 @@ from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import ConstantVectorSource, RandomSource
 
+from .allocation import ThrustAllocation
 from .disturbance_source import DisturbanceSource
 from .ekf import Ekf
 from .learned_plant import LearnedPlant
 from .sensor_suite import SensorSuite
 from .station_config import StationConfig
-from .thruster_bank import ThrustAllocation, ThrusterBank
 
 INPUTS = {"F_Bo_B": 6}
 """Input ports and their sizes: the wrench a controller wants."""
@@ -47,8 +47,9 @@ def station_ports(hardware: bool = False) -> tuple[dict[str, int], dict[str, int
 def make_station(config: StationConfig, hardware: bool = False) -> Diagram:
     """A diagram with `station_ports(hardware)`.
 
-    In simulation: allocation, thrusters, plant, disturbances, sensors and filter, as subsystems of
-    these names. All noise comes from random sources inside, which `SetRandomContext` seeds.
+    In simulation: allocation, plant with thrusters, disturbances, sensors and filter, as subsystems
+    `allocation`, `plant`, `disturbances`, `sensors` and `ekf`. All noise comes from random sources
+    inside, which `SetRandomContext` seeds.
 
     Raises:
         NotImplementedError: hardware is asked for.
@@ -79,8 +80,8 @@ def _simulated(config: StationConfig) -> Diagram:
     builder = DiagramBuilder()
     add = builder.AddNamedSystem
     allocation = add("allocation", ThrustAllocation(thrusters, config.voltage))
-    bank = add("thrusters", ThrusterBank(thrusters, config.period))
-    plant = add("plant", LearnedPlant(config.dynamics(), config.period, config.substeps, X0, V0))
+    body = LearnedPlant(config.dynamics(), config.period, config.substeps, X0, V0, thrusters)
+    plant = add("plant", body)
     water = add("disturbances", DisturbanceSource(config.disturbance(), water_period))
     sensors = add("sensors", SensorSuite(s.imu, s.dvl, s.depth, s.compass))
     ekf = add("ekf", Ekf(s.imu, s.dvl, s.depth, s.compass, s.ekf, X0, V0))
@@ -88,8 +89,7 @@ def _simulated(config: StationConfig) -> Diagram:
     def connect(source, output: str, target, name: str | None = None) -> None:
         builder.Connect(source.GetOutputPort(output), target.GetInputPort(name or output))
 
-    connect(allocation, "pwm", bank)
-    connect(bank, "F_Bo_B", plant)
+    connect(allocation, "pwm", plant)
     connect(water, "F_disturbance_Bo_B", plant)
     connect(water, "flow_W", plant)
     for reader in (water, sensors):
@@ -101,7 +101,7 @@ def _simulated(config: StationConfig) -> Diagram:
     nominal = float(thrusters.nominal_voltage)
     volts = nominal if config.voltage is None else config.voltage
     battery = add("battery", ConstantVectorSource([volts]))
-    builder.Connect(battery.get_output_port(), bank.GetInputPort("voltage"))
+    builder.Connect(battery.get_output_port(), plant.GetInputPort("voltage"))
 
     add_noise(builder, plant, "noise", config.period)
     add_noise(builder, water, "noise", water_period)

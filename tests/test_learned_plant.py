@@ -8,6 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RotationalInertia, SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
+from thruster_examples import prompt_thrusters
 
 from spinndrift.models import integrate, se3
 from spinndrift.models.rigid_body import FossenDynamics, spatial_inertia
@@ -18,16 +19,16 @@ INERTIA = np.diag([0.26, 0.23, 0.37])
 ZERO = np.zeros((6, 6))
 
 
-def rigid_body() -> FossenDynamics:
+def rigid_body(com: np.ndarray = COM) -> FossenDynamics:
     """A body in empty space: no added mass, drag, weight or buoyancy."""
     return FossenDynamics(
-        rigid_inertia=spatial_inertia(MASS, COM, INERTIA),
+        rigid_inertia=spatial_inertia(MASS, com, INERTIA),
         added_mass=ZERO,
         linear_drag=ZERO,
         quadratic_drag=ZERO,
         weight=0.0,
         buoyancy=0.0,
-        p_BoBcm_B=COM,
+        p_BoBcm_B=com,
         p_BoCb_B=np.zeros(3),
     )
 
@@ -56,6 +57,27 @@ def advance(plant: LearnedPlant, end: float, **inputs: np.ndarray) -> tuple[np.n
         plant.GetInputPort(name).FixValue(context, value)
     simulator.AdvanceTo(end)
     return tuple(read(plant, n, context) for n in ("X_WB", "V_WB_B", "A_WB_B"))
+
+
+class Driven:
+    """A body in empty space, its thrusters commanded to a wrench, with one context."""
+
+    def __init__(self, **settings: float):
+        self.thrusters = prompt_thrusters(**settings)
+        self.plant = LearnedPlant(rigid_body(np.zeros(3)), thrusters=self.thrusters)
+
+    def __call__(self, F: np.ndarray, end: float, **inputs: np.ndarray) -> np.ndarray:
+        """The thrusters' wrench at `end`."""
+        pwm = np.asarray(self.thrusters.pwm(self.thrusters.allocate(jnp.asarray(F))))
+        simulator = Simulator(self.plant)
+        context = simulator.get_mutable_context()
+        for name, value in ({"pwm": pwm} | inputs).items():
+            self.plant.GetInputPort(name).FixValue(context, value)
+        simulator.AdvanceTo(end)
+        self.loaded = read(self.plant, "voltage_loaded", context)
+        self.V = read(self.plant, "V_WB_B", context)
+        force = read(self.plant, "thruster_force", context)
+        return np.asarray(self.thrusters.wrench(jnp.asarray(force)))
 
 
 def free_body_in_drake(X0: np.ndarray, V0: np.ndarray, end: float) -> np.ndarray:
@@ -155,6 +177,79 @@ def test_a_turning_vehicle_in_a_current_converges_to_the_one_in_still_water():
     assert 1.7 < coarse / fine < 2.3  # a difference of discretisation alone, of order one
 
 
+@pytest.fixture(name="prompt", scope="module")
+def _prompt() -> Driven:
+    return Driven()
+
+
+@pytest.fixture(name="slow", scope="module")
+def _slow() -> Driven:
+    return Driven(time_constant=0.15)
+
+
+def test_prompt_thrusters_push_from_the_first_period_on(prompt):
+    F = np.array([20.0, 0, 5, 0, 0, 0])
+    for periods in (1, 20):
+        np.testing.assert_allclose(prompt(F, 0.01 * periods - 0.005), F, atol=1e-9)
+        np.testing.assert_allclose(prompt.V, 0.01 * periods * F / MASS, atol=1e-9)
+
+
+def test_the_wrench_of_the_port_comes_on_top_of_the_thrusters(prompt):
+    F, more = np.array([20.0, 0, 5, 0, 0, 0]), np.array([-3.0, 2, 0, 0, 0, 0])
+    prompt(F, 0.195, F_Bo_B=more)
+    np.testing.assert_allclose(prompt.V, 0.2 * (F + more) / MASS, atol=1e-9)
+
+
+def test_a_step_is_followed_with_the_time_constant(slow):
+    F = np.array([20.0, 0, 5, 0, 0, 1])
+    for time in (0.15, 0.45):
+        # An update at t covers [t, t + period): half a period later the state is that of its end.
+        got = slow(F, time - 0.005)
+        np.testing.assert_allclose(got, (1 - np.exp(-time / 0.15)) * F, rtol=1e-9, atol=1e-9)
+
+
+def test_the_body_gets_the_impulse_of_forces_that_lag(slow):
+    F, time, lag = np.array([20.0, 0, 5, 0, 0, 0]), 0.45, 0.15
+    slow(F, time - 0.005)
+    impulse = (time - lag * (1 - np.exp(-time / lag))) * F
+    # The trapezoidal rule is off by h² / 12 of what the slope F / τ (1 - e) changed.
+    bound = 0.01**2 / 12 * F[0] / lag
+    np.testing.assert_allclose(MASS * slow.V, impulse, atol=bound)
+
+
+def test_a_low_battery_gives_less(prompt):
+    F = np.array([40.0, 0, 0, 0, 0, 0])
+    full = prompt(F, 0.02, voltage=np.array([16.0]))
+    low = prompt(F, 0.02, voltage=np.array([12.0]))
+    assert 0.5 * full[0] < low[0] < 0.9 * full[0]
+
+
+def test_the_voltage_sags_under_load():
+    driven = Driven(resistance=0.02)
+    weak = driven(np.array([60.0, 0, 0, 0, 0, 0]), 0.02)
+    assert 12 < driven.loaded[0] < 15.9
+    assert weak[0] < 60
+    driven(np.zeros(6), 0.02)
+    np.testing.assert_allclose(driven.loaded, [16.0])
+
+
+def test_a_start_from_rest_takes_its_pause():
+    driven = Driven(start_delay=0.1)
+    F = np.array([20.0, 0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(driven(F, 0.085), np.zeros(6))
+    np.testing.assert_array_equal(driven.V, np.zeros(6))
+    np.testing.assert_allclose(driven(F, 0.125), F, atol=1e-9)
+
+
+def test_without_commands_the_thrusters_stand_still():
+    plant = LearnedPlant(vehicle(), thrusters=prompt_thrusters())
+    F = np.array([10.0, -4, 3, 0.3, 0.2, -0.4])
+    for a, b in zip(
+        advance(plant, 0.1, F_Bo_B=F), advance(LearnedPlant(vehicle()), 0.1, F_Bo_B=F), strict=True
+    ):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13)
+
+
 def test_quaternion_stays_unit_and_states_agree():
     plant = LearnedPlant(vehicle(), 0.05, 1, V0_WB_B=np.array([0, 0, 0, 2.0, -1.0, 1.5]))
     simulator = Simulator(plant)
@@ -181,6 +276,13 @@ def test_an_input_that_is_not_a_number_is_named():
     plant.GetInputPort("F_Bo_B").FixValue(simulator.get_mutable_context(), np.full(6, np.nan))
     with pytest.raises(FloatingPointError, match=r"t = 0\.0000 s; its F_Bo_B already"):
         simulator.AdvanceTo(0.1)
+    plant = LearnedPlant(vehicle(), thrusters=prompt_thrusters())
+    for name in ("pwm", "voltage"):
+        simulator = Simulator(plant)
+        port = plant.GetInputPort(name)
+        port.FixValue(simulator.get_mutable_context(), np.full(port.size(), np.nan))
+        with pytest.raises(FloatingPointError, match=rf"t = 0\.0000 s; its {name} already"):
+            simulator.AdvanceTo(0.1)
 
 
 @pytest.mark.parametrize(

@@ -39,10 +39,9 @@ def arguments() -> dict[str, dict]:
         config=MppiConfig(horizon=10, sequences=20, knots=(2,)),
     )
     return {
-        "LearnedPlant": {"dynamics": dynamics},
+        "LearnedPlant": {"dynamics": dynamics, "thrusters": thrusters},
         "DisturbanceSource": {"disturbance": Combined()},
         "ThrustAllocation": {"thrusters": thrusters},
-        "ThrusterBank": {"thrusters": thrusters},
         "Mppi": {"planner": planner},
         "Impedance": {"law": ImpedanceLaw(np.eye(6), np.eye(6), limits), "layout": PlanLayout()},
         "DisturbanceObserver": {"observer": MomentumObserver(dynamics)},

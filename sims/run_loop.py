@@ -16,7 +16,7 @@ from pydrake.systems.framework import Diagram
 from ..systems.closed_loop import build_diagram, logged, seeded
 from .criteria import Monitor, Outcome
 from .run_log import RunLog
-from .run_signals import PlanTap, collect, log_periods
+from .run_signals import PlanTap, collect, log_periods, with_present
 from .scenario import Scenario
 
 Progress = Callable[[float, str], None]
@@ -93,7 +93,8 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Run:
     timing.compilation = time.perf_counter() - started
     with _stop_on_interrupt() as stopped, _few_collections():
         outcome = _fly(scenario, diagram, simulator, monitor, tap, timing, tell, stopped)
-    log = collect(scenario, logged(diagram, context), tap, outcome.time)
+    signals = with_present(logged(diagram, context), diagram, context)
+    log = collect(scenario, signals, tap, outcome.time)
     return Run(scenario, log, outcome, timing)
 
 

@@ -14,6 +14,7 @@ from ..systems.filtering.error_state import ERRORS
 from .run_log import Plans, RunLog
 from .scenario import Scenario
 
+_ESTIMATES = ("X_WB", "V_WB_B", "covariance")
 _PLAN_STEP = 0.2  # s between the states of a plan that are kept
 _NOTES = (
     "X_WB and V_WB_B are the simulation's truth, not an estimate.",
@@ -24,7 +25,11 @@ _NOTES = (
 
 
 def log_periods(scenario: Scenario) -> dict[str, float]:
-    """How often each port of station and controller is logged (s)."""
+    """How often each port of station and controller is logged (s).
+
+    Estimates are logged twice as often as the filter makes them: the log's time and the filter's
+    differ by rounding, so that only a sample in the middle surely shows the one before it.
+    """
     coarse: tuple[str, ...] = (
         "pwm",
         "X_WB_cheat",
@@ -32,10 +37,28 @@ def log_periods(scenario: Scenario) -> dict[str, float]:
         "F_disturbance_cheat",
         "flow_cheat",
     )
-    fine: tuple[str, ...] = ("X_WB", "V_WB_B", "covariance", "F_Bo_B")
     periods: dict[str, float] = dict.fromkeys(coarse, 1 / scenario.log.rate)
-    periods.update(dict.fromkeys(fine, scenario.station.period))
+    periods.update(dict.fromkeys(_ESTIMATES, _estimate_period(scenario) / 2))
+    periods["F_Bo_B"] = scenario.station.period
     return periods
+
+
+def _estimate_period(scenario: Scenario) -> float:
+    return 1 / scenario.station.sensing.ekf.output_rate
+
+
+def with_present(
+    signals: Mapping[str, Signal], diagram: Diagram, root: Context
+) -> dict[str, Signal]:
+    """The signals with what the filter says at the context's time as a last sample."""
+    station = diagram.GetSubsystemByName("station")
+    context = station.GetMyContextFromRoot(root)
+    found = dict(signals)
+    for name in _ESTIMATES:
+        time, value = signals[name]
+        present = station.GetOutputPort(name).Eval(context)
+        found[name] = Signal(np.append(time, root.get_time()), np.vstack([value, present]))
+    return found
 
 
 class PlanTap:
@@ -120,15 +143,18 @@ class PlanTap:
 
 
 def collect(scenario: Scenario, signals: Mapping[str, Signal], tap: PlanTap, end: float) -> RunLog:
-    """One log of all signals from 0 to `end` (s)."""
-    dt, period = 1 / scenario.log.rate, scenario.station.period
+    """One log of all signals (`with_present`) from 0 to `end` (s).
+
+    What the filter says of t comes with the updates of t, after which the truth of t has gone.
+    """
+    dt, period = 1 / scenario.log.rate, _estimate_period(scenario)
     n = min(round(end / dt) + 1, len(signals["X_WB_cheat"].time))
     finite = np.all(np.isfinite(signals["X_WB_cheat"].value[:n]), axis=1)
     n = n if finite.all() else max(1, int(np.argmin(finite)))
     grid = dt * np.arange(n)
-    # A log sees outputs before the updates of its time: what the filter says of t comes one period
-    # later. The truth of t is there at t.
-    told = np.searchsorted(signals["X_WB"].time, grid + 1.5 * period) - 1
+    newest = period * np.floor(grid / period + 1e-6)
+    times = signals["X_WB"].time
+    told = np.minimum(np.searchsorted(times, newest + period / 4), times.size - 1)
     variance = signals["covariance"].value[told][:, :: ERRORS + 1]
     variables = {
         "X_WB": signals["X_WB_cheat"].value[:n],

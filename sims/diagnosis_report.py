@@ -1,7 +1,7 @@
 """A diagnosis as a page."""
 
 from ..training.diagnosis.diagnose import Finding
-from ..training.diagnosis.result import Value
+from ..training.diagnosis.result import Diagnosis, Interval, Value
 from .figures_diagnosis import (
     horizon_figure,
     innovations_figure,
@@ -10,6 +10,13 @@ from .figures_diagnosis import (
     residual_figure,
 )
 from .pages import Page
+
+_LEFT_OUT = {
+    "scenario": "Each model and its noise levels were fitted without the scenario it is judged on.",
+    "run": "There is one scenario: each model was fitted without the runs that it is judged on.",
+    "block": "There is one run: each model was fitted without the stretch that it is judged on.",
+    "nothing": "Nothing could be left out: the models are judged on what they were fitted to.",
+}
 
 
 def diagnosis_page(finding: Finding, title: str) -> Page:
@@ -42,6 +49,20 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
             f"None of {d.tested} names wins more than noise alone can win ({d.threshold:.1f} nats "
             f"at a false-alarm rate of {d.alpha:g})."
         )
+    for c in d.causes:
+        if c.structure is not None:
+            s = c.structure
+            page.text(
+                f"**Unknown:** {s.description} wins {s.heldout_gain:.0f} nats; the best name would "
+                f"win {s.best_name_gain:.0f} of them."
+            )
+    if d.refitted:
+        page.text("Coefficients that were fitted before any cause was named:")
+        page.table(
+            [(r.name, r.where, f"{r.believed:.4g}", _told(r.parameter, r.fitted))
+             for r in d.refitted],
+            ("coefficient", "where", "believed", "fitted (95 %)"),
+        )  # fmt: skip
     page.figure(names_figure(finding), "Each name alone, fitted on the other scenarios.")
     page.section(
         "Where the error lives",
@@ -53,8 +74,16 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
     )
     page.figure(innovations_figure(finding), "Repeated runs average the noise, errors stay.")
     page.figure(residual_figure(finding), "What is left by channel.")
-    page.section("Gain", "Noise-free simulations from recorded states, on scenarios left out.")
-    page.figure(horizon_figure(d), "Root mean square error; bands: 95 % over scenarios.")
+    page.section("Gain", _LEFT_OUT[d.left_out])
+    page.table(
+        _gains(d),
+        ("model", "nats a sample", "over the base", "energy score", "in 50 %", "in 90 %"),
+    )
+    page.figure(
+        horizon_figure(d),
+        "Root mean square error of noise-free simulations from recorded states, and energy score "
+        "of simulated laws; bands: 95 %.",
+    )
     page.section("Data")
     page.table(
         {
@@ -71,3 +100,20 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
 def _told(name: str, v: Value) -> str:
     low, high = v.interval95
     return f"{name} = {v.value:.4g} ({low:.4g} … {high:.4g}) {v.unit}"
+
+
+def _gains(d: Diagnosis) -> list[tuple[str, ...]]:
+    """A row a model: scores, and bands at the longest horizon."""
+    rows = []
+    for name, g in d.gain.items():
+        last = list(g.energy_score)[-1]
+        shares = [_interval(bands[last], 2) for bands in g.coverage.values()]
+        energy = f"{_interval(g.energy_score[last])} at {last} s"
+        row = (name.replace("_", " "), _interval(g.log_score, 2), _interval(g.log_score_gain, 2))
+        rows.append((*row, energy, *shares))
+    return rows
+
+
+def _interval(v: Interval, digits: int = 3) -> str:
+    low, high = v.interval95
+    return f"{v.value:.{digits}f} ({low:.{digits}f} … {high:.{digits}f})"

@@ -4,7 +4,8 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from ..training.diagnosis.diagnose import Finding, Look
+from ..training.diagnosis.diagnose import Finding
+from ..training.diagnosis.looking import Look
 from ..training.diagnosis.result import Diagnosis
 from .figures import FLOWN, INK, PLANNED, QUIET, legend, panels, styled
 
@@ -117,22 +118,23 @@ def map_figure(finding: Finding) -> Figure:
 
 @styled
 def horizon_figure(diagnosis: Diagnosis) -> Figure:
-    """Errors of simulations against their horizon, on scenarios left out, with 95 % intervals."""
-    figure, axes = panels(1, 3, 2.7)
-    titles = ("position / m", "rotation / rad", "velocity / (m/s)")
-    colors = {"base": PLANNED, "extended": FLOWN}
+    """Errors and scores of simulations against their horizon, on data left out, with 95 %."""
+    figure, axes = panels(1, 4, 2.7)
+    titles = ("position / m", "rotation / rad", "velocity / (m/s)", "energy score")
+    colors = {"base": PLANNED, "refitted": QUIET, "black_box": INK, "extended": FLOWN}
     for name, gain in diagnosis.gain.items():
-        tables = (gain.position_rmse, gain.rotation_rmse, gain.velocity_rmse)
+        tables = (gain.position_rmse, gain.rotation_rmse, gain.velocity_rmse, gain.energy_score)
+        style = {"base": "o-", "extended": "o-", "refitted": "s--", "black_box": "^:"}[name]
         for ax, table, title in zip(axes[0], tables, titles, strict=True):
             h = [float(k) for k in table]
             value = [v.value for v in table.values()]
             low, high = np.array([v.interval95 for v in table.values()]).T
-            ax.fill_between(h, low, high, color=colors[name], alpha=0.16, lw=0)
-            ax.plot(h, value, "o-", ms=3.5, color=colors[name], label=name)
+            ax.fill_between(h, low, high, color=colors[name], alpha=0.13, lw=0)
+            ax.plot(h, value, style, ms=3.5, color=colors[name], label=name.replace("_", " "))
             ax.set_title(title)
             ax.set_xlabel("horizon / s")
             ax.set_ylim(bottom=0)
-    legend(axes[0, 2])
+    legend(axes[0, 3])
     return figure
 
 

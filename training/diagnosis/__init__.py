@@ -8,10 +8,14 @@ The way of a diagnosis, one module a step:
 `responses`   how every effect would change the innovations: finite probes through the same filter
 `gram`        inner products of innovations and responses, run by run
 `hypotheses`  fits, held-out gains and bounds of a set of causes from these inner products
-`naming`      which causes are there: vetoes, nesting, ties, forward and backward
+`naming`      which of them to give: vetoes, nesting, echoes, ties
+`looking`     all that one set of parameters shows, and fits with exact predictions
+`search`      which causes are there together: forward and backward
 `laws`        what is left: heavy tails, memory, dependence on speed
 `checks`      data at fault: stuck sensors, jumps, axes never excited
-`gain`        errors of simulations over seconds, base against extended
+`gain`        what a model is worth on data left out: scores, simulations, bands
+`blackbox`    a rival that names nothing: ridge regression on random features
+`telling`     causes with intervals, in words
 `diagnose`    all of it, to a `result.Diagnosis` (`result.schema()` is its JSON Schema)
 
 The filter. A record y_n = h(x_n) + e_n is predicted from the record before it,

@@ -60,3 +60,21 @@ def unexcited(data: Data, share: float = 0.02) -> list[str]:
         for axis, still in zip(AXES, quiet, strict=True)
         if still
     ]
+
+
+def limits(data: Data) -> list[str]:
+    """What these data can't tell, one sentence each."""
+    found = unexcited(data)
+    if data.command == "F_Bo_B":
+        found.append("commands are wrenches: single thrusters can't be told apart")
+    if not data.has_voltage:
+        found.append("no voltage was recorded: voltage_sag can't be told")
+    if data.left_out == "run":
+        found.append(
+            "there is one scenario: runs were left out in turn, other motions stay unknown"
+        )
+    if data.left_out == "block":
+        found.append(
+            "there is one run: blocks of it were left out in turn, other runs stay unknown"
+        )
+    return found

@@ -2,7 +2,7 @@
 
 import itertools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +14,9 @@ from ...models.vehicle import Vehicle
 
 SEGMENT = 256
 """Longest piece (samples) that a run is cut into; pieces are filtered side by side."""
+_BLOCKS, _LEAST = 8, 16
+"""Pieces that a single run is cut into at least, and samples of a piece at least."""
+_MOST_FOLDS = 10
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class Data:
         voltage: relative to the vehicle's nominal one (N, R).
         weight: 1 for steps that exist, else 0 (N, R).
         scenario: index into `names` (R,).
-        run: which run a piece was cut from (R,): the unit of clustering.
+        run: which run a piece was cut from (R,).
         names: scenarios.
         dt: step (s).
         command: what the commands were made of: thruster_force, pwm or F_Bo_B.
@@ -45,6 +48,26 @@ class Data:
     dt: float
     command: str
     has_voltage: bool
+
+    @property
+    def left_out(self) -> Literal["scenario", "run", "block"]:
+        """What is left out of a fit in turn: scenarios, of one scenario runs, of one run blocks."""
+        if len(np.unique(self.scenario)) > 1:
+            return "scenario"
+        return "run" if len(np.unique(self.run)) > 1 else "block"
+
+    @property
+    def fold(self) -> Int[np.ndarray, " R"]:
+        """Which pieces are left out together."""
+        if self.left_out == "scenario":
+            return self.scenario
+        number = np.unique(self.cluster, return_inverse=True)[1]
+        return number * min(_MOST_FOLDS, number.max() + 1) // (number.max() + 1)
+
+    @property
+    def cluster(self) -> Int[np.ndarray, " R"]:
+        """Within which pieces may depend on each other: runs, or the blocks of a single run."""
+        return np.arange(len(self.run)) if self.left_out == "block" else self.run
 
     @property
     def steps(self) -> int:
@@ -72,6 +95,8 @@ def make_data(recording: Recording, vehicle: Vehicle, segment: int = SEGMENT) ->
     pieces: dict[str, list[Any]] = {"X": [], "V": [], "u": [], "voltage": []}
     scenario, run, sizes = [], [], []
     has_voltage = "voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any())
+    if np.sum(lengths >= 3) == 1:
+        segment = min(segment, max(int(lengths.max()) // _BLOCKS, _LEAST))
     for number, (j, k) in enumerate(np.argwhere(lengths >= 3)):
         length = int(lengths[j, k])
         values = {

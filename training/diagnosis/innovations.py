@@ -109,6 +109,6 @@ def _jacobian(model: Extended, inertia: Any, X: Array, V: Array, u: Array, dt: f
 
 
 def predict(model: Extended, library: Library, theta: np.ndarray, data: Data) -> Predictions:
-    """Predictions of all samples with the effects' values `theta` (p,)."""
-    effects = library.filled(jnp.asarray(theta)[:, None])
+    """Predictions of all samples with the effects' values `theta`: (p,), or (p, R) by piece."""
+    effects = library.filled(jnp.asarray(theta.reshape(len(theta), -1)))
     return _predict(model, effects, as_arrays(data), data.dt)

@@ -5,9 +5,11 @@ intensity. Each law below is one or two numbers that change their density; gains
 the numbers fitted on the other scenarios.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.optimize
 from jaxtyping import Float, Int
 
 from ...models.effects.base import AXES
@@ -21,11 +23,18 @@ class Law:
     where: str
     parameters: dict[str, float]
     heldout: Float[np.ndarray, " R"]
+    loss: Callable[[np.ndarray], np.ndarray] | None = None
+    """Nats lost by each piece at the logarithms of the parameters, in their order."""
 
     @property
     def heldout_gain(self) -> float:
         """Nats won on scenarios left out."""
         return float(self.heldout.sum())
+
+
+Told = tuple[np.ndarray, dict[str, float], Callable[[np.ndarray], np.ndarray]]
+"""Held-out gain by piece, the best numbers, and the loss as a function of their logarithms."""
+_KAPPAS = (0.004, 0.01, 0.02, 0.04, 0.08, 0.15, 0.3)
 
 
 def _folds(fold: np.ndarray) -> list[np.ndarray]:
@@ -46,7 +55,7 @@ def _held_out(losses: np.ndarray, fold: np.ndarray) -> tuple[np.ndarray, int]:
 
 def impacts(
     z: Float[np.ndarray, "N R"], weight: Float[np.ndarray, "N R"], fold: Int[np.ndarray, " R"]
-) -> tuple[np.ndarray, dict[str, float]]:
+) -> Told:
     """Gain of a mixture (1 - p) N(0, s²) + p N(0, (k s)²) over N(0, σ²)."""
     sigma = np.sqrt((z**2 * weight).sum() / weight.sum())
     # a histogram for each run: the density is smooth on its bins
@@ -56,17 +65,22 @@ def impacts(
     np.add.at(counts, (bins, np.broadcast_to(np.arange(z.shape[1]), bins.shape)), weight)
     x = np.append((edges[1:] + edges[:-1]) / 2, edges[-1])
     plain = ((x / sigma) ** 2 / 2 + np.log(sigma)) @ counts
+
+    def loss(logs: np.ndarray) -> np.ndarray:
+        p, size, s = np.exp(logs)
+        p = min(p, 0.9)
+        a = np.log1p(-p) - np.log(s) - (x / s) ** 2 / 2
+        b = np.log(p) - np.log(size) - (x / size) ** 2 / 2
+        return -np.logaddexp(a, b) @ counts
+
     choices, losses = [], []
     for p in (0.002, 0.005, 0.01, 0.02, 0.05, 0.1):
         for k in (2.0, 3.0, 5.0, 8.0, 15.0, 30.0):
             for s in (0.6 * sigma, 0.8 * sigma, 0.9 * sigma, 0.96 * sigma):
-                a = np.log1p(-p) - np.log(s) - (x / s) ** 2 / 2
-                b = np.log(p) - np.log(k * s) - (x / (k * s)) ** 2 / 2
-                losses.append(-np.logaddexp(a, b) @ counts)
-                choices.append({"share": p, "size": k * s})
-    losses = np.array(losses)
-    held, best = _held_out(losses, fold)
-    return plain - held, choices[best]
+                choices.append({"share": p, "size": k * s, "rest": s})
+                losses.append(loss(np.log(list(choices[-1].values()))))
+    held, best = _held_out(np.array(losses), fold)
+    return plain - held, choices[best], loss
 
 
 def speed_dependence(
@@ -74,41 +88,50 @@ def speed_dependence(
     speed: Float[np.ndarray, "N R"],
     weight: Float[np.ndarray, "N R"],
     fold: Int[np.ndarray, " R"],
-) -> tuple[np.ndarray, dict[str, float]]:
+) -> Told:
     """Gain of the variance s² (1 + k |v|²) over a constant one."""
     growth = np.concatenate([[0.0], np.geomspace(0.05, 200.0, 40)])
-    losses = []
-    for k in growth:
+
+    def at(k: float) -> np.ndarray:
         shape = 1 + k * speed**2
         s2 = (z**2 / shape * weight).sum() / weight.sum()
-        losses.append(((z**2 / (s2 * shape) + np.log(s2 * shape)) / 2 * weight).sum(axis=0))
-    losses = np.array(losses)
+        return ((z**2 / (s2 * shape) + np.log(s2 * shape)) / 2 * weight).sum(axis=0)
+
+    losses = np.array([at(k) for k in growth])
     held, best = _held_out(losses, fold)
-    return losses[0] - held, {"growth": float(growth[best])}
+    return losses[0] - held, {"growth": float(growth[best])}, lambda logs: at(np.exp(logs[0]))
 
 
 def colour(
     z: Float[np.ndarray, "N R"], weight: Float[np.ndarray, "N R"], fold: Int[np.ndarray, " R"],
     dt: float,
-) -> tuple[np.ndarray, dict[str, float]]:  # fmt: skip
+) -> Told:  # fmt: skip
     """Gain of predicting z from a slow part m' = ρ m + κ (z - m) (an ARMA(1, 1) of slow waves)."""
     plain = (z**2 * weight / 2).sum(axis=0)
-    choices, losses = [{"time_constant": 0.0, "share": 0.0}], [plain]
-    for tau in (0.3, 0.6, 1.2, 2.5, 5.0, 10.0, 20.0):
-        rho = np.exp(-dt / tau)
-        for kappa in (0.004, 0.01, 0.02, 0.04, 0.08, 0.15, 0.3):
-            m, loss = np.zeros(z.shape[1]), np.zeros(z.shape[1])
-            total = np.zeros(z.shape[1])
-            for n in range(len(z)):
-                e = z[n] - m
-                loss += e**2 * weight[n] / 2
-                total += m * m * weight[n]
-                m = rho * (m + kappa * e)
-            losses.append(loss)
-            choices.append({"time_constant": tau, "share": float(total.sum() / weight.sum())})
-    losses = np.array(losses)
+
+    def at(rho: np.ndarray, kappa: np.ndarray) -> np.ndarray:
+        """Losses (k, R) for each of k pairs."""
+        m, loss = np.zeros((len(rho), z.shape[1])), np.zeros((len(rho), z.shape[1]))
+        for n in range(len(z)):
+            e = z[n] - m
+            loss += e**2 * weight[n] / 2
+            m = rho[:, None] * (m + kappa[:, None] * e)
+        return loss
+
+    times, gains = np.meshgrid((0.3, 0.6, 1.2, 2.5, 5.0, 10.0, 20.0), _KAPPAS)
+    rho = np.exp(-dt / times.ravel())
+    losses = np.concatenate([plain[None], at(rho, gains.ravel())])
     held, best = _held_out(losses, fold)
-    return plain - held, choices[best]
+    values = {"time_constant": 0.0, "kappa": 0.0}
+    if best > 0:
+        pair = times.ravel()[best - 1], gains.ravel()[best - 1]
+        values = dict(zip(values, map(float, pair), strict=True))
+
+    def loss(logs: np.ndarray) -> np.ndarray:
+        tau, kappa = np.exp(logs)
+        return at(np.array([np.exp(-dt / tau)]), np.array([min(kappa, 0.99)]))[0]
+
+    return plain - held, values, loss
 
 
 def run_constants(
@@ -145,10 +168,49 @@ def find_laws(
     found = []
     for i, axis in enumerate(AXES):
         own = z[:, 6 + i]
-        gain, values = impacts(own, weight, fold)
-        found.append(Law("disturbance_impacts", axis, values, gain))
-        gain, values = speed_dependence(own, speed, weight, fold)
-        found.append(Law("disturbance_state_dependence", axis, values, gain))
-        gain, values = colour(own, weight, fold, dt)
-        found.append(Law("disturbance_colour", axis, values, gain))
+        for name, told in (
+            ("disturbance_impacts", impacts(own, weight, fold)),
+            ("disturbance_state_dependence", speed_dependence(own, speed, weight, fold)),
+            ("disturbance_colour", colour(own, weight, fold, dt)),
+        ):
+            gain, values, loss = told
+            found.append(Law(name, axis, values, gain, loss))
     return sorted(found, key=lambda law: -law.heldout_gain)
+
+
+def estimated(
+    law: Law, cluster: Int[np.ndarray, " R"]
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+    """Logarithms of a law's parameters where the likelihood is largest, and their covariance.
+
+    The covariance is the sandwich H⁻¹ Σ g gᵀ H⁻¹ over clusters (Huber 1967; White 1982), with
+    derivatives by central differences.
+    """
+    assert law.loss is not None
+    loss, x0 = law.loss, np.log(np.maximum(list(law.parameters.values()), 1e-6))
+    labels, index = np.unique(cluster, return_inverse=True)
+
+    def total(x: np.ndarray) -> float:
+        return float(loss(x).sum()) if np.all(np.abs(x - x0) < 4) else np.inf
+
+    found = scipy.optimize.minimize(
+        total, x0, method="Nelder-Mead", options={"maxfev": 120, "xatol": 1e-3, "fatol": 1e-2}
+    ).x
+    k, h = len(found), 0.02
+    steps = h * np.eye(k)
+    by_piece = np.array([(loss(found + d) - loss(found - d)) / (2 * h) for d in steps])
+    g = np.zeros((len(labels), k))
+    np.add.at(g, index, by_piece.T)
+    H = np.array(
+        [
+            [
+                total(found + a + b) - total(found + a - b) - total(found - a + b)
+                + total(found - a - b)
+                for b in steps
+            ]
+            for a in steps
+        ]
+    ) / (4 * h * h)  # fmt: skip
+    inverse = np.linalg.pinv(H + 1e-9 * np.eye(k))
+    n = len(labels)
+    return found, inverse @ (g.T @ g) @ inverse * n / max(n - 1, 1)

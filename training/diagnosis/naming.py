@@ -52,11 +52,13 @@ def choose(
     threshold: float,
     alpha: float,
     accepted: Mapping[str, float] | None = None,
+    strict: bool = False,
 ) -> Choice | None:
     """The name that explains most, or None where nothing passes.
 
     To pass, a name needs a held-out gain above `threshold` (calibrated for the number of names), a
-    robust p value that survives Bonferroni unless the gain is clear, and admissible estimates.
+    robust p value that survives Bonferroni unless the gain is clear (`strict`: even then), and
+    admissible estimates.
     Echoes of names accepted before (with their gains) must win one per cent of those. Among the
     rest the largest held-out gain leads; a simpler name replaces it unless clearly beaten. Ties are
     names within two standard errors of the difference, clustered by run.
@@ -71,7 +73,10 @@ def choose(
                 needed = max(needed, ECHO_SHARE * gain)
         if (
             fit.heldout_gain > needed
-            and (fit.p_value * len(fits) < alpha or fit.heldout_gain > CLEAR * threshold)
+            and (
+                fit.p_value * len(fits) < alpha
+                or (fit.heldout_gain > CLEAR * threshold and not strict)
+            )
             and admissible(library, theta, fit)
         ):
             passing[hypothesis] = fit

@@ -11,7 +11,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from ...models.files import atomic_path
 
 Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,31 @@ class Rival:
 
 
 @dataclass(frozen=True)
+class Structure:
+    """What no name explains, as far as data tell where it lives.
+
+    Attributes:
+        acts_on: axes, thruster or frame that feel it.
+        variables: what it depends on, most telling first.
+        description: one sentence.
+        lag: time over which it remembers (s), if it does.
+        frequency: at which it rings (Hz), if it does.
+        region: of each variable, where it was seen.
+        heldout_gain: nats won on data left out.
+        best_name_gain: what the best name would have won of them.
+    """
+
+    acts_on: str
+    variables: list[str]
+    description: str
+    lag: float | None
+    frequency: float | None
+    region: dict[str, tuple[float, float]]
+    heldout_gain: float
+    best_name_gain: float
+
+
+@dataclass(frozen=True)
 class Cause:
     """One named cause."""
 
@@ -51,6 +76,7 @@ class Cause:
     rivals: list[Rival]
     indistinguishable_from: list[str]
     next_experiment: str
+    structure: Structure | None = None
 
 
 @dataclass(frozen=True)
@@ -78,12 +104,34 @@ class Interval:
 
 @dataclass(frozen=True)
 class ModelGain:
-    """A model on scenarios left out: nats a sample, and error by horizon (s, as text)."""
+    """A model on data left out of its fit; horizons are seconds as text.
+
+    Attributes:
+        log_score: log density of the innovations, nats a sample; larger is better.
+        log_score_gain: what it wins over the base, sample by sample.
+        energy_score: of simulated laws, m, rad, m/s and rad/s alike; smaller is better.
+        position_rmse, rotation_rmse, velocity_rmse: of noise-free simulations (m, rad, m/s).
+        coverage: share of records inside the bands of 50 and 90 %, mean over axes.
+    """
 
     log_score: Interval
+    log_score_gain: Interval
+    energy_score: dict[str, Interval]
     position_rmse: dict[str, Interval]
     rotation_rmse: dict[str, Interval]
     velocity_rmse: dict[str, Interval]
+    coverage: dict[str, dict[str, Interval]]
+
+
+@dataclass(frozen=True)
+class Refitted:
+    """A coefficient that was fitted before any cause was named: believed and fitted value."""
+
+    name: str
+    where: str
+    parameter: str
+    believed: float
+    fitted: Value
 
 
 @dataclass(frozen=True)
@@ -102,14 +150,26 @@ class DataSummary:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The whole finding."""
+    """The whole finding.
+
+    Attributes:
+        verdict: adequate (no cause), explained (all by names), partly_explained (names and
+            `unknown`), unexplained (`unknown` alone).
+        refitted: coefficients fitted before any cause was named.
+        gain: of base, refitted, extended (where there are causes) and black_box.
+        left_out: what was left out in turn, for gains here and in causes.
+        tested, threshold, alpha: names tried; nats that noise alone wins of so many, and how often.
+        seconds: that it took.
+    """
 
     version: int
     verdict: Verdict
     sentence: str
     causes: list[Cause]
+    refitted: list[Refitted]
     residual: dict[str, AxisResidual]
     gain: dict[str, ModelGain]
+    left_out: Literal["scenario", "run", "block", "nothing"]
     data: DataSummary
     tested: int
     threshold: float
@@ -170,5 +230,11 @@ def _schema(kind: Any, definitions: dict[str, Any]) -> dict[str, Any]:
         return {"type": "object", "additionalProperties": _schema(arguments[1], definitions)}
     if origin in (Union, UnionType):
         return {"anyOf": [_schema(a, definitions) for a in arguments]}
-    plain = {float: ["number", "null"], int: "integer", str: "string", bool: "boolean"}
+    plain = {
+        float: ["number", "null"],
+        int: "integer",
+        str: "string",
+        bool: "boolean",
+        type(None): "null",
+    }
     return {"type": plain[kind]}

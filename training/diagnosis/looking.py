@@ -1,0 +1,189 @@
+"""What one set of parameters shows: innovations, noise, responses; fits by exact predictions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ...models.dynamics import Dynamics
+from ...models.effects.base import Effect
+from ...models.effects.extended import Extended
+from ...models.effects.library import KINDS, Library
+from ...models.recording import Recording
+from ...models.vehicle import Vehicle
+from .data import Data, make_data
+from .gram import gram
+from .hypotheses import Design, Evidence, Fit
+from .innovations import Predictions, predict
+from .naming import parameters_of
+from .noise import Filter, Noise, estimate, make_filter, mean_jacobian
+from .responses import respond
+
+_RANDOM = ("waves", "current_varying")
+"""Causes that are sought as laws: their motion differs from run to run."""
+
+
+class Look(NamedTuple):
+    """All that one set of parameters shows."""
+
+    theta: Float[np.ndarray, " p"]
+    predictions: Predictions
+    noise: Noise
+    kalman: Filter
+    evidence: Evidence
+    z: Float[np.ndarray, "N 12 R"]
+    loss: float
+
+
+@dataclass(frozen=True)
+class Bench:
+    """One recording beside one believed model.
+
+    Attributes:
+        data: the runs.
+        vehicle: whose thrusters they are.
+        model: the believed model without effects.
+        library: every effect that may explain a difference.
+        believed: θ of the belief: zero but for effects that it holds already (p,).
+    """
+
+    data: Data
+    vehicle: Vehicle
+    model: Extended
+    library: Library
+    believed: Float[np.ndarray, " p"]
+
+    @classmethod
+    def of(cls, recording: Recording, vehicle: Vehicle, base: Dynamics | None = None) -> "Bench":
+        """`base` in place of the vehicle's preset is what is believed."""
+        data = make_data(recording, vehicle)
+        believed = vehicle.dynamics() if base is None else base
+        effects = believed.effects if isinstance(believed, Extended) else ()
+        core = believed.base if isinstance(believed, Extended) else believed
+        library, theta = _library(data, effects)
+        return cls(data, vehicle, Extended.create(core, (), vehicle.thrusters()), library, theta)
+
+    def with_effect(self, effect: Effect) -> "Bench":
+        """The same with one more effect, absent so far, behind those of the library."""
+        library = Library([*self.library.effects, effect])
+        old = [library.index(*_key(e)) for e in self.library.entries]
+        theta = np.zeros(library.size)
+        theta[old] = self.believed
+        return Bench(self.data, self.vehicle, self.model, library, theta)
+
+    def moved(self, theta: Float[np.ndarray, " q"], library: Library) -> Float[np.ndarray, " p"]:
+        """A θ of another library in this one's order."""
+        found = np.zeros(self.library.size)
+        for value, entry in zip(theta, library.entries, strict=True):
+            found[self.library.index(*_key(entry))] = value
+        return found
+
+    def mass(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "6 6"]:
+        """The mass matrix under θ (kg, kg·m, kg·m²)."""
+        model = self.model.with_effects(self.library.filled(jnp.asarray(theta)))
+        return np.asarray(model.inertia().matrix)
+
+    # ------------------------------------------------------------------------------- looking
+
+    def predict(self, theta: Float[np.ndarray, " p"]) -> tuple[Predictions, Noise, Filter]:
+        """Predictions with the noise and the filter that they ask for."""
+        p = predict(self.model, self.library, theta, self.data)
+        error, weight = np.asarray(p.error), self.data.weight
+        A = mean_jacobian(np.asarray(p.jacobian), weight)
+        mass = self.mass(theta)
+        noise = estimate(error, weight, A, mass, self.data.dt)
+        kalman = make_filter(noise, A, np.linalg.inv(mass), self.data.dt, len(self.data.u))
+        return p, noise, kalman
+
+    def look(
+        self,
+        theta: Float[np.ndarray, " p"],
+        chosen: Sequence[int] | None = None,
+        kalman: Filter | None = None,
+    ) -> Look:
+        """Innovations at θ and the responses to the parameters chosen.
+
+        By default all but those in single thrusters of causes that may be in all of them.
+        """
+        p, noise, own = self.predict(theta)
+        kalman = own if kalman is None else kalman
+        if chosen is None:
+            first = parameters_of(self.library, self.library.hypotheses(single=False))
+            chosen = sorted({*first, *np.flatnonzero(theta).tolist()})
+        design = Design.of(self.library, theta, chosen)
+        z = respond(self.model, self.library, theta, design.probes, self.data, p, kalman)
+        data = self.data
+        evidence = Evidence(self.library, theta, design, gram(z), data.cluster, data.fold)
+        own_z = z[0].reshape(len(data.u), 12, -1)
+        return Look(theta, p, noise, kalman, evidence, own_z, float(evidence.total[0, 0]) / 2)
+
+    def polish(
+        self,
+        theta: Float[np.ndarray, " p"],
+        chosen: Sequence[int],
+        kalman: Filter | None = None,
+        rounds: int = 4,
+    ) -> tuple[np.ndarray, Look, Fit]:
+        """Gauss–Newton on the parameters chosen, with exact predictions at every step.
+
+        The fit returned is at the θ returned: its errors are joint, clustered by run.
+        """
+        chosen = list(chosen)
+        low = np.array([self.library.entries[i].parameter.low for i in chosen])
+        high = np.array([self.library.entries[i].parameter.high for i in chosen])
+        theta = theta.copy()
+        theta[chosen] = np.clip(theta[chosen], low, high)
+        best: tuple[np.ndarray, Look, Fit] | None = None
+        for _ in range(rounds):
+            seen = self.look(theta, chosen, kalman)
+            fit = seen.evidence.fit(chosen)
+            if best is not None and kalman is not None and seen.loss > best[1].loss:
+                break
+            best = theta.copy(), seen, fit
+            theta[chosen] = np.clip(theta[chosen] + fit.values, low, high)
+            if np.all(np.abs(fit.values) < 0.15 * fit.errors + 1e-12):
+                break
+        assert best is not None
+        return best
+
+    def without_each(self, look: Look, chosen: Sequence[int]) -> Float[np.ndarray, "p R"]:
+        """θ of each piece, the parameters chosen refitted without the pieces it is left out with.
+
+        One Gauss–Newton step from the fit to all data, which is exact to first order in what a
+        fold weighs; values stay in their admissible range.
+        """
+        data, chosen = self.data, list(chosen)
+        theta = np.repeat(look.theta[:, None], len(data.fold), axis=1)
+        evidence = look.evidence
+        if not chosen or len(evidence.folds) < 2:
+            return theta
+        columns = [evidence.column(i) for i in chosen]
+        prior = np.diag(evidence.prior(chosen))
+        for number, label in enumerate(np.unique(data.fold)):
+            T = evidence.total - evidence.folds[number]
+            change = -np.linalg.solve(T[np.ix_(columns, columns)] + prior, T[columns, 0])
+            for i, c in zip(chosen, change, strict=True):
+                p = self.library.entries[i].parameter
+                theta[i, data.fold == label] = np.clip(look.theta[i] + c, p.low, p.high)
+        return theta
+
+
+def _key(entry: tuple) -> tuple[str, str, str]:
+    return entry[0], entry[1], entry[2].name
+
+
+def _library(data: Data, effects: Sequence[Effect]) -> tuple[Library, np.ndarray]:
+    floor = float(data.X[:, 6].min()) - 0.3
+    options = {"proximity": {"floor": floor}}
+    left_out = set(_RANDOM) | (set() if data.has_voltage else {"voltage_sag"})
+    kinds = [k for k in KINDS.values() if k.family != "disturbance" and k.name not in left_out]
+    own = {e.name: e for e in effects if e.name not in {k.name for k in kinds}}
+    library = Library([*(k.neutral(**options.get(k.name, {})) for k in kinds), *own.values()])
+    theta = np.zeros(library.size)
+    for effect in effects:
+        rows = [i for i, e in enumerate(library.entries) if e.cause == effect.name]
+        theta[rows] = np.asarray(effect.values)
+    return library, theta

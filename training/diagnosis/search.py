@@ -1,0 +1,202 @@
+"""Which causes are there together: forward selection with exact refits, and checks backwards."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from ...models.effects.library import Library, kind
+from .hypotheses import Fit
+from .laws import Law, find_laws, run_constants
+from .looking import Bench, Look
+from .naming import Choice, Hypothesis, admissible, choose, parameters_of
+from .noise import Filter
+
+BELIEFS = ("added_mass", "linear_drag", "quadratic_drag", "net_buoyancy")
+"""Coefficients that a user would expect fitted."""
+REFITS = {"none": (), "scales": ("thrust_scale",), "linear": BELIEFS}
+_CLOSE = 0.7
+_OF_A_LAW = 0.02
+"""Share of what the best law wins that a name must win where the law wins more."""
+
+
+@dataclass
+class Found:
+    """Where a search has come to.
+
+    Attributes:
+        base, first, current: the belief, the belief refitted, and with the causes.
+        accepted: causes in the order found, with the fit that named them.
+        fits: every name alone, beside the belief refitted.
+        threshold: of held-out nats in the last round.
+    """
+
+    base: Look
+    first: Look
+    current: Look
+    accepted: list[tuple[Choice, Fit]] = field(default_factory=list)
+    fits: dict[Hypothesis, Fit] = field(default_factory=dict)
+    threshold: float = 0.0
+
+    @property
+    def hypotheses(self) -> list[Hypothesis]:
+        """The causes named."""
+        return [choice.hypothesis for choice, _ in self.accepted]
+
+
+def refitted(bench: Bench, refit: str) -> list[int]:
+    """Parameters that are free beside every cause."""
+    return [i for i, e in enumerate(bench.library.entries) if e.cause in REFITS[refit]]
+
+
+def laws_of(bench: Bench, look: Look) -> list[Law]:
+    """Laws of the disturbance in what is left, largest gain first."""
+    data = bench.data
+    speed = np.linalg.norm(data.V[:-1, :3], axis=1)
+    found = find_laws(look.z.astype(float), speed, data.weight, data.fold, data.dt)
+    rows = bench.library.at("current_steady", "W")
+    evidence = look.evidence
+    if set(rows) <= set(evidence.design.owner.tolist()) and len(evidence.runs) > 2:
+        columns = [evidence.column(i) for i in rows]
+        sizes = np.array([bench.library.entries[i].parameter.probes[0] for i in rows])
+        gain, values = run_constants(evidence.runs, columns, sizes, evidence.fold)
+        values["time_constant"] = float(data.weight.sum(axis=0).mean() * data.dt)
+        found.append(Law("current_varying", "W", values, gain))
+    return sorted(found, key=lambda law: -law.heldout_gain)
+
+
+class Search:
+    """Forward selection on a bench; `rng` draws what noise alone can win."""
+
+    def __init__(
+        self,
+        bench: Bench,
+        nuisance: list[int],
+        alpha: float,
+        most: int,
+        rng: np.random.Generator,
+        progress: Callable[[float, str], None],
+    ):
+        self.bench, self.nuisance, self.alpha, self.most = bench, nuisance, alpha, most
+        self.rng, self.progress = rng, progress
+        free = {bench.library.entries[i].cause for i in nuisance}
+        self.names = [h for h in bench.library.hypotheses(single=False) if h[0] not in free]
+
+    def run(self, found: Found) -> Found:
+        """Add causes until none passes; all accepted are refitted together."""
+        for number in range(len(found.accepted), self.most):
+            self.progress(number / self.most, f"{number} causes so far")
+            choice, fits = self.next(found)
+            found.fits = found.fits or fits
+            if choice is None:
+                break
+            choice, theta = self._refine(choice, fits, found)
+            found.accepted.append((choice, choice.fit))
+            found.current = self.bench.look(theta)
+            self._backward(found)
+        return found
+
+    def next(self, found: Found) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
+        """The name that explains most of what is left, and the fits of all names."""
+        bench, current, taken = self.bench, found.current, found.hypotheses
+        beside = self.nuisance + parameters_of(bench.library, taken)
+        open_names = [h for h in self.names if h not in taken]
+        sets = [bench.library.at(*h) for h in open_names]
+        found.threshold = current.evidence.null_quantile(sets, beside, self.alpha, self.rng)
+        fits = {h: current.evidence.fit(s, beside) for h, s in zip(open_names, sets, strict=True)}
+        gains = {c.hypothesis[0]: f.heldout_gain for c, f in found.accepted}
+
+        def chosen(strict: bool, least: float) -> Choice | None:
+            return choose(
+                bench.library, current.theta, fits, max(found.threshold, least), self.alpha,
+                gains, strict,
+            )  # fmt: skip
+
+        choice = chosen(False, 0.0)
+        if choice is not None and self._about_thrust(choice):
+            fits |= self._single_thrusters(current, beside, taken)
+            choice = chosen(False, 0.0)
+        law = laws_of(bench, current)[0].heldout_gain
+        if choice is not None and law > choice.fit.heldout_gain:
+            # random structure is imitated by names: they must hold between runs by themselves
+            choice = chosen(True, _OF_A_LAW * law)
+        return choice, fits
+
+    def _about_thrust(self, choice: Choice) -> bool:
+        """Whether the best names so far leave it open that a single thruster is at fault."""
+        names = [choice.hypothesis[0], *(h[0] for h, _ in choice.rivals[:2])]
+        level = self.bench.data.command != "F_Bo_B"
+        return level and any(kind(name).family == "actuation" for name in names)
+
+    def _single_thrusters(
+        self, current: Look, beside: list[int], taken: list[Hypothesis]
+    ) -> dict[Hypothesis, Fit]:
+        """Fits of causes in one thruster each, by the filter of the other names."""
+        library = self.bench.library
+        names = [h for h in library.hypotheses(single=True) if h not in taken]
+        chosen = sorted({*parameters_of(library, names), *beside})
+        seen = self.bench.look(current.theta, chosen, current.kalman)
+        return {h: seen.evidence.fit(library.at(*h), beside) for h in names}
+
+    def _start(self, fit: Fit, theta: np.ndarray) -> np.ndarray:
+        moved = theta.copy()
+        moved[list(fit.parameters)] += fit.values
+        for i, change in fit.others.items():
+            moved[i] += change
+        return moved
+
+    def _refine(
+        self, choice: Choice, fits: dict[Hypothesis, Fit], found: Found
+    ) -> tuple[Choice, Float[np.ndarray, " p"]]:
+        """Fit the name with exact predictions; let close rivals try the same, and take the best."""
+        library, bench = self.bench.library, self.bench
+        beside = self.nuisance + parameters_of(library, found.hypotheses)
+
+        def fitted(h: Hypothesis, kalman: Filter | None) -> tuple[np.ndarray, Look]:
+            chosen = [*library.at(*h), *beside]
+            return bench.polish(self._start(fits[h], found.current.theta), chosen, kalman)[:2]
+
+        top = choice.hypothesis
+        theta, seen = fitted(top, None)
+        close = [h for h, g in choice.rivals[:2] if g > _CLOSE * choice.fit.heldout_gain]
+        if not close:
+            return choice, theta
+        best = bench.polish(theta, [*library.at(*top), *beside], seen.kalman, 2)[1]
+        start_loss = best.loss
+        for h in close:
+            if h[0] in kind(top[0]).simpler:
+                continue
+            other, rival = fitted(h, seen.kalman)
+            within = admissible(library, np.zeros_like(other), _as_fit(library, h, other))
+            if within and rival.loss < best.loss - (2.0 if best.loss == start_loss else 0.0):
+                top, theta, best = h, other, rival
+        if top == choice.hypothesis:
+            return choice, theta
+        rivals = ((choice.hypothesis, choice.fit.heldout_gain), *choice.rivals)
+        return Choice(top, fits[top], choice.ties, rivals), theta
+
+    def _backward(self, found: Found) -> None:
+        """Drop causes that those found later have made needless, and refit the rest."""
+        library, current = self.bench.library, found.current
+        chosen = parameters_of(library, found.hypotheses)
+        kept, theta = [], current.theta.copy()
+        for choice, fit in found.accepted:
+            own = library.at(*choice.hypothesis)
+            others = [i for i in chosen if i not in own]
+            again = current.evidence.fit(own, others)
+            ratio = current.theta[own] / np.maximum(again.errors, 1e-300)
+            if float(np.sum(ratio**2)) / 2 > found.threshold:
+                kept.append((choice, fit))
+            else:
+                theta[own] = 0.0
+        if len(kept) < len(found.accepted):
+            found.accepted = kept
+            rest = self.nuisance + parameters_of(library, found.hypotheses)
+            theta = self.bench.polish(theta, rest)[0] if rest else theta
+            found.current = self.bench.look(theta)
+
+
+def _as_fit(library: Library, h: Hypothesis, theta: np.ndarray) -> Fit:
+    rows = library.at(*h)
+    return Fit(tuple(rows), theta[rows], {}, np.zeros(len(rows)), 0.0, np.zeros(1), 1.0)

@@ -1,0 +1,224 @@
+"""A finding in words and numbers: causes with intervals, what is left, what was refitted."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+from jaxtyping import Float
+
+from ...models.effects.base import AXES, Effect
+from ...models.effects.library import kind
+from ...models.rigid_body import FossenDynamics
+from . import result
+from .experiments import next_experiment
+from .hypotheses import Fit
+from .laws import Law, estimated
+from .looking import Bench, Look
+from .naming import Choice, parameters_of
+from .search import Found
+
+CHANNELS = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
+_NAN = float("nan")
+
+
+def quantile(fit: Fit) -> float:
+    """Of Student's t for 95 % intervals: clusters less parameters are its degrees of freedom."""
+    return float(scipy.stats.t.ppf(0.975, max(len(fit.heldout) - len(fit.parameters), 1)))
+
+
+def values_of(
+    bench: Bench, theta: Float[np.ndarray, " p"], rows: Sequence[int], joint: Fit
+) -> dict[str, result.Value]:
+    """Parameters with intervals from the joint fit of all that is free, clustered by run."""
+    t = quantile(joint)
+    found = {}
+    for i in rows:
+        p, v = bench.library.entries[i].parameter, float(theta[i])
+        error = t * float(joint.errors[joint.parameters.index(i)])
+        found[p.name] = result.Value(v, p.unit, (v - error, v + error))
+    return found
+
+
+def cause(
+    choice: Choice, fit: Fit, bench: Bench, look: Look, joint: Fit, tested: int
+) -> result.Cause:
+    """A named cause; `joint` is the fit of all accepted parameters together."""
+    name, where = choice.hypothesis
+    rivals = [result.Rival(h[0], h[1], float(g)) for h, g in choice.rivals]
+    others = [*(h[0] for h in choice.ties), *(r.name for r in rivals)]
+    return result.Cause(
+        name=name,
+        where=where,
+        parameters=values_of(bench, look.theta, bench.library.at(name, where), joint),
+        evidence=result.Support(min(1.0, fit.p_value * tested), fit.heldout_gain),
+        rivals=rivals,
+        indistinguishable_from=list(dict.fromkeys(h[0] for h in choice.ties if h[0] != name)),
+        next_experiment=next_experiment(name, kind(name).family, others),
+    )
+
+
+def refitted(bench: Bench, look: Look, rows: Sequence[int], joint: Fit) -> list[result.Refitted]:
+    """Coefficients that were fitted beside the causes: believed and found."""
+    found = []
+    t = quantile(joint) if rows else 0.0
+    for i in rows:
+        e = bench.library.entries[i]
+        old = believed(bench, e.cause, e.where)
+        new = old + float(look.theta[i] - bench.believed[i])
+        error = t * float(joint.errors[joint.parameters.index(i)])
+        value = result.Value(new, e.parameter.unit, (new - error, new + error))
+        found.append(result.Refitted(e.cause, e.where, e.parameter.name, old, value))
+    return found
+
+
+def believed(bench: Bench, name: str, where: str) -> float:
+    """The believed model's own coefficient that a cause changes; 0 where it has none."""
+    core = bench.model.base
+    if not isinstance(core, FossenDynamics):
+        return 0.0
+    if name == "net_buoyancy":
+        return float(core.buoyancy - core.weight)
+    if where not in AXES:
+        return 0.0
+    i = AXES.index(where)
+    if name == "added_mass":
+        return float(core.mass.matrix()[i, i] - core.rigid_inertia[i, i])
+    if name in ("linear_drag", "quadratic_drag"):
+        return float(getattr(core, name).dense[i, i])
+    return 0.0
+
+
+def residual(bench: Bench, look: Look) -> dict[str, result.AxisResidual]:
+    """What is left, channel by channel."""
+    w = bench.data.weight
+    n = w.sum()
+    found = {}
+    for i, name in enumerate(CHANNELS):
+        z = look.z[:, i] * w
+        square = float((z**2).sum())
+        memory = float((z[1:] * z[:-1]).sum() / max(square, 1e-300))
+        found[name] = result.AxisResidual(square / n, memory, float(z.sum() / np.sqrt(n)))
+    return found
+
+
+# ------------------------------------------------------------------------------------- laws
+
+
+def law_causes(
+    laws: Sequence[Law], bench: Bench, look: Look
+) -> tuple[list[result.Cause], list[Effect]]:
+    """The best law as a cause, axis by axis, and the effect that has it."""
+    if not laws:
+        return [], []
+    top = laws[0]
+    same = [law for law in laws if law.name == top.name]
+    parameters: dict[str, result.Value] = {}
+    cls = kind(top.name)
+    values = np.zeros(cls.size())
+    for number, law in enumerate(same):
+        for name, told in _law_values(law, bench, look).items():
+            parameters[name if number == 0 else f"{name}_{law.where}"] = told
+            values[cls.index(law.where, name)] = told.value
+    rivals = [result.Rival(r.name, r.where, r.heldout_gain) for r in laws if r.name != top.name]
+    named = result.Cause(
+        name=top.name,
+        where=", ".join(law.where for law in same),
+        parameters=parameters,
+        evidence=result.Support(float(np.exp(-top.heldout_gain)), top.heldout_gain),
+        rivals=rivals[:4],
+        indistinguishable_from=[],
+        next_experiment=next_experiment(top.name, "disturbance", [r.name for r in rivals]),
+    )
+    return [named], [cls(jnp.asarray(values))]
+
+
+def _law_values(law: Law, bench: Bench, look: Look) -> dict[str, result.Value]:
+    """A law's numbers in the units of its effect, with intervals by the delta method."""
+    data = bench.data
+    units = {p.name: p.unit for p in kind(law.name).parameters}
+    cluster = data.cluster
+    if law.loss is not None and len(law.heldout) != len(cluster):
+        cluster = np.arange(len(law.heldout))
+    at, covariance = estimated(law, cluster)
+    once, steady = _responses(bench, look, law.where)
+
+    def physical(x: np.ndarray) -> np.ndarray:
+        v = np.exp(x)
+        if law.name == "disturbance_impacts":
+            share, size, rest = v
+            return np.array([np.sqrt(max(size**2 - rest**2, 1e-12)) / once, share / data.dt])
+        if law.name == "disturbance_colour":
+            tau, kappa = v[0], min(v[1], 0.99)
+            rho = np.exp(-data.dt / tau)
+            square = (kappa / (1 - kappa) - rho**2 * kappa) / (1 - rho**2)
+            return np.array([np.sqrt(square) / steady, tau])
+        return v
+
+    values, D = physical(at), []
+    for d in 1e-4 * np.eye(len(at)):
+        D.append((np.log(physical(at + d)) - np.log(physical(at - d))) / 2e-4)
+    spread = np.sqrt(np.maximum(np.diag(np.array(D).T @ covariance @ np.array(D)), 0))
+    found = {}
+    for name, value, s in zip(units, values, spread, strict=False):
+        low, high = value * np.exp(-1.96 * s), value * np.exp(1.96 * s)
+        found[name] = result.Value(float(value), units[name], (float(low), float(high)))
+    if law.name == "current_varying":
+        tau = law.parameters["time_constant"]
+        found["time_constant"] = result.Value(tau, "s", (tau, _NAN))
+    return found
+
+
+def _responses(bench: Bench, look: Look, axis: str) -> tuple[float, float]:
+    """Whitened innovation on an axis for a unit impulse, and in the end for a unit wrench."""
+    if axis not in AXES:
+        return 1.0, 1.0
+    i, dt = AXES.index(axis), bench.data.dt
+    a = np.linalg.inv(bench.mass(look.theta))[:, i]
+    d = np.concatenate([dt * dt / 2 * a, dt * a])
+    w = bench.data.weight
+    A = np.einsum("nijr,nr->ij", np.asarray(look.predictions.jacobian), w) / w.sum()
+    white = look.kalman.whiten[-1]
+    lasting = np.linalg.solve(np.eye(12) - A @ look.kalman.keep[-1], d)
+    return abs(float((white @ d)[6 + i])) / dt, abs(float((white @ lasting)[6 + i]))
+
+
+# -------------------------------------------------------------------------------- sentences
+
+
+def verdict(causes: Sequence[result.Cause]) -> result.Verdict:
+    """What the causes amount to."""
+    unknown = [c.name == "unknown" for c in causes]
+    if not causes:
+        return "adequate"
+    if not any(unknown):
+        return "explained"
+    return "unexplained" if all(unknown) else "partly_explained"
+
+
+def sentence(causes: Sequence[result.Cause], problems: Sequence[str]) -> str:
+    """The finding in a line or two."""
+    first = f"The data have faults ({len(problems)}), see there first. " if problems else ""
+    if not causes:
+        return first + "Your model is adequate at this noise."
+    named = ", ".join(f"{c.name} ({c.where})" for c in causes if c.name != "unknown")
+    told = f"The data differ from your model by: {named}." if named else ""
+    for c in causes:
+        if c.structure is not None:
+            told += f" No name explains {c.structure.description}."
+    return first + told.strip()
+
+
+def noise_words(look: Look) -> dict[str, float]:
+    """Levels of noise, mean over the axes of a sensor."""
+    groups = ("position_m", "attitude_rad", "velocity_m_s", "rate_rad_s")
+    found = {g: float(np.mean(look.noise.record[3 * i : 3 * i + 3])) for i, g in enumerate(groups)}
+    return found | {
+        f"diffusion_{a}": float(b) for a, b in zip(AXES, look.noise.diffusion, strict=True)
+    }
+
+
+def joint_rows(found: Found, nuisance: Sequence[int], bench: Bench) -> list[int]:
+    """All parameters that are free in the end."""
+    rows = [*parameters_of(bench.library, found.hypotheses), *nuisance]
+    return list(dict.fromkeys(rows))

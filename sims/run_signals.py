@@ -56,8 +56,10 @@ def with_present(
     found = dict(signals)
     for name in _ESTIMATES:
         time, value = signals[name]
-        present = station.GetOutputPort(name).Eval(context)
-        found[name] = Signal(np.append(time, root.get_time()), np.vstack([value, present]))
+        present = np.asarray(station.GetOutputPort(name).Eval(context))
+        found[name] = Signal(
+            np.append(time, root.get_time()), np.concatenate([value, present[None]])
+        )
     return found
 
 

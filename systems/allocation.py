@@ -50,17 +50,17 @@ class ThrustAllocation(LeafSystem):
         self.DeclareVectorOutputPort("pwm", count, self._put_pwm, once)
         self.DeclareVectorOutputPort("thruster_force", count, self._put_forces, once)
 
-    def _both(self, context: Context) -> list[np.ndarray]:
+    def _both(self, context: Context) -> np.ndarray:
         F = np.asarray(self._F.Eval(context))
-        if not np.all(np.isfinite(F)):
+        if not np.isfinite(F).all():
             raise FloatingPointError(
                 f"{self.get_name() or 'ThrustAllocation'}: the wanted wrench at "
                 f"t = {context.get_time():.4f} s is not finite: {F}"
             )
-        return self._allocate(F)
+        return self._allocate.flat(F)
 
     def _put_pwm(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._both(context)[0])
+        output.SetFromVector(self._both(context)[: output.size()])
 
     def _put_forces(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._both(context)[1])
+        output.SetFromVector(self._both(context)[output.size() :])

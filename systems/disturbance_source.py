@@ -89,6 +89,7 @@ class DisturbanceSource(LeafSystem):
             X = np.array([1.0, 0, 0, 0, 0, 0, 0])
         V = value_or_zeros(self._V, context)
         when = np.array([context.get_time(), ahead])
-        results = self._advance(X, V, when, value_or_zeros(self._noise, context), state)
-        for index, value in enumerate(results):  # state, wrench, water in this order
-            discrete_state.set_value(index, value)
+        result = self._advance.flat(X, V, when, value_or_zeros(self._noise, context), state)
+        discrete_state.set_value(0, result[:-12])
+        discrete_state.set_value(1, result[-12:-6])
+        discrete_state.set_value(2, result[-6:])

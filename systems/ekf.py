@@ -86,7 +86,7 @@ class Ekf(LeafSystem):
         start, unravel = ravel_pytree(core.init(jnp.asarray(X0), jnp.asarray(V0)))
         n = start.size
         outputs = {"X_WB": 7, "V_WB_B": 6, "covariance": ERRORS**2, "status": len(STATUS)}
-        self._ratio = round(ratio)
+        self._ratio, self._period = round(ratio), core.period
         self._samples = core.samples_at_once(self._ratio)
         self._filter = self.DeclareDiscreteState(BasicVector(np.asarray(start).tolist()))
         self._outputs = [self.DeclareDiscreteState(size) for size in outputs.values()]
@@ -148,7 +148,7 @@ class Ekf(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         """Keep the sample that is shown; with the last of several, step over all of them."""
         t = context.get_time()
-        tick = round(t / self.filter.period)
+        tick = round(t / self._period)
         phase = tick % self._samples
         imu = value_or_zeros(self._readings[0], context)
         if phase:

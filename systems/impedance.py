@@ -139,7 +139,7 @@ class Impedance(LeafSystem):
         return jnp.where(wanted.valid, F, 0)
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        (F,) = self._step(
+        F = self._step.flat(
             np.array([context.get_time()]),
             self._plan.Eval(context),
             self._X.Eval(context),

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice, pairwise
+from math import lcm
 
 import jax.numpy as jnp
 import numpy as np
@@ -132,14 +133,20 @@ class SensorSuite(LeafSystem):
             function = VectorFunction(packed, inputs, [self._sizes[i] for i in writes])
             return function, reads, writes
 
+        cycle = lcm(*every)
+
+        @cache
+        def call_at(phase: int) -> tuple[VectorFunction, list[int], list[int]]:
+            return call(tuple(phase % m == 0 for m in every))
+
         def update(context: Context, discrete_state: DiscreteValues) -> None:
             t = context.get_time()
-            tick = round(t / period)
-            function, reads, writes = call(tuple([tick % m == 0 for m in every]))
+            function, reads, writes = call_at(round(t / period) % cycle)
             state = context.get_discrete_state()
-            values = [value_or_zeros(port, context) for port in ports]
-            results = function(np.array([t]), *values, *[state.value(i) for i in reads])
-            for index, value in zip(writes, results, strict=True):
+            parts = [np.array([t])]
+            parts += [value_or_zeros(port, context) for port in ports]
+            parts += [state.value(index) for index in reads]
+            for index, value in zip(writes, function(*parts), strict=True):
                 discrete_state.set_value(index, value)
 
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, update)

@@ -325,6 +325,4 @@ def test_the_first_guess_of_the_diffusion_is_of_the_right_size():
     truth = vehicle.dynamics(b, jnp.float32)
     windows = simulated(truth, 400, steps=6, dt=0.05)
     found = estimate_diffusion(vehicle.dynamics(dtype=jnp.float32), windows, horizon_s=0.1)
-    # drag takes up to a third of the angular noise within the horizon
-    assert (found > 0.6 * b).all()
-    assert (found < 1.15 * b).all()
+    np.testing.assert_allclose(found, b, rtol=0.2)  # medians of 400 pieces on either side

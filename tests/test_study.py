@@ -79,7 +79,9 @@ def test_the_full_study_has_the_papers_sizes():
     assert (study.evaluation.samples, study.evaluation.shown_samples) == (350, 750)
     for name in METHODS:
         config = RunSettings.of(study, "sparse", name, 3).training
-        assert config == replace(method_config(name), seed=3)
+        method = method_config(name)
+        objective = replace(method.objective, substeps=3)
+        assert config == replace(method, seed=3, steps=600, objective=objective)
 
 
 def test_sizes_fit_every_method():

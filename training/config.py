@@ -52,15 +52,16 @@ class PretrainConfig:
 class DriftConfig:
     """Least squares on the output biases before the law is trained (`training.drift`)."""
 
-    iterations: int = 8
+    iterations: int = 12
     """At most so many steps of each of two passes; 0 leaves the fit out."""
     length_s: float = 1.0
     """Seconds of the pieces whose noise-free motion is compared."""
     pieces: int = 256
     """Pieces used, evenly taken from all."""
-    prior: float = 1e-3
-    """Weight of the squared change of a raw bias (a change of 1 doubles a coefficient, about)
-    against the mean squared error in the units of what the model misses."""
+    prior: float = 1e-4
+    """Weight of the squared change of a raw bias (a change of 1 doubles a coefficient, about) and
+    of the relative change of the potential's bound and net buoyancy, against the mean squared error
+    in the units of what the model misses."""
 
     def __post_init__(self) -> None:
         check_numbers(self)
@@ -82,7 +83,7 @@ class TrainingConfig:
     steps: int = 400
     batch: int = 16
     """Windows a step."""
-    learning_rate: float = 3e-3
+    learning_rate: float = 1e-3
     """Adam's peak rate; the paper's is 1e-4, constant."""
     schedule: Literal["cosine", "constant"] = "cosine"
     """After the warm-up: cosine decay to 1 % of the peak, or constant."""

@@ -115,7 +115,8 @@ def _residuals(
         # a far step of the solver may run away: a large finite error tells it to go back
         errors = jnp.where(jnp.isfinite(errors), jnp.clip(errors, -1e3, 1e3), 1e3)
         errors = (errors / errors.size**0.5).astype(values.dtype)
-        return errors, config.prior**0.5 * (values - start.astype(values.dtype))
+        change = (values - start) / jnp.maximum(1, jnp.abs(start))
+        return errors, config.prior**0.5 * change.astype(values.dtype)
 
     return residuals
 
@@ -123,7 +124,8 @@ def _residuals(
 def _constants(model: Spinn) -> list[Any]:
     """The numbers that make M, D, D^f and V where networks give zero."""
     potential = model.learned_potential
-    found = [model.matrix_heads.bias, _network(potential).skip]
+    network = _network(potential)
+    found = [model.matrix_heads.bias, network.skip, network.bound]
     if model.constant_mass is not None:
         found.append(model.constant_mass)
     if isinstance(potential, (GravityPotential, EulerPotential)):

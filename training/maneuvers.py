@@ -1,7 +1,8 @@
 """The ten feedforward maneuvers of the simulated and ocean data sets (Palmer et al., figure 3).
 
-Each holds one wrench from rest. The figure names no numbers: directions here are its evident ones,
-sizes are fractions of what the thrusters can give along each direction.
+Each holds one wrench from rest. The paper names no numbers: both directions of surge, sway and
+heave, yaw, and three combinations that move every axis. Sizes are fractions of what the thrusters
+can give along each direction.
 """
 
 import jax.numpy as jnp
@@ -19,11 +20,14 @@ MANEUVERS: dict[str, tuple[float, float, float, float, float, float]] = {
     "heave-up": (0, 0, 1, 0, 0, 0),
     "heave-down": (0, 0, -1, 0, 0, 0),
     "yaw-left": (0, 0, 0, 0, 0, 1),
-    "yaw-right": (0, 0, 0, 0, 0, -1),
     "surge-yaw-left": (1, 0, 0, 0, 0, 0.5),
     "surge-sway-heave": (0.7, -0.7, 0.7, 0, 0, 0),
+    "heave-roll-pitch": (0, 0, 0.7, 0.1, 0.1, 0),
 }
-"""Direction of each wrench, in units of the largest one along each single axis."""
+"""Direction of each wrench, in units of the largest one along each single axis.
+
+Without moments about roll and pitch no data told these axes' inertia, damping, restoring moment
+and diffusion but in proportion to each other."""
 
 
 def maneuver_wrench(

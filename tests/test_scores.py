@@ -82,6 +82,20 @@ def test_the_true_law_beats_perturbed_ones(scored, name):
     assert difference.mean() > 5 * error
 
 
+@pytest.mark.parametrize("name", list(LAWS))
+def test_the_energy_score_is_proper_too(name):
+    """It is known to feel correlations less (Pinson and Tastu 2013): four times the windows."""
+    kernel = VelocityKernel(bandwidths(VelocityKernel, N), profile="energy")
+
+    def score(law, key):
+        z, y = law(jax.random.fold_in(key, 0)), gaussian(jax.random.fold_in(key, 1), 1)
+        return np.asarray(kernel_score(kernel, z, y[:, :, 0], FIRST, SECOND))
+
+    keys = jax.random.split(jax.random.key(5), 4)
+    gap = np.concatenate([score(LAWS[name], k) - score(lambda k: gaussian(k, P), k) for k in keys])
+    assert gap.mean() > 5 * gap.std() / np.sqrt(gap.size)
+
+
 def test_a_score_that_sees_one_time_alone_is_blind_to_correlation():
     """Equal one-time marginals, opposite lag correlation: only the joint law tells them apart."""
     kernel = VelocityKernel(bandwidths(VelocityKernel, N))

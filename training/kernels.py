@@ -4,10 +4,15 @@ Each kernel is k(z, z') = exp(-½ (d₁² + d₂²)), d_k² the squared distance
 t_k in axes scaled by the bandwidths γ_k (Palmer et al., velocity, chordal and geodesic kernel).
 With several `scales` s it is the mean of exp(-½ (d₁² + d₂²) / s²), which is characteristic where
 each one is, and keeps a gradient when the laws are still far apart.
+
+With the profile `energy` it is -√(d₁² + d₂²) instead, whose kernel score is the energy score
+(Székely and Rizzo 2013; Gneiting and Raftery 2007, eq. 22): no scale to choose but the axes'
+relative ones, and proper for twists and chordal poses. The geodesic distance of rotations is not of
+negative type, so that there it is proper for laws within about a radian alone.
 """
 
 import abc
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +21,10 @@ from jaxtyping import Array, Float
 
 from ..models import se3
 from .geodesic import relative_log
+
+Profile = Literal["gaussian", "energy"]
+
+_NEAR = 1e-12  # added to d², so that the energy profile has a gradient where samples coincide
 
 
 def _subtract(a: Array, b: Array) -> list[Array]:
@@ -27,6 +36,7 @@ class Kernel(eqx.Module):
 
     bandwidths: Float[Array, "C N"]
     scales: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
+    profile: Profile = eqx.field(static=True, default="gaussian")
     floors: ClassVar[tuple[float, ...]]
     """Least bandwidth of each axis: what no sensor resolves (m, rad, m/s, rad/s, or 1)."""
 
@@ -48,6 +58,8 @@ class Kernel(eqx.Module):
 
     def value(self, d2: Float[Array, "*c"]) -> Float[Array, "*c"]:
         """The kernel as a function of d₁² + d₂²."""
+        if self.profile == "energy":
+            return -jnp.sqrt(d2 + _NEAR)
         total = jnp.zeros_like(d2)
         for s in self.scales:
             total = total + jnp.exp(d2 * (-0.5 / (s * s)))

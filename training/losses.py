@@ -1,7 +1,7 @@
 """The objectives: finite dimensional matching (with a squared error), and a squared error alone."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -14,7 +14,14 @@ from ..models.checks import check_numbers, require
 from ..models.dynamics import Dynamics
 from ..models.errors import UserError
 from ..models.spinn import Spinn
-from .kernels import KERNELS, GeodesicKernel, Kernel, VelocityKernel, bandwidths_from_differences
+from .kernels import (
+    KERNELS,
+    GeodesicKernel,
+    Kernel,
+    Profile,
+    VelocityKernel,
+    bandwidths_from_differences,
+)
 from .objective import Batch, Objective
 from .predict import predict, predict_drift
 from .scores import kernel_score, time_pairs
@@ -38,6 +45,8 @@ class Fdm:
     """Cyclic shifts that pair predicted samples; null takes all pairs."""
     scales: tuple[float, ...] = (1.0, 0.35)
     """Multiples of the bandwidths whose kernels are averaged."""
+    profile: Profile = "gaussian"
+    """`energy` puts the energy score in place of the Gaussian kernels' (`training.kernels`)."""
     bandwidth_quantile: float = 0.5
     bandwidth_factor: float = 1.0
     pose_weight: float = 1.0
@@ -56,6 +65,7 @@ class Fdm:
     def __post_init__(self) -> None:
         check_numbers(self)
         require(self.pose_kernel in ("geodesic", "chordal"), self, "pose_kernel", "use a known one")
+        require(self.profile in get_args(Profile), self, "profile", "use gaussian or energy")
         require(self.samples >= 2, self, "samples", "give at least 2")
         require(self.time_pairs >= 1, self, "time_pairs", "give at least 1")
         require(len(self.lags_s) > 0 and min(self.lags_s) > 0, self, "lags_s", "give times above 0")
@@ -75,8 +85,10 @@ class Fdm:
             config=self,
             lags=tuple(dict.fromkeys(lags)),
             error=SquaredError.build(self.mse_unit, self.substeps, model, windows),
-            pose_kernel=kernel(jnp.ones((len(kernel.floors), steps), dtype), self.scales),
-            velocity_kernel=VelocityKernel(jnp.ones((6, steps), dtype), self.scales),
+            pose_kernel=kernel(
+                jnp.ones((len(kernel.floors), steps), dtype), self.scales, self.profile
+            ),
+            velocity_kernel=VelocityKernel(jnp.ones((6, steps), dtype), self.scales, self.profile),
         )
         return unfitted.refit(model, windows)
 

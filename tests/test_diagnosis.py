@@ -272,3 +272,50 @@ def test_predictions_without_noise_have_no_error():
     error = np.abs(np.asarray(p.error)).max(axis=(0, 2))
     assert np.all(error[6:] < 0.01 * step)
     assert np.all(error[:6] < 0.01 * step * 0.05)
+
+
+def test_structure_without_a_name_is_found_where_it_is(tmp_path):
+    """The flow's memory on one axis: seen there, with its time and frequency, and on no other."""
+    from spinndrift.training.diagnosis.structures import Screen, _memory, refined
+
+    case, recording = recorded(tmp_path, 70002, "unknown", names=("memory",))
+    hidden = case.answer()["causes"][0]
+    bench = Diagnoser(recording, VEHICLE).bench
+    look = bench.look(bench.believed)
+    screen, rng = Screen(bench, look, None), np.random.default_rng(0)
+    times, frequencies = (0.4, 1.2, 4.0), (0.0, 0.2, 0.5, 1.0)
+    found = {
+        axis: screen.match(_memory(bench, i, times, frequencies), 0.01, rng)
+        for i, axis in ((1, "sway"), (5, "yaw"))
+    }
+    assert hidden["where"] == "yaw"
+    assert found["yaw"].gain > found["yaw"].threshold
+    assert found["yaw"].gain > 50 * abs(found["sway"].gain)
+    effect = refined(screen, found["yaw"], rng)
+    parameters = hidden["parameters"]
+    assert effect.numbers[0] == pytest.approx(parameters["decay"]["value"], rel=0.3)
+    assert effect.numbers[1] == pytest.approx(parameters["frequency"]["value"], rel=0.15)
+
+
+def test_axes_that_are_not_driven_and_filled_samples_are_told(tmp_path):
+    from hidden.faults import spoil
+
+    from spinndrift.training.diagnosis.checks import problems
+
+    idle = draw(3, "null", plan=Plan(scenarios=2, runs=1, seconds=4.0, idle=(1,)))
+    idle.write(tmp_path / "idle")
+    assert Diagnoser(read_csv(tmp_path / "idle"), VEHICLE).quiet == ["sway"]
+    case = draw(3, "null", plan=PLAN)
+    assert problems(_read(tmp_path / "clean", case.logged())) == ([], [])
+    for fault, word in (("stuck", "stuck"), ("clock_jump", "clock")):
+        runs, told = spoil(case.logged(), fault, seed=3)
+        found, faulty = problems(_read(tmp_path / fault, runs))
+        assert word in " ".join(found)
+        assert faulty == [int(told[0]["file"][4:7]) - 1]
+
+
+def _read(folder, runs):
+    from hidden.write import write_folder
+
+    write_folder(folder, runs)
+    return read_csv(folder)

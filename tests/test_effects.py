@@ -1,5 +1,7 @@
 """Every effect is absent at zero, and acts as its own equation says."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from spinndrift.models.effects import KINDS, Extended, Library
 from spinndrift.models.effects.drag import COUPLINGS
 from spinndrift.models.effects.predict import advance
 from spinndrift.models.effects.thrust import REFERENCE
+from spinndrift.models.effects.unknown import Unknown
 from spinndrift.models.errors import UserError
 from spinndrift.models.integrate import rollout
 from spinndrift.models.vehicle import load_vehicle
@@ -327,3 +330,46 @@ def test_further_fields_are_stored(tmp_path):
         again.extra_wrench(X, V), model.extra_wrench(X, V)
     )  # the bottom lies where it was
     assert again.remember(U)[0].shape == (240, N)
+
+
+def test_a_memory_without_a_name_is_its_convolution():
+    """z(t) = ∫ e^((-1/T + 2πif) s) v(t - s) ds against a fine sum; the wrench weighs it."""
+    T, f, dt, steps, fine = 1.4, 0.3, 0.05, 80, 200
+    effect = Unknown.neutral(kind="memory", acts_on="sway", numbers=(T, f))
+    effect = dataclasses.replace(effect, values=jnp.array([0.5, 2.0, -1.0]))
+    v = np.random.default_rng(0).standard_normal(steps)
+    memory, push = jnp.zeros((2, 1)), jnp.zeros((6, 1))
+    for x in v:
+        memory, push = effect.feel(memory, jnp.zeros((6, 1)).at[1].set(x), dt)
+    t = (np.arange(steps * fine) + 0.5) * dt / fine
+    kernel = np.exp((-1 / T + 2j * np.pi * f) * (steps * dt - t))
+    z = np.sum(kernel * np.repeat(v, fine)) * dt / fine
+    np.testing.assert_allclose(np.asarray(memory)[:, 0], [z.real, z.imag], rtol=1e-4)
+    assert float(push[1, 0]) != 0
+    assert float(jnp.abs(push).sum() - jnp.abs(push[1]).sum()) == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "acts_on", "numbers"),
+    [
+        ("motion", "yaw", (5.0, 13.0)),
+        ("flow", "W", (0.5, 0.0, 0.0, 1.0, -1.0)),
+        ("thruster", "3", (0.0,)),
+        ("depth", "W", (-3.0, 0.5)),
+        ("pose", "heave", (0.0,)),
+    ],
+)
+def test_what_has_no_name_is_stored_and_moves_the_vehicle(tmp_path, kind, acts_on, numbers):
+    effect = Unknown.neutral(kind=kind, acts_on=acts_on, numbers=numbers)
+    model = PLAIN.with_effects((dataclasses.replace(effect, values=0.1 + effect.values),))
+    save_model(tmp_path / "m.spinn", model)
+    again = load_model(tmp_path / "m.spinn")[0]
+    assert isinstance(again, Extended)
+
+    def drift(model):
+        return np.asarray(model.drift(model.inertia(), X, V, U))
+
+    np.testing.assert_array_equal(drift(model), drift(again))
+    plain = drift(PLAIN)
+    np.testing.assert_allclose(drift(PLAIN.with_effects((effect,))), plain, atol=1e-12)
+    assert np.abs(drift(model) - plain).max() > 1e-4

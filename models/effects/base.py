@@ -183,6 +183,16 @@ class Effect(eqx.Module):
         del dt
         return memory, level
 
+    def feel(
+        self,
+        memory: Float[Array, "m *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        dt: Any,
+    ) -> tuple[Float[Array, "m *#batch"], Float[Array, "6 *#batch"]]:
+        """Memory after a step of `dt` s at a velocity, and the wrench F_Bo_B that it makes."""
+        del dt
+        return memory, jnp.zeros_like(V_WB_B)
+
     def thrust(
         self,
         force: Float[Array, "n *#batch"],

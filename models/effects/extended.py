@@ -259,6 +259,22 @@ class Extended(Dynamics):
                 i += 1
         return tuple(kept), level
 
+    def feel(
+        self, memory: Memory, V_WB_B: Float[Array, "6 *#batch"], dt: Any
+    ) -> tuple[Memory, Float[Array, "6 *#batch"] | None]:
+        """Memories after a step at a velocity, and the wrench that they make, if any."""
+        kept, total, i = [], None, 0
+        for effect in self.effects:
+            if not effect.memory_size:
+                continue
+            new = memory[i]
+            if effect.acts("feel"):
+                new, push = effect.feel(new, V_WB_B, dt)
+                total = push if total is None else total + push
+            kept.append(new)
+            i += 1
+        return tuple(kept), total
+
     def observe(
         self,
         X_WB: Float[Array, "7 *#batch"],

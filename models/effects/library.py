@@ -29,6 +29,7 @@ from .proximity import Proximity
 from .supply import LoadDroop, VoltageSag
 from .tether import Tether
 from .thrust import ThrustAsymmetry, ThrustCurve, ThrusterDeadZone, ThrusterGain, ThrustScale
+from .unknown import Unknown
 from .water import CurrentSteady, CurrentVarying, Waves
 
 KINDS: dict[str, type[Effect]] = {
@@ -76,11 +77,13 @@ KINDS: dict[str, type[Effect]] = {
 
 
 def kind(name: str) -> type[Effect]:
-    """The class of a cause.
+    """The class of a cause; `unknown` is one for what has no name.
 
     Raises:
         UserError: there is no such cause.
     """
+    if name == Unknown.name:
+        return Unknown
     if name not in KINDS:
         raise UserError(f"cause {name!r} is unknown: take one of {', '.join(sorted(KINDS))}")
     return KINDS[name]
@@ -125,7 +128,7 @@ class Library:
         every = list(dict.fromkeys((e.cause, e.where) for e in self.entries))
         if single is None:
             return every
-        return [h for h in every if (KINDS[h[0]].places == ALL_OR_ONE and h[1] != "all") == single]
+        return [h for h in every if (kind(h[0]).places == ALL_OR_ONE and h[1] != "all") == single]
 
     def filled(self, theta: Float[Array, "p *batch"]) -> tuple[Effect, ...]:
         """The effects with values from θ, whose batch axes they take."""

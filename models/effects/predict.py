@@ -33,6 +33,9 @@ def advance(
     stages are one loop, so that a model of many effects compiles once.
     """
     memory, levels = model.actuate(memory, command, dt, substeps)
+    memory, felt = model.feel(memory, V_WB_B, dt)
+    if felt is not None:
+        push = felt if push is None else push + felt
     dtype = V_WB_B.dtype
     h = jnp.asarray(dt / substeps, dtype)
     batch = jnp.broadcast_shapes(

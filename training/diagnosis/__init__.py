@@ -11,6 +11,8 @@ The way of a diagnosis, one module a step:
 `naming`      which of them to give: vetoes, nesting, echoes, ties
 `looking`     all that one set of parameters shows, and fits with exact predictions
 `search`      which causes are there together: forward and backward
+`structures`  what a wrench could depend on besides, group by group
+`unknowns`    when to say that no name explains it
 `laws`        what is left: heavy tails, memory, dependence on speed
 `checks`      data at fault: stuck sensors, jumps, axes never excited
 `gain`        what a model is worth on data left out: scores, simulations, bands

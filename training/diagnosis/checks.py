@@ -1,80 +1,103 @@
-"""Data at fault, found before anything is explained by physics."""
+"""Data at fault, and what data can't tell, found before anything is explained by physics."""
 
 import numpy as np
 
+from ...models.effects.base import AXES
 from ...models.recording import Recording
 from .data import Data
 
-AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 _STUCK = 0.5  # s
+_FILLED = 3  # samples on a straight line
+_STILL = 0.02
+"""Share of the strongest axis' command below which an axis counts as not driven."""
+_CHANNELS = {
+    "X_WB": ("qw", "qx", "qy", "qz", "x", "y", "z"),
+    "V_WB_B": ("u", "v", "w", "p", "q", "r"),
+}
 
 
-def problems(recording: Recording) -> list[str]:
-    """Sensors that stand still while others move, jumps of the pose; one sentence each.
+def problems(recording: Recording) -> tuple[list[str], list[int]]:
+    """Sensors that stand still, jumps of the pose, stretches without samples.
 
-    A channel is stuck where it repeats one value exactly for longer than half a second in a run
-    in which it otherwise changes, or never changes while the vehicle is driven.
+    One sentence each, and the runs (by number, scenario by scenario) that have them. A channel is
+    stuck where it repeats one value exactly for longer than half a second while others change; it
+    is no fault if it does so in every run and is part of the pose (a vehicle held in place).
+    Samples on a straight line in all velocities were filled in: a gap or a jump of the clock.
     """
-    found = []
-    labels = {
-        "X_WB": ("qw", "qx", "qy", "qz", "x", "y", "z"),
-        "V_WB_B": ("u", "v", "w", "p", "q", "r"),
-    }
-    stuck: dict[str, int] = {}
-    jumps = 0
-    for run in recording.trajectories():
+    stuck: dict[str, list[int]] = {}
+    jumps: list[int] = []
+    filled: list[int] = []
+    longest, count = 0.0, 0
+    for number, run in enumerate(recording.trajectories()):
+        count += 1
         for name, values in (("X_WB", run.X_WB), ("V_WB_B", run.V_WB_B)):
-            for label, column in zip(labels[name], values.T, strict=True):
-                if _longest_repeat(column) * recording.dt > _STUCK and np.isfinite(column).all():
-                    stuck[f"{name}.{label}"] = stuck.get(f"{name}.{label}", 0) + 1
+            for label, column in zip(_CHANNELS[name], values.T, strict=True):
+                still = _longest(np.diff(column) == 0) * recording.dt
+                if still > _STUCK and np.isfinite(column).all():
+                    stuck.setdefault(f"{name}.{label}", []).append(number)
         moved = np.linalg.norm(np.diff(run.X_WB[:, 4:], axis=0), axis=1)
         speed = np.linalg.norm(run.V_WB_B[:-1, :3], axis=1) * recording.dt
         excess = np.abs(moved - speed)
-        scale = np.nanmedian(excess) + 1e-6
-        jumps += int(np.nansum(excess > 30 * scale + 0.1))
-    still = len([1 for _ in recording.trajectories()])
-    for channel, count in stuck.items():
-        if count < still or channel.startswith("V"):
-            found.append(
-                f"{channel} repeats one value for {_STUCK:g} s or more in {count} runs: stuck?"
-            )
+        if np.nansum(excess > 30 * np.nanmedian(excess) + 0.1):
+            jumps.append(number)
+        bend = np.abs(np.diff(run.V_WB_B, 2, axis=0)).max(axis=1, initial=0.0)
+        line = _longest(bend < 1e-7 * np.nanstd(run.V_WB_B))
+        if line >= _FILLED:
+            filled.append(number)
+            longest = max(longest, (line + 1) * recording.dt)
+    stuck = {c: r for c, r in stuck.items() if len(r) < count or c.startswith("V")}
+    found = [
+        f"{channel} repeats one value for {_STUCK:g} s or more in {len(runs)} runs: stuck?"
+        for channel, runs in stuck.items()
+    ]
     if jumps:
-        found.append(f"the position jumps {jumps} times by far more than the velocity says")
-    return found
+        found.append(f"the position jumps by far more than the velocity says in {len(jumps)} runs")
+    if filled:
+        found.append(
+            f"samples were filled in on a straight line, for up to {longest:.2g} s, in "
+            f"{len(filled)} runs: lost samples or a jump of the clock"
+        )
+    return found, sorted({*jumps, *filled, *(n for runs in stuck.values() for n in runs)})
 
 
-def _longest_repeat(column: np.ndarray) -> int:
-    same = np.concatenate([[False], np.diff(column) == 0, [False]]).astype(int)
-    edges = np.flatnonzero(np.diff(same))
+def _longest(holds: np.ndarray) -> int:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(int)))
     return int((edges[1::2] - edges[::2]).max()) if edges.size else 0
 
 
-def unexcited(data: Data, share: float = 0.02) -> list[str]:
-    """Axes along which the vehicle hardly moved: what acts there can't be told from these data."""
+def unexcited(data: Data, wrench_of: np.ndarray) -> list[str]:
+    """Axes that were not driven: what acts along them can't be told from these data.
+
+    `wrench_of` (6, n) is the wrench of unit thruster forces.
+    """
     w = data.weight[:, None]
-    rms = np.sqrt((data.V[:-1] ** 2 * w).sum(axis=(0, 2)) / data.weight.sum())
+    F = np.einsum("ij,njr->nir", wrench_of, data.u)
+    rms = np.sqrt((F**2 * w).sum(axis=(0, 2)) / data.weight.sum())
     scale = np.repeat([rms[:3].max(), rms[3:].max()], 3)
-    quiet = rms < share * np.maximum(scale, 1e-9)
-    return [
-        f"{axis} was hardly excited: its drag and inertia are not identifiable from these data"
-        for axis, still in zip(AXES, quiet, strict=True)
-        if still
-    ]
+    return [a for a, f, s in zip(AXES, rms, scale, strict=True) if f <= _STILL * s]
 
 
-def limits(data: Data) -> list[str]:
+def limits(data: Data, quiet: list[str], resampled: bool) -> list[str]:
     """What these data can't tell, one sentence each."""
-    found = unexcited(data)
+    found = [
+        f"{axis} was not driven: its drag and inertia are not identifiable from these data"
+        for axis in quiet
+    ]
     if data.command == "F_Bo_B":
         found.append("commands are wrenches: single thrusters can't be told apart")
     if not data.has_voltage:
         found.append("no voltage was recorded: voltage_sag can't be told")
+    if resampled:
+        found.append(
+            "time steps were uneven: effects of a tenth of a step in time, and rare blows, can't "
+            "be told from the resampling"
+        )
     if data.left_out == "run":
         found.append(
-            "there is one scenario: runs were left out in turn, other motions stay unknown"
+            "there is one scenario: runs were left out in turn, so other motions stay unknown"
         )
     if data.left_out == "block":
         found.append(
-            "there is one run: blocks of it were left out in turn, other runs stay unknown"
+            "there is one run: blocks of it were left out in turn, so other runs stay unknown"
         )
     return found

@@ -1,6 +1,7 @@
 """Recordings as the arrays that a diagnosis works on."""
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -75,11 +76,14 @@ class Data:
         return int(self.weight.sum())
 
 
-def make_data(recording: Recording, vehicle: Vehicle, segment: int = SEGMENT) -> Data:
+def make_data(
+    recording: Recording, vehicle: Vehicle, segment: int = SEGMENT, without: Sequence[int] = ()
+) -> Data:
     """Cut a recording into pieces and turn its commands into thruster forces.
 
     Thruster forces are taken as they are; PWM goes through the vehicle's curve at the recorded
-    voltage; a wrench is split over the thrusters with the least effort.
+    voltage; a wrench is split over the thrusters with the least effort. Runs `without` (by number,
+    scenario by scenario) are left out, unless none would remain.
 
     Raises:
         UserError: a channel of pose or twist is missing, or no run has two samples.
@@ -95,9 +99,13 @@ def make_data(recording: Recording, vehicle: Vehicle, segment: int = SEGMENT) ->
     pieces: dict[str, list[Any]] = {"X": [], "V": [], "u": [], "voltage": []}
     scenario, run, sizes = [], [], []
     has_voltage = "voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any())
-    if np.sum(lengths >= 3) == 1:
+    kept = lengths >= 3
+    for number, at in enumerate(np.argwhere(lengths > 0)):
+        kept[tuple(at)] &= number not in without
+    kept = kept if kept.any() else lengths >= 3
+    if kept.sum() == 1:
         segment = min(segment, max(int(lengths.max()) // _BLOCKS, _LEAST))
-    for number, (j, k) in enumerate(np.argwhere(lengths >= 3)):
+    for number, (j, k) in enumerate(np.argwhere(kept)):
         length = int(lengths[j, k])
         values = {
             "X": data["X_WB"].to_numpy()[j, k, :length],

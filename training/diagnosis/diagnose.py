@@ -5,19 +5,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ...models.checks import check_numbers, require
 from ...models.dynamics import Dynamics
-from ...models.effects.base import Effect
 from ...models.effects.extended import Extended
 from ...models.effects.library import Library
 from ...models.recording import Recording
 from ...models.vehicle import Vehicle
 from . import result, telling
 from .blackbox import train
-from .checks import limits, problems
+from .checks import limits, problems, unexcited
 from .data import Data
 from .gain import Contender, judge, told
 from .hypotheses import Fit
@@ -25,8 +25,12 @@ from .laws import Law
 from .looking import Bench, Look
 from .naming import Hypothesis
 from .search import Found, Search, laws_of, refitted
+from .unknowns import accept, seek, structure
 
 Progress = Callable[[float, str], None]
+_MOST_UNKNOWN = 2
+_RESAMPLED, _OF_A_STEP = 0.02, 0.1
+"""Nats a sample that a law, and share of a step that a time must have, in resampled data."""
 _LAW_MARGIN = 5.0
 """Nats above the threshold of names that a law must win: it is tried on a grid on every axis."""
 
@@ -85,26 +89,32 @@ class Diagnoser:
         progress: Progress = lambda fraction, remark: None,
     ):
         self.config = DiagnoseConfig() if config is None else config
-        self.progress = progress
-        self.recording = recording
-        self.bench = Bench.of(recording, vehicle, base)
+        self.furthest = 0.0
+        self.tell = progress
+        self.faults, faulty = problems(recording)
+        self.bench = Bench.of(recording, vehicle, base, faulty)
+        self.resampled = any("resampled" in note for note in recording.notes)
+        directions = np.asarray(self.bench.model.allocate(jnp.eye(self.bench.data.u.shape[1])))
+        self.quiet = unexcited(self.bench.data, directions)
         self.rng = np.random.default_rng(self.config.seed)
+
+    def progress(self, fraction: float, remark: str) -> None:
+        """Tell how far it is; it never goes back."""
+        self.furthest = max(self.furthest, fraction)
+        self.tell(self.furthest, remark)
 
     def run(self) -> Finding:
         """All of it."""
         started = time.monotonic()
         config, bench = self.config, self.bench
-        faults = problems(self.recording)
         self.progress(0.02, "one-step predictions")
         base = first = bench.look(bench.believed)
         nuisance = refitted(bench, config.refit)
         if nuisance:
             theta, _, _ = bench.polish(bench.believed, nuisance)
             first = bench.look(theta)
-        search = Search(
-            bench, nuisance, config.alpha, config.most, self.rng, self._within(0.1, 0.7)
-        )
-        found = search.run(Found(base, first, first))
+        found = Found(base, first, first)
+        bench, nuisance, structures = self._search(bench, nuisance, found)
         self.progress(0.72, "all causes together")
         rows = telling.joint_rows(found, nuisance, bench)
         final, joint = found.current, None
@@ -113,19 +123,25 @@ class Diagnoser:
             final = bench.look(theta)
         self.progress(0.78, "laws of the disturbance")
         laws = laws_of(bench, final)
-        passing = [law for law in laws if law.heldout_gain > found.threshold + _LAW_MARGIN]
+        least = found.threshold + _LAW_MARGIN
+        if self.resampled:  # interpolation makes the noise uneven
+            least += _RESAMPLED * bench.data.steps
+        passing = [law for law in laws if law.heldout_gain > least]
         tested = len(found.fits) + len(laws)
         causes, stirring = [], []
         if joint is not None:
-            causes = [telling.cause(*a, bench, final, joint, tested) for a in found.accepted]
+            causes = [
+                telling.cause(*a, bench, final, joint, tested, structures.get(a[0].hypothesis))
+                for a in found.accepted
+            ]
         more, stirring = telling.law_causes(passing, bench, final)
         causes += more
-        gain = self._gain(base, final, rows, passing, bool(causes))
+        gain = self._gain(bench, base, final, rows, passing, bool(causes))
         d = bench.data
         diagnosis = result.Diagnosis(
             version=result.VERSION,
             verdict=telling.verdict(causes),
-            sentence=telling.sentence(causes, faults),
+            sentence=telling.sentence(causes, self.faults),
             causes=causes,
             refitted=[] if joint is None else telling.refitted(bench, final, nuisance, joint),
             residual=telling.residual(bench, final),
@@ -137,8 +153,8 @@ class Diagnoser:
                 seconds=d.steps * d.dt,
                 step=d.dt,
                 command=d.command,
-                problems=faults,
-                limits=limits(d),
+                problems=self.faults,
+                limits=limits(d, self.quiet, self.resampled),
                 noise=telling.noise_words(final),
             ),
             tested=tested,
@@ -147,7 +163,11 @@ class Diagnoser:
             seconds=time.monotonic() - started,
         )
         self.progress(1.0, "done")
-        extended = self._extended(final.theta, stirring)
+        extended = Extended.create(
+            bench.model.base,
+            (*bench.library.used(final.theta), *stirring),
+            bench.vehicle.thrusters(),
+        )
         return Finding(
             diagnosis, extended, bench.library, final.theta, d, base, final, found.fits, laws
         )
@@ -155,16 +175,54 @@ class Diagnoser:
     def _within(self, low: float, high: float) -> Progress:
         return lambda fraction, remark: self.progress(low + (high - low) * fraction, remark)
 
-    def _extended(self, theta: np.ndarray, laws: list[Effect]) -> Extended:
-        bench = self.bench
-        used = bench.library.used(theta)
-        return Extended.create(bench.model.base, (*used, *laws), bench.vehicle.thrusters())
+    def _names(self, bench: Bench, nuisance: list[int], low: float, high: float) -> Search:
+        config, within = self.config, self._within(low, high)
+        shortest = _OF_A_STEP * bench.data.dt if self.resampled else 0.0
+        return Search(
+            bench, nuisance, config.alpha, config.most, self.rng, within, self.quiet, shortest
+        )
+
+    def _search(
+        self, bench: Bench, nuisance: list[int], found: Found
+    ) -> tuple[Bench, list[int], dict[Hypothesis, result.Structure]]:
+        """Names, structure without a name, and names beside it; it widens the library by an effect.
+
+        Where a law of the disturbance wins more than any name, structure is looked for first.
+        """
+        config, structures = self.config, {}
+        search = self._names(bench, nuisance, 0.1, 0.5)
+        choice, found.left = search.next(found)
+        found.fits = found.left
+        best = 0.0 if choice is None else choice.fit.heldout_gain
+        law = laws_of(bench, found.first)[0].heldout_gain
+        if law < max(best, found.threshold + _LAW_MARGIN):
+            search.run(found)
+        for number in range(_MOST_UNKNOWN):
+            self.progress(0.52 + 0.1 * number, "structure without a name")
+            seen = seek(bench, nuisance, found, config.alpha, self.rng)
+            taken = {h[1] for h in found.hypotheses if h[0] == "unknown"}
+            if seen is None or seen.matched.group.effect.acts_on in taken:
+                if number == 0 and not found.accepted:
+                    search.run(found)
+                break
+            bench = accept(bench, nuisance, found, seen, self.rng)
+            nuisance = refitted(bench, config.refit)
+            where = found.hypotheses[-1][1]
+            structures["unknown", where] = structure(bench, where, found.current.theta, seen)
+            self._names(bench, nuisance, 0.55 + 0.1 * number, 0.6 + 0.1 * number).run(found)
+        return bench, nuisance, structures
 
     def _gain(
-        self, base: Look, final: Look, rows: list[int], laws: list[Law], extended: bool
+        self,
+        bench: Bench,
+        base: Look,
+        final: Look,
+        rows: list[int],
+        laws: list[Law],
+        extended: bool,
     ) -> dict[str, result.ModelGain]:
         """Base, base refitted, extended model and black box on data left out of their fits."""
-        bench, horizon, seed = self.bench, self.config.horizon, self.config.seed
+        horizon, seed = self.config.horizon, self.config.seed
         self.progress(0.82, "gain: the belief")
         R = len(bench.data.fold)
         still = np.repeat(bench.believed[:, None], R, axis=1)

@@ -57,9 +57,15 @@ class Bench:
     believed: Float[np.ndarray, " p"]
 
     @classmethod
-    def of(cls, recording: Recording, vehicle: Vehicle, base: Dynamics | None = None) -> "Bench":
-        """`base` in place of the vehicle's preset is what is believed."""
-        data = make_data(recording, vehicle)
+    def of(
+        cls,
+        recording: Recording,
+        vehicle: Vehicle,
+        base: Dynamics | None = None,
+        without: Sequence[int] = (),
+    ) -> "Bench":
+        """`base` is believed in place of the vehicle's preset; runs `without` are faulty."""
+        data = make_data(recording, vehicle, without=without)
         believed = vehicle.dynamics() if base is None else base
         effects = believed.effects if isinstance(believed, Extended) else ()
         core = believed.base if isinstance(believed, Extended) else believed
@@ -180,10 +186,10 @@ def _library(data: Data, effects: Sequence[Effect]) -> tuple[Library, np.ndarray
     options = {"proximity": {"floor": floor}}
     left_out = set(_RANDOM) | (set() if data.has_voltage else {"voltage_sag"})
     kinds = [k for k in KINDS.values() if k.family != "disturbance" and k.name not in left_out]
-    own = {e.name: e for e in effects if e.name not in {k.name for k in kinds}}
-    library = Library([*(k.neutral(**options.get(k.name, {})) for k in kinds), *own.values()])
+    own = [e for e in effects if e.name not in {k.name for k in kinds}]
+    library = Library([*(k.neutral(**options.get(k.name, {})) for k in kinds), *own])
     theta = np.zeros(library.size)
     for effect in effects:
-        rows = [i for i, e in enumerate(library.entries) if e.cause == effect.name]
+        rows = [i for where in effect.places for i in library.at(effect.name, where)]
         theta[rows] = np.asarray(effect.values)
     return library, theta

@@ -51,7 +51,8 @@ def _respond(
             middle_V = (v + p.V[:, None]) / 2
             middle_X = se3.retract(x, dt / 4 * (v + middle_V))
             memory, level = model.actuate(memory, command[:, None], dt, 1)
-            a = model.drift(inertia, middle_X, middle_V, level[..., 0], volts[None, None])
+            memory, push = model.feel(memory, v, dt)
+            a = model.drift(inertia, middle_X, middle_V, level[..., 0], volts[None, None], push)
             direct = dt / 2 * jnp.concatenate([jnp.zeros_like(a), a - a[:, :1]])
             moved = kept - direct
         nu = jnp.sum(p.jacobian[:, :, None] * moved[None], axis=1) - direct

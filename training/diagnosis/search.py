@@ -1,6 +1,6 @@
 """Which causes are there together: forward selection with exact refits, and checks backwards."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,6 +16,7 @@ from .noise import Filter
 BELIEFS = ("added_mass", "linear_drag", "quadratic_drag", "net_buoyancy")
 """Coefficients that a user would expect fitted."""
 REFITS = {"none": (), "scales": ("thrust_scale",), "linear": BELIEFS}
+_TIMES = ("thruster_lag", "actuation_delay", "clock_offset")
 _CLOSE = 0.7
 _OF_A_LAW = 0.02
 """Share of what the best law wins that a name must win where the law wins more."""
@@ -29,6 +30,7 @@ class Found:
         base, first, current: the belief, the belief refitted, and with the causes.
         accepted: causes in the order found, with the fit that named them.
         fits: every name alone, beside the belief refitted.
+        left: every further name beside those accepted.
         threshold: of held-out nats in the last round.
     """
 
@@ -37,6 +39,7 @@ class Found:
     current: Look
     accepted: list[tuple[Choice, Fit]] = field(default_factory=list)
     fits: dict[Hypothesis, Fit] = field(default_factory=dict)
+    left: dict[Hypothesis, Fit] = field(default_factory=dict)
     threshold: float = 0.0
 
     @property
@@ -77,11 +80,19 @@ class Search:
         most: int,
         rng: np.random.Generator,
         progress: Callable[[float, str], None],
+        quiet: Sequence[str] = (),
+        shortest: float = 0.0,
     ):
+        """`quiet` axes are not identifiable; times below `shortest` (s) are no cause."""
         self.bench, self.nuisance, self.alpha, self.most = bench, nuisance, alpha, most
         self.rng, self.progress = rng, progress
         free = {bench.library.entries[i].cause for i in nuisance}
-        self.names = [h for h in bench.library.hypotheses(single=False) if h[0] not in free]
+        self.names = [
+            h
+            for h in bench.library.hypotheses(single=False)
+            if h[0] not in free and not (h[1] in quiet and kind(h[0]).family == "body")
+        ]
+        self.shortest = shortest
 
     def run(self, found: Found) -> Found:
         """Add causes until none passes; all accepted are refitted together."""
@@ -89,6 +100,7 @@ class Search:
             self.progress(number / self.most, f"{number} causes so far")
             choice, fits = self.next(found)
             found.fits = found.fits or fits
+            found.left = fits
             if choice is None:
                 break
             choice, theta = self._refine(choice, fits, found)
@@ -105,6 +117,10 @@ class Search:
         sets = [bench.library.at(*h) for h in open_names]
         found.threshold = current.evidence.null_quantile(sets, beside, self.alpha, self.rng)
         fits = {h: current.evidence.fit(s, beside) for h, s in zip(open_names, sets, strict=True)}
+        for h in [h for h in open_names if h[0] in _TIMES]:
+            times = current.theta[list(fits[h].parameters)] + fits[h].values
+            if np.all(np.abs(times) < self.shortest):
+                del fits[h]
         gains = {c.hypothesis[0]: f.heldout_gain for c, f in found.accepted}
 
         def chosen(strict: bool, least: float) -> Choice | None:

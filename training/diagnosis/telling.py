@@ -41,7 +41,13 @@ def values_of(
 
 
 def cause(
-    choice: Choice, fit: Fit, bench: Bench, look: Look, joint: Fit, tested: int
+    choice: Choice,
+    fit: Fit,
+    bench: Bench,
+    look: Look,
+    joint: Fit,
+    tested: int,
+    structure: result.Structure | None = None,
 ) -> result.Cause:
     """A named cause; `joint` is the fit of all accepted parameters together."""
     name, where = choice.hypothesis
@@ -55,6 +61,7 @@ def cause(
         rivals=rivals,
         indistinguishable_from=list(dict.fromkeys(h[0] for h in choice.ties if h[0] != name)),
         next_experiment=next_experiment(name, kind(name).family, others),
+        structure=structure,
     )
 
 

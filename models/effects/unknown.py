@@ -1,0 +1,200 @@
+"""What no name explains: a sparse residual of a few weighted terms on stated inputs."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .. import se3
+from .base import AXES, Effect, Parameter, Plant, axes_only, force_only
+
+TWIST = ("u", "v", "w", "p", "q", "r")
+MOTION: dict[str, Callable[[Array], Array]] = {
+    **{n: lambda V, i=i: V[i] for i, n in enumerate(TWIST)},
+    **{f"|{n}|{n}": lambda V, i=i: jnp.abs(V[i]) * V[i] for i, n in enumerate(TWIST)},
+    **{f"{n}³": lambda V, i=i: V[i] ** 3 for i, n in enumerate(TWIST)},
+    **{
+        f"{TWIST[i]}·{TWIST[j]}": lambda V, i=i, j=j: V[i] * V[j]
+        for i in range(6)
+        for j in range(i, 6)
+    },
+}
+"""Terms of a wrench in the velocities (u, v, w, p, q, r)."""
+POSE = ("cos ψ", "sin ψ", "cos 2ψ", "sin 2ψ", "φ", "θ")
+"""Terms in heading ψ, roll φ and pitch θ."""
+POWERS = ("|f|f", "f²", "f³")
+"""Terms in a thruster's own force, in tens of newtons."""
+WORLD = ("east", "north", "up")
+_SIZES = {"flow": 0.004, "place": 0.1, "depth": 0.1}
+_PUSHES = ("motion", "pose", "place", "depth")
+
+
+class Unknown(Effect):
+    """Σ_k w_k φ_k on one axis, thruster or in W; φ by `kind`, with its constants in `numbers`.
+
+    `motion`: terms of `MOTION` by number, a wrench on an axis. `pose`: all of `POSE`, likewise.
+    `memory`: ξ, Re z and Im z with z' = (-1/T + 2πi f) z + ξ, ξ the axis' own velocity; numbers
+    T (s) and f (Hz). `thruster`: all of `POWERS` on one thruster. `place`: a force in W of bumps
+    exp(-½ |p - c|² / s²) over the horizontal plane, east and north for each; numbers s (m) and
+    centres. `flow`: the same as a velocity of the water. `depth`: a force in W of (z - c) / s and
+    its square, in three directions; numbers c and s (m).
+    """
+
+    name: ClassVar[str] = "unknown"
+    family: ClassVar = "body"
+    order: ClassVar[int] = 12
+    source: ClassVar[str] = "matched to data"
+    kind: str = eqx.field(static=True, default="motion")
+    acts_on: str = eqx.field(static=True, default="surge")
+    numbers: tuple[float, ...] = eqx.field(static=True, default=(0.0,))
+
+    @classmethod
+    def neutral(cls, dtype: Any = float, **options: Any) -> "Unknown":
+        options = {k: tuple(v) if isinstance(v, list) else v for k, v in options.items()}
+        blank = cls(jnp.zeros(0, dtype), **options)
+        return cls(jnp.zeros(len(blank.terms), dtype), **options)
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """What each value weighs."""
+        if self.kind == "motion":
+            return tuple(list(MOTION)[int(i)] for i in self.numbers)
+        if self.kind == "memory":
+            own = TWIST[AXES.index(self.acts_on)]
+            return own, f"Re z({own})", f"Im z({own})"
+        if self.kind == "pose":
+            return POSE
+        if self.kind == "thruster":
+            return POWERS
+        if self.kind == "depth":
+            return tuple(f"{d} z{p}" for p in ("", "²") for d in WORLD)
+        count = len(self.numbers) // 2
+        return tuple(f"{d} {i + 1}" for d in WORLD[:2] for i in range(count))
+
+    @property
+    def places(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return (self.acts_on,)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        unit = "m/s" if self.kind == "flow" else "N or N·m a unit"
+        return tuple(Parameter(t, unit, (_SIZES.get(self.kind, 1.0),)) for t in self.terms)
+
+    def size(self) -> int:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return len(self.terms)
+
+    def acts(self, hook: str) -> bool:  # pyright: ignore[reportIncompatibleMethodOverride]
+        acting = {"flow": "flow", "memory": "feel", "thruster": "thrust"}
+        return hook == acting.get(self.kind, "wrench")
+
+    # ---------------------------------------------------------------------------------- terms
+
+    def of_state(
+        self, X_WB: Float[Array, "7 *#b"], V_CB_B: Float[Array, "6 *#b"]
+    ) -> Float[Array, "k *b"]:
+        """φ of all kinds that depend on the present pose and velocity alone.
+
+        Those in W have one row for each bump or power, to be used in each direction.
+        """
+        if self.kind == "motion":
+            names = list(MOTION)
+            return jnp.stack([MOTION[names[int(i)]](V_CB_B) for i in self.numbers])
+        if self.kind == "pose":
+            return _attitude(X_WB)
+        if self.kind == "depth":
+            c, s = self.numbers
+            z = (X_WB[6] - c) / s
+            return jnp.stack([z, z * z])
+        width, centres = self.numbers[0], np.array(self.numbers[1:]).reshape(-1, 2)
+        shape = (-1,) + (1,) * (X_WB.ndim - 1)
+        x, y = (jnp.asarray(c.reshape(shape), X_WB.dtype) for c in centres.T)
+        return jnp.exp(-((X_WB[4][None] - x) ** 2 + (X_WB[5][None] - y) ** 2) / (2 * width**2))
+
+    def _vector(self, X: Array, V: Array) -> Array:
+        """Σ w φ in the directions of W."""
+        phi = self.of_state(X, V)
+        w = self.column(X)
+        count = len(phi)
+        if self.kind == "depth":  # powers outside, directions inside
+            rows = [w[d::3] * phi for d in range(3)]
+        else:
+            rows = [w[d * count : (d + 1) * count] * phi for d in range(2)]
+        parts = [jnp.sum(r, axis=0) for r in rows]
+        return jnp.stack([*parts, *(jnp.zeros_like(parts[0]) for _ in range(3 - len(parts)))])
+
+    def wrench(
+        self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
+    ) -> Float[Array, "6 *#batch"]:
+        if self.kind not in _PUSHES:
+            return jnp.zeros_like(V_CB_B)
+        if self.kind in ("place", "depth"):
+            return force_only(se3.rotate_inverse(X_WB, self._vector(X_WB, V_CB_B)))
+        total = jnp.sum(self.column(V_CB_B) * self.of_state(X_WB, V_CB_B), axis=0)
+        return axes_only({AXES.index(self.acts_on): total}, V_CB_B)
+
+    def flow(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "3 *#batch"]:
+        return self._vector(X_WB, X_WB[:6]) if self.kind == "flow" else jnp.zeros_like(X_WB[4:])
+
+    def thrust(
+        self,
+        force: Float[Array, "n *#batch"],
+        V_CB_B: Float[Array, "6 *#batch"],
+        voltage: Float[Array, "1 *#batch"],
+        plant: Plant,
+    ) -> Float[Array, "n *#batch"]:
+        if self.kind != "thruster":
+            return force
+        k = int(self.acts_on) - 1
+        more = jnp.sum(self.column(force) * powers(force[k]), axis=0)[None]
+        unit = jnp.arange(len(force)).reshape((-1,) + (1,) * (more.ndim - 1)) == k
+        return force + jnp.where(unit, more, jnp.zeros_like(more))
+
+    # --------------------------------------------------------------------------------- memory
+
+    @property
+    def memory_size(self) -> int:
+        return 2 if self.kind == "memory" else 0
+
+    def feel(
+        self, memory: Float[Array, "2 *#batch"], V_WB_B: Float[Array, "6 *#batch"], dt: Any
+    ) -> tuple[Float[Array, "2 *#batch"], Float[Array, "6 *#batch"]]:
+        """The memory after a step at this velocity, and the wrench during it."""
+        i = AXES.index(self.acts_on)
+        after = remembered(memory, V_WB_B[i], self.numbers[0], self.numbers[1], dt)
+        mean = (memory + after) / 2
+        w = self.column(V_WB_B)
+        total = w[0] * V_WB_B[i] + w[1] * mean[0] + w[2] * mean[1]
+        return after, axes_only({i: total}, V_WB_B)
+
+
+def remembered(
+    z: Float[Array, "2 *#b"], x: Float[Array, " *#b"], time: float, frequency: float, dt: Any
+) -> Float[Array, "2 *b"]:
+    """After dt of z' = (-1/T + 2πi f) z + x, with x held: real and imaginary part of z."""
+    h = jnp.asarray(dt, x.dtype)
+    a, b = -1 / time, float(2 * np.pi * frequency)
+    size = jnp.exp(a * h)
+    c, s = size * jnp.cos(b * h), size * jnp.sin(b * h)
+    # (turn - 1) / rate with rate a + b i
+    square = a * a + b * b
+    re, im = ((c - 1) * a + s * b) / square, (s * a - (c - 1) * b) / square
+    return jnp.stack([c * z[0] - s * z[1] + re * x, s * z[0] + c * z[1] + im * x])
+
+
+def powers(force: Float[Array, " *b"]) -> Float[Array, "3 *b"]:
+    """Terms of `POWERS`."""
+    f = force / 10
+    return jnp.stack([jnp.abs(f) * f, f * f, f * f * f])
+
+
+def _attitude(X: Array) -> Array:
+    w, x, y, z = jnp.unstack(X[:4])
+    s, c = 2 * (w * z + x * y), 1 - 2 * (y * y + z * z)
+    size = jnp.sqrt(s * s + c * c)
+    s, c = s / size, c / size
+    roll = jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = jnp.arcsin(jnp.clip(2 * (w * y - z * x), -1, 1))
+    return jnp.stack([c, s, c * c - s * s, 2 * s * c, roll, pitch])

@@ -1,0 +1,469 @@
+"""Structure that no name explains: what a wrench could depend on, tried group by group.
+
+A group is a few columns φ_k of one kind of action (a wrench on an axis, along a thruster, in the
+directions of W, or moving water) on one set of inputs. Each column passes the innovations' filter,
+
+    J_(n+1) = A_n ((I - K_n) J_n - d/2) - d/2,   d = dt φ_n (∂V'/∂wrench or ∂V'/∂flow),
+
+so that its gain is in the same held-out nats as that of a name. Ridge regression, the prior's size
+chosen with the fit; groups with nodes (time constants, frequencies) take the best node of the other
+folds. Groups are added one at a time, each beside those before (orthogonal matching by groups).
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...models import se3
+from ...models.effects.base import AXES
+from ...models.effects.extended import Extended
+from ...models.effects.unknown import MOTION, TWIST, Unknown, powers
+from .looking import Bench, Look
+
+LANES = 24
+PIECES = 60
+"""Columns that one call of the compiled program takes, and pieces that are looked at."""
+TIMES = (0.4, 1.2, 4.0)
+FREQUENCIES = (0.0, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0)
+_PRIORS = (0.3, 3.0, 30.0)
+_LEAST, CLEAR = 8.0, 2.5
+"""Nats, and standard errors between runs, below which a gain is not looked at further."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Columns that stand or fall together.
+
+    Attributes:
+        effect: that has these columns as its terms (of a memory: with the first node's numbers).
+        action: `wrench`, `thruster`, `force` (in W) or `flow` (in W).
+        variables: inputs, in the words of recordings.
+        columns: of the wrench (N, component of the action, k, R) for a range of pieces.
+        nodes: columns of each alternative.
+        labels: what each node means: time constant (s) and frequency (Hz) of a memory.
+    """
+
+    effect: Unknown
+    action: str
+    variables: tuple[str, ...]
+    columns: Callable[[np.ndarray], Float[np.ndarray, "N c k R"]]
+    nodes: tuple[tuple[int, ...], ...]
+    labels: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Matched:
+    """A group's gain: nats by run while its fold is left out, and the node that is best."""
+
+    group: Group
+    heldout: Float[np.ndarray, " runs"]
+    node: int
+    threshold: float
+
+    @property
+    def gain(self) -> float:
+        """Held-out nats."""
+        return float(self.heldout.sum())
+
+
+# ------------------------------------------------------------------------------- the filter
+
+
+@eqx.filter_jit
+def _through(
+    d: Float[Array, "N 6 L R"],
+    jacobian: Array,
+    keep: Array,
+    whiten: Array,
+    weight: Array,
+    dt: float,
+) -> Float[Array, "N 12 L R"]:
+    """Whitened responses to accelerations d."""
+
+    def body(nu: Array, given: tuple) -> tuple[Array, Array]:
+        a, A, gap, white, exists = given
+        direct = dt / 2 * jnp.concatenate([jnp.zeros_like(a), a])
+        moved = jnp.tensordot(gap, nu, 1) - direct
+        nu = jnp.sum(A[:, :, None] * moved[None], axis=1) - direct
+        return nu, jnp.tensordot(white, nu, 1) * exists[None, None]
+
+    zero = jnp.zeros((12, *d.shape[2:]), d.dtype)
+    return jax.lax.scan(body, zero, (d, jacobian, keep, whiten, weight))[1].astype(jnp.float32)
+
+
+class Screen:
+    """Responses of groups beside the columns of what is accepted, on some of the pieces."""
+
+    def __init__(self, bench: Bench, look: Look, beside: Float[np.ndarray, "m N12 R"] | None):
+        self.bench, self.look = bench, look
+        data = bench.data
+        labels = np.unique(data.fold)
+        each = max(1, PIECES // len(labels))
+        chosen: list[int] = []
+        for label in labels:
+            own = np.flatnonzero(data.fold == label)
+            at = np.unique(np.linspace(0, len(own) - 1, each).round().astype(int))
+            chosen += own[at].tolist()
+        self.kept = np.array(sorted(chosen))
+        self.fold = data.fold[self.kept]
+        self.cluster = data.cluster[self.kept]
+        k = look.kalman
+        self.filters = (
+            jnp.asarray(np.asarray(look.predictions.jacobian)[..., self.kept]),
+            jnp.asarray(k.keep),
+            jnp.asarray(k.whiten),
+            jnp.asarray(data.weight[:, self.kept]),
+        )
+        z = look.z[..., self.kept].reshape(len(data.u) * 12, -1)
+        self.z = z[None] if beside is None else np.concatenate([z[None], beside[..., self.kept]])
+        self.inverse = np.linalg.inv(bench.mass(look.theta))
+
+    def responses(self, group: Group) -> Float[np.ndarray, "k N12 R"]:
+        """Changes of the whitened innovations by each column of a group."""
+        phi = group.columns(self.kept)
+        a = self.accelerations(group, phi)  # (N, 6, k, R)
+        parts = []
+        for first in range(0, a.shape[2], LANES):
+            some = a[:, :, first : first + LANES]
+            width = some.shape[2]
+            padded = np.zeros((*some.shape[:2], LANES, some.shape[3]))
+            padded[:, :, :width] = some
+            z = np.asarray(_through(jnp.asarray(padded), *self.filters, self.bench.data.dt))
+            parts.append(np.moveaxis(z[:, :, :width], 2, 0).reshape(width, -1, z.shape[3]))
+        return np.concatenate(parts)
+
+    def accelerations(self, group: Group, phi: np.ndarray) -> Float[np.ndarray, "N 6 k R"]:
+        """dV/dt of each column."""
+        if group.action == "wrench":
+            return self.inverse[:, AXES.index(group.effect.acts_on)][:, None, None] * phi
+        if group.action == "thruster":
+            model = self.bench.model
+            unit = np.eye(len(model.inverse))[:, int(group.effect.acts_on) - 1]
+            wrench = self.inverse @ np.asarray(model.allocate(jnp.asarray(unit)))
+            return wrench[:, None, None] * phi
+        F = self._of_world() if group.action == "force" else self._of_flow
+        return np.einsum("nijr,njkr->nikr", F, phi)
+
+    def _of_world(self) -> Float[np.ndarray, "N 6 3 R"]:
+        X = self.bench.data.X[:-1][..., self.kept].swapaxes(0, 1)
+        unit = np.eye(3)[:, :, None, None] + np.zeros((1, 1, *X.shape[1:]))
+        turned = se3.rotate_inverse(jnp.asarray(X)[:, None], jnp.asarray(unit))
+        return np.einsum("ij,jknr->nikr", self.inverse[:, :3], np.asarray(turned))
+
+    @property
+    def _of_flow(self) -> Float[np.ndarray, "N 6 3 R"]:
+        """∂V'/∂(velocity of the water in W), by central differences of the model's drift."""
+        d = self.bench.data
+        X, V, u = (jnp.asarray(a[..., self.kept].swapaxes(0, 1)) for a in (d.X[:-1], d.V[:-1], d.u))
+        return np.moveaxis(np.asarray(_flow_gradient(self.bench.model, X, V, u)), 2, 0)
+
+    # ------------------------------------------------------------------------------ matching
+
+    def match(
+        self, group: Group, alpha: float, rng: np.random.Generator, draws: int = 24
+    ) -> Matched:
+        """Held-out gain of a group, and what noise alone wins at most with probability α.
+
+        That threshold is infinite where the gain is small, or not clear between runs.
+        """
+        J = self.responses(group)
+        columns = np.concatenate([self.z, J]).astype(np.float64)
+        free = len(self.z)
+        G = np.einsum("iar,jar->rij", columns, columns, optimize=True)
+        labels, index = np.unique(self.fold, return_inverse=True)
+        folds = np.zeros((len(labels), *G.shape[1:]))
+        np.add.at(folds, index, G)
+        size = np.sqrt(np.maximum(np.diag(folds.sum(axis=0)), 1e-12))
+        picks = self._held_out(folds, free, group, size)[1]
+        total = folds.sum(axis=0)
+        node = int(np.argmax([self._fit(total, free, n, size)[1] for n in group.nodes]))
+        # by run: each with the weights of its own fold
+        runs, of_run = np.unique(self.cluster, return_inverse=True)
+        heldout = np.zeros(len(runs))
+        for f in range(len(labels)):
+            w0, w = picks[f]
+            own = index == f
+            before = np.einsum("rij,i,j->r", G[own], w0, w0)
+            after = np.einsum("rij,i,j->r", G[own], w, w)
+            np.add.at(heldout, of_run[own], (before - after) / 2)
+        # self-normalised: runs that excite much win much, whatever is there
+        spread = np.sqrt(np.sum(heldout**2))
+        clear = min(CLEAR, 0.8 * np.sqrt(len(heldout)))
+        threshold = np.inf if draws else 0.0
+        if draws and heldout.sum() > max(_LEAST, clear * spread):
+            threshold = self._null(folds, free, group, size, alpha, rng, draws)
+        return Matched(group, heldout, node, threshold)
+
+    def sparse(self, group: Group, most: int = 4) -> tuple[float, ...]:
+        """The few columns that orthogonal matching takes first (Pati et al. 1993)."""
+        columns = np.concatenate([self.z, self.responses(group)]).astype(np.float64)
+        free = len(self.z)
+        T = np.einsum("iar,jar->ij", columns, columns, optimize=True)
+        size = np.sqrt(np.maximum(np.diag(T), 1e-12))
+        chosen: list[int] = []
+        gain = self._fit(T, free, (), size)[1]
+        while len(chosen) < most:
+            rest = [k for k in range(len(T) - free) if k not in chosen]
+            gains = [self._fit(T, free, (*chosen, k), size)[1] for k in rest]
+            best = int(np.argmax(gains))
+            # a further term must pay for itself, and more than a twentieth of all so far
+            if chosen and gains[best] - gain < max(5.0, 0.05 * gains[best]):
+                break
+            gain = gains[best]
+            chosen.append(rest[best])
+        return tuple(float(k) for k in sorted(chosen))
+
+    def _fit(
+        self, T: np.ndarray, free: int, node: tuple[int, ...], size: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        """Weights of all columns (1 for z), and the gain on T, at the prior of most evidence."""
+        c = np.array([*range(1, free), *(free + k for k in node)], int)
+        if not len(c):
+            w = np.zeros(len(T))
+            w[0] = 1
+            return w, 0.0
+        s = size[c]
+        H, g = T[np.ix_(c, c)] / s[:, None] / s, T[c, 0] / s
+        values, vectors = np.linalg.eigh(H)
+        values = np.maximum(values, 0)
+        q = vectors.T @ g
+        best: tuple[float, np.ndarray] | None = None
+        for prior in _PRIORS:
+            # weights ~ N(0, prior²) in units of a column that alone wins half a nat a unit
+            precision = 1 / (prior**2 * 100)
+            x = -q / (values + precision)
+            evidence = float(
+                (q**2 / (values + precision)).sum() / 2 - np.log1p(values / precision).sum() / 2
+            )
+            if best is None or evidence > best[0]:
+                best = evidence, vectors @ x / s
+        assert best is not None
+        w = np.zeros(len(T))
+        w[0], w[c] = 1, best[1]
+        return w, best[0]
+
+    def _held_out(
+        self, folds: np.ndarray, free: int, group: Group, size: np.ndarray
+    ) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
+        total, gains, picks = folds.sum(axis=0), np.zeros(len(folds)), []
+        for f, T in enumerate(folds):
+            rest = total - T if len(folds) > 1 else total
+            fits = [self._fit(rest, free, n, size) for n in group.nodes]
+            w = max(fits, key=lambda fit: fit[1])[0]
+            w0 = self._fit(rest, free, (), size)[0]
+            gains[f] = (w0 @ T @ w0 - w @ T @ w) / 2
+            picks.append((w0, w))
+        return gains, picks
+
+    def _null(
+        self, folds: np.ndarray, free: int, group: Group, size: np.ndarray, alpha: float,
+        rng: np.random.Generator, draws: int,
+    ) -> float:  # fmt: skip
+        """What white innovations win: mean and spread over draws, and a Gumbel tail."""
+        gains = []
+        roots = []
+        for T in folds:
+            values, vectors = np.linalg.eigh(T[1:, 1:])
+            roots.append(vectors * np.sqrt(np.maximum(values, 0)))
+        for _ in range(draws if len(group.nodes) == 1 else draws // 3):
+            drawn = folds.copy()
+            for f, root in enumerate(roots):
+                g = root @ rng.standard_normal(root.shape[1])
+                drawn[f, 0, 1:] = drawn[f, 1:, 0] = g
+            gains.append(self._held_out(drawn, free, group, size)[0].sum())
+        gains = np.array(gains)
+        scale = max(float(gains.std()), 1.0)
+        return float(max(gains.mean(), 0.0) + scale * np.log(1 / alpha))
+
+
+@eqx.filter_jit
+def _flow_gradient(model: Extended, X: Array, V: Array, u: Array) -> Float[Array, "6 3 N R"]:
+    inertia = model.inertia()
+
+    def drift(v_W: Array) -> Array:
+        v = se3.rotate_inverse(X, v_W)
+        zero = jnp.zeros_like(v)
+        V_r = V - jnp.concatenate([v, zero])
+        turning = jnp.concatenate([-se3.cross(V[3:], v), zero])
+        return model.drift(inertia, X, V_r, u) + turning
+
+    still = jnp.zeros_like(X[4:])
+    columns = []
+    for i in range(3):
+        e = still.at[i].set(1)
+        columns.append(jax.jvp(drift, (still,), (e,))[1])
+    return jnp.stack(columns, axis=1)
+
+
+# ------------------------------------------------------------------------------- the groups
+
+
+def groups(bench: Bench) -> Iterator[Group]:
+    """Everything that is tried."""
+    d = bench.data
+    for i, axis in enumerate(AXES):
+        yield _memory(bench, i, TIMES, FREQUENCIES)
+        yield _of_state(bench, Unknown.neutral(kind="motion", acts_on=axis, numbers=_ALL_MOTION))
+        yield _of_state(bench, Unknown.neutral(kind="pose", acts_on=axis))
+    level = d.command != "F_Bo_B"
+    for k in range(d.u.shape[1] if level else 0):
+        yield _of_thruster(bench, k)
+    z = d.X[:-1, 6][d.weight > 0]
+    numbers = (float(z.mean()), float(z.std() + 1e-3))
+    yield _of_state(bench, Unknown.neutral(kind="depth", acts_on="W", numbers=numbers))
+    bumps = _bumps(d.X[:-1, 4][d.weight > 0], d.X[:-1, 5][d.weight > 0])
+    if len(bumps) > 9:
+        for kind in ("place", "flow"):
+            yield _of_state(bench, Unknown.neutral(kind=kind, acts_on="W", numbers=bumps))
+
+
+_ALL_MOTION = tuple(float(i) for i in range(len(MOTION)))
+_VARIABLES = {
+    "motion": TWIST, "pose": ("heading", "roll", "pitch"), "depth": ("z",), "place": ("x", "y"),
+    "flow": ("x", "y"),
+}  # fmt: skip
+
+
+def _of_state(bench: Bench, effect: Unknown) -> Group:
+    d, k = bench.data, effect.size()
+
+    def columns(kept: np.ndarray) -> np.ndarray:
+        X, V = (jnp.asarray(a[:-1][..., kept].swapaxes(0, 1)) for a in (d.X, d.V))
+        phi = np.moveaxis(np.asarray(effect.of_state(X, V)), 1, 0)  # (N, k, R)
+        if effect.acts_on != "W":
+            return phi[:, None]
+        count, found = phi.shape[1], np.zeros((len(phi), 3, k, len(kept)))
+        for number in range(k):
+            way, row = divmod(number, count)
+            if effect.kind == "depth":
+                row, way = divmod(number, 3)
+            found[:, way, number] = phi[:, row]
+        return found
+
+    action = {"place": "force", "depth": "force", "flow": "flow"}.get(effect.kind, "wrench")
+    return Group(effect, action, _VARIABLES[effect.kind], columns, (tuple(range(k)),))
+
+
+def _of_thruster(bench: Bench, k: int) -> Group:
+    effect = Unknown.neutral(kind="thruster", acts_on=str(k + 1))
+
+    def columns(kept: np.ndarray) -> np.ndarray:
+        return np.moveaxis(np.asarray(powers(jnp.asarray(bench.data.u[:, k][:, kept]))), 0, 1)[
+            :, None
+        ]
+
+    return Group(effect, "thruster", (f"f{k + 1}",), columns, (tuple(range(effect.size())),))
+
+
+def _memory(bench: Bench, axis: int, times: Sequence[float], frequencies: Sequence[float]) -> Group:
+    nodes = [(t, f) for f in frequencies for t in times]
+    effect = Unknown.neutral(kind="memory", acts_on=AXES[axis], numbers=nodes[0])
+
+    def columns(kept: np.ndarray) -> np.ndarray:
+        v = bench.data.V[:-1, axis][:, kept]
+        rates = np.array([complex(-1 / t, 2 * np.pi * f) for t, f in nodes])[:, None]
+        turn = np.exp(rates * bench.data.dt)
+        gain = (turn - 1) / rates
+        z, found = np.zeros((len(nodes), len(kept)), complex), []
+        for x in v:
+            after = turn * z + gain * x
+            mean = (z + after) / 2
+            both = np.stack([mean.real, mean.imag], axis=1).reshape(2 * len(nodes), -1)
+            found.append(np.concatenate([x[None], both]))
+            z = after
+        return np.array(found)[:, None]
+
+    # at f = 0 the imaginary part is zero
+    columns_of = [
+        (0, 1 + 2 * i) if f == 0 else (0, 1 + 2 * i, 2 + 2 * i) for i, (_, f) in enumerate(nodes)
+    ]
+    return Group(effect, "wrench", (TWIST[axis],), columns, tuple(columns_of), tuple(nodes))
+
+
+def _bumps(x: np.ndarray, y: np.ndarray, most: int = 16) -> tuple[float, ...]:
+    """Width and centres of bumps where the vehicle was, a width apart."""
+    width = 0.4
+    while True:
+        cells, counts = np.unique(
+            np.round(np.stack([x, y]) / width).astype(int), axis=1, return_counts=True
+        )
+        centres = cells[:, counts > 0.002 * len(x)] * width
+        if centres.shape[1] <= most:
+            return (width, *(float(c) for c in centres.T.ravel()))
+        width *= 1.2
+
+
+# --------------------------------------------------------------------------- what was found
+
+
+def refined(screen: Screen, found: Matched, rng: np.random.Generator) -> Unknown:
+    """The effect of a match: a memory's numbers between the nodes, the few terms of a motion."""
+    effect = found.group.effect
+    if effect.kind == "memory":
+        axis = AXES.index(effect.acts_on)
+        T, f = found.group.labels[found.node]
+        for spread in (1.4, 1.18, 1.08):
+            # a ring that decays within the runs tells its frequency to a fraction of 1 / T
+            step = (spread - 1) * max(f, 0.2)
+            frequencies = [g for g in (f - step, f, f + step) if g >= 0.03] if f else [0.0]
+            finer = _memory(screen.bench, axis, (T / spread, T, T * spread), frequencies)
+            again = screen.match(finer, 0.01, rng, draws=0)
+            T, f = finer.labels[again.node]
+        return Unknown.neutral(kind="memory", acts_on=effect.acts_on, numbers=(T, f))
+    if effect.kind == "motion":
+        chosen = screen.sparse(found.group)
+        return Unknown.neutral(kind="motion", acts_on=effect.acts_on, numbers=chosen)
+    return effect
+
+
+def described(effect: Unknown, weights: np.ndarray, bench: Bench) -> dict[str, Any]:
+    """Variables, one sentence, lag, frequency and region of what was matched."""
+    d = bench.data
+    exists = d.weight > 0
+    heading = np.arctan2(
+        2 * (d.X[:-1, 0] * d.X[:-1, 3] + d.X[:-1, 1] * d.X[:-1, 2]),
+        1 - 2 * (d.X[:-1, 2] ** 2 + d.X[:-1, 3] ** 2),
+    )
+    seen = {n: d.V[:-1, i] for i, n in enumerate(TWIST)}
+    seen |= {"x": d.X[:-1, 4], "y": d.X[:-1, 5], "z": d.X[:-1, 6], "heading": heading}
+    seen |= {f"f{k + 1}": d.u[:, k] for k in range(d.u.shape[1])}
+    lag = frequency = None
+    where = effect.acts_on
+    variables: Sequence[str] = _VARIABLES.get(effect.kind, ())
+    if effect.kind == "memory":
+        lag, frequency = effect.numbers
+        variables = (effect.terms[0],)
+        rings = f" and rings at {frequency:.2f} Hz" if frequency else ""
+        told = f"a wrench on {where} that remembers {variables[0]} for {lag:.2g} s{rings}"
+    elif effect.kind == "motion":
+        order = np.argsort(-np.abs(weights))
+        told = f"a wrench on {where} in " + ", ".join(effect.terms[i] for i in order)
+        variables = [n for n in TWIST if any(n in effect.terms[i] for i in order)]
+    elif effect.kind == "thruster":
+        variables = (f"f{where}",)
+        told = f"the force of thruster {where} against its command"
+    elif effect.kind == "pose":
+        told = f"a wrench on {where} that depends on heading, roll or pitch"
+    elif effect.kind == "depth":
+        told = "a force in W that depends on depth"
+    else:
+        what = "moving water" if effect.kind == "flow" else "a force"
+        count = len(weights) // 2
+        size = np.hypot(weights[:count], weights[count:])
+        x, y = np.array(effect.numbers[1:]).reshape(-1, 2)[int(np.argmax(size))]
+        told = f"{what} that depends on the place in W (x, y), largest near ({x:.1f}, {y:.1f}) m"
+    region = {}
+    for name in variables:
+        if name in seen:
+            low, high = np.percentile(seen[name][exists], (2, 98))
+            region[name] = (float(low), float(high))
+    return {
+        "acts_on": where, "variables": list(variables), "description": told, "lag": lag,
+        "frequency": frequency or None, "region": region,
+    }  # fmt: skip

@@ -134,7 +134,7 @@ def horizon_figure(diagnosis: Diagnosis) -> Figure:
             ax.set_title(title)
             ax.set_xlabel("horizon / s")
             ax.set_ylim(bottom=0)
-    legend(axes[0, 3])
+    axes[0, 3].legend(loc="upper left", fontsize=7, frameon=False)
     return figure
 
 

@@ -181,7 +181,10 @@ def horizon_figure(metrics: Mapping[str, xr.Dataset]) -> Figure:
 
 @styled
 def curves_figure(curves: Mapping[tuple[str, str], list[tuple[np.ndarray, np.ndarray]]]) -> Figure:
-    """Training loss against steps, a panel a method, a line a seed; scales differ by method."""
+    """Training loss against steps, a panel a method, a line a seed; scales differ by method.
+
+    Faint is what the steps' batches gave, bold the mean over a tenth of the run.
+    """
     methods = ordered([method for _, method in curves])
     columns = min(4, len(methods))
     lines = -(-len(methods) // columns)
@@ -191,15 +194,25 @@ def curves_figure(curves: Mapping[tuple[str, str], list[tuple[np.ndarray, np.nda
     for ax, method in zip(axes.ravel(), methods, strict=False):
         for regime in REGIMES:
             for step, loss in curves.get((regime, method), []):
-                ax.plot(step, loss, color=shades[regime], lw=0.9, alpha=0.8)
+                ax.plot(step, loss, color=shades[regime], lw=0.6, alpha=0.2)
+                ax.plot(*_smoothed(step, loss), color=shades[regime], lw=1.1)
         ax.set_title(method)
     for ax in axes.ravel()[len(methods) :]:
         ax.set_visible(False)
     for ax in axes[-1]:
         ax.set_xlabel("step")
-    handles = [Line2D([], [], color=shades[r], label=f"{r} data") for r in REGIMES]
-    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    seen = [r for r in REGIMES if any(regime == r for regime, _ in curves)]
+    handles = [Line2D([], [], color=shades[r], label=f"{r} data") for r in seen]
+    if handles:
+        figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return figure
+
+
+def _smoothed(step: np.ndarray, loss: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Means of step and loss over a window of a tenth of all entries."""
+    width = max(1, len(loss) // 10)
+    even = np.full(width, 1 / width)
+    return np.convolve(step, even, "valid"), np.convolve(loss, even, "valid")
 
 
 @styled

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from ...models import config as yaml
 from ...models.files import atomic_path
+from ...training.methods import METHODS
 from ..pages import Page
 from .claims import Verdict, targets, verdicts
 from .config import REGIMES, StudyConfig
@@ -35,6 +36,7 @@ _COLUMNS = (
     ("rmse_samples_geodesic", "samples, pose"),
     ("spread_velocity_ratio", "spread / true"),
     ("coverage_90", "in 90 % band"),
+    ("seconds_training", "training, s"),
 )
 _EXPLAINED = (
     "Runs that succeeded are averaged (± one standard deviation over seeds). A run succeeds if "
@@ -53,8 +55,9 @@ def render(out: str | os.PathLike[str], docs: str | os.PathLike[str] | None = No
     """Write every table, figure and page of the runs in `out`; return the runs.
 
     Into `out`: table.csv (a row a run), summary.csv (a row a method), rich.nc and sparse.nc (all
-    metrics over scenarios and time), results.png, distributions-<scenario>.png, report.html and
-    ablation.md. With `docs`, ablation.md also goes there, with the figures that it shows beside it.
+    metrics over scenarios and time), results.png, diffusion.png, training.png,
+    distributions-<scenario>.png, report.html and ablation.md. With `docs`, ablation.md also goes
+    there, with the figures that it shows beside it.
 
     Raises:
         UserError: there is no finished run, or one is damaged.
@@ -66,6 +69,9 @@ def render(out: str | os.PathLike[str], docs: str | os.PathLike[str] | None = No
     write_csv(out / "summary.csv", summary)
     write_netcdf(out)
     figures = {"results": results_figure(rows)}
+    if any(r["success"] for r in rows):
+        figures["diffusion"] = diffusion_figure(rows)
+    figures["training"] = curves_figure(_curves(out))
     figures |= _distributions(out)
     for name, figure in figures.items():
         _save(figure, out / f"{name}.png")
@@ -73,7 +79,8 @@ def render(out: str | os.PathLike[str], docs: str | os.PathLike[str] | None = No
     _write_text(out / "ablation.md", ablation_text(rows, _settings(out), figures=list(figures)))
     if docs is not None:
         docs = Path(docs)
-        kept = [n for n in figures if n == "results" or n.startswith("distributions")][:2]
+        kept = [n for n in figures if not n.startswith("distributions")]
+        kept += [n for n in figures if n not in kept][:1]
         names = {name: f"{docs.stem}-{name}.png" for name in kept}
         for name, file in names.items():
             _save(figures[name], docs.with_name(file))
@@ -136,11 +143,11 @@ def _page(
         page.section("Distributions", "Samples of the true and of each learned law from above.")
         for name in shown:
             page.figure(figures[name], f"Scenario {name.removeprefix('distributions-')}.")
-    if any(r["success"] for r in rows):
+    if "diffusion" in figures:
         page.section("Diffusion", "Learned against true b, averaged over the true motion.")
-        page.figure(diffusion_figure(rows), "Learned over true diffusion; the band is ± 20 %.")
+        page.figure(figures["diffusion"], "Learned over true diffusion; the band is ± 20 %.")
     page.section("Training")
-    page.figure(curves_figure(_curves(out)), "Loss against steps; its unit differs by method.")
+    page.figure(figures["training"], "Loss against steps; its unit differs by method.")
     failures = [(r["regime"], r["method"], r["seed"], r["failure"]) for r in rows if r["failure"]]
     if failures:
         page.table(failures, ("regime", "method", "seed", "why training was given up"))
@@ -164,6 +171,19 @@ def _told(rows: Sequence[Row]) -> str:
     methods = len({r["method"] for r in rows})
     regimes = " and ".join(r for r in REGIMES if any(row["regime"] == r for row in rows))
     return f"{methods} methods, {regimes} data, {seeds} seed{'s' * (seeds > 1)}, {len(rows)} runs"
+
+
+def _command(rows: Sequence[Row]) -> str:
+    """What to type for the same runs."""
+    regimes = [r for r in REGIMES if any(row["regime"] == r for row in rows)]
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    words = ["spinndrift study ablation"]
+    if len(regimes) < len(REGIMES):
+        words.append(f"--regime {' '.join(regimes)}")
+    if set(methods) != set(METHODS):
+        words.append(f"--methods {' '.join(methods)}")
+    words.append(f"--seeds {1 + max(int(row['seed']) for row in rows)} --docs docs/ablation.md")
+    return " ".join(words)
 
 
 def _lines(summary: Sequence[Row], regime: str) -> list[list[str]]:
@@ -196,7 +216,11 @@ def ablation_text(
     lines = [
         "# Ablation study",
         "",
-        f"Written by `spinndrift study ablation` from its own table of runs: {_told(rows)}.",
+        *_wrapped(f"{_told(rows)}, as written by"),
+        "",
+        "```",
+        _command(rows),
+        "```",
         "",
     ]
     if study is not None:

@@ -83,7 +83,7 @@ class TrainingConfig:
     steps: int = 400
     batch: int = 16
     """Windows a step."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-3
     """Adam's peak rate; the paper's is 1e-4, constant."""
     schedule: Literal["cosine", "constant"] = "cosine"
     """After the warm-up: cosine decay to 1 % of the peak, or constant."""

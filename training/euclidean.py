@@ -21,7 +21,7 @@ from ..models.errors import UserError
 from ..models.euclidean import EuclideanSpinn, coordinates
 from .groups import group_size
 from .kernels import VelocityKernel, bandwidths_from_differences
-from .moments import Moments, Unit, compare, pooled, units, vector_moments, weighted
+from .moments import Moments, MomentsObjective, Unit, compare, pooled, units, vector_moments
 from .objective import Batch, Objective
 from .scores import kernel_score, time_pairs
 from .windows import Windows
@@ -247,41 +247,28 @@ class EuclideanMoments(Moments):
         return EuclideanMomentsObjective(self, size, error, pose_unit, velocity_unit)
 
 
-class EuclideanMomentsObjective(Objective):
+class EuclideanMomentsObjective(MomentsObjective):
     """As `MomentsObjective`, with the moments of vectors throughout."""
 
     name: ClassVar[str] = "euclidean moments"
-    config: EuclideanMoments = eqx.field(static=True)
-    size: int = eqx.field(static=True)
-    error: CoordinateError
-    pose_unit: Float[Array, "6 T"]
-    velocity_unit: Float[Array, "6 T"]
 
-    def group_size(self) -> int:
-        return self.size
-
-    def loss(
-        self, model: Dynamics, batch: Batch, key: Array
-    ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-        c, P = self.config, self.config.samples
-        drift = c.mse_of == "drift" and c.mse_weight > 0
-        q, V = predict_coordinates(
-            model, batch, self.error.dt, key, P, substeps=c.substeps, with_path_of_drift=drift
+    def motions(
+        self, model: Dynamics, batch: Batch, key: Array, with_path_of_drift: bool
+    ) -> tuple[Float[Array, "T C P W"], Float[Array, "T 6 P W"]]:
+        return predict_coordinates(
+            model,
+            batch,
+            self.error.dt,
+            key,
+            self.config.samples,
+            substeps=self.config.substeps,
+            with_path_of_drift=with_path_of_drift,
         )
-        parts = {}
-        for name, unit, own, data in (
-            ("pose", self.pose_unit, q, observed(batch)),
-            ("velocity", self.velocity_unit, V, batch.V),
-        ):
-            mean, S = vector_moments(pooled(own[:, :, :P], self.size))
-            their_mean, their_S = vector_moments(pooled(data[1:], self.size))
-            parts |= compare(their_mean - mean, S, their_S, unit, name)
-        total = weighted(parts, c.mean_weight, c.covariance_weight)
-        if c.mse_weight > 0:
-            judged = slice(P, None) if drift else slice(None)
-            parts["mse"] = self.error(q[:, :, judged], V[:, :, judged], batch)
-            total = total + c.mse_weight * parts["mse"]
-        return total, parts
+
+    def pose_parts(self, X: Float[Array, "T C P W"], batch: Batch) -> dict[str, Array]:
+        mean, own = vector_moments(pooled(X, self.size))
+        their_mean, theirs = vector_moments(pooled(observed(batch)[1:], self.size))
+        return compare(their_mean - mean, own, theirs, self.pose_unit, "pose")
 
 
 def _spread(X: Array, V: Array) -> tuple[Array, Array]:

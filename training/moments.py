@@ -7,7 +7,7 @@ velocities have the moments of a vector space.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -135,7 +135,8 @@ class MomentsObjective(Objective):
     name: ClassVar[str] = "moments"
     config: Moments = eqx.field(static=True)
     size: int = eqx.field(static=True)
-    error: SquaredError
+    error: Any
+    """Squared error with `dt`: `SquaredError`, or its twin for what `motions` gives."""
     pose_unit: Float[Array, "6 T"]
     velocity_unit: Float[Array, "6 T"]
 
@@ -147,24 +148,9 @@ class MomentsObjective(Objective):
     ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
         c, P = self.config, self.config.samples
         drift = c.mse_of == "drift" and c.mse_weight > 0
-        X, V = predict(
-            model,
-            batch.X[0],
-            batch.V[0],
-            batch.F,
-            self.error.dt,
-            key,
-            P,
-            substeps=c.substeps,
-            with_path_of_drift=drift,
-        )
-        pose = [
-            pose_moments(pooled(a, self.size), c.iterations) for a in (X[:, :, :P], batch.X[1:])
-        ]
+        X, V = self.motions(model, batch, key, drift)
+        parts = self.pose_parts(X[:, :, :P], batch)
         velocity = [vector_moments(pooled(a, self.size)) for a in (V[:, :, :P], batch.V[1:])]
-        (predicted, own), (observed, theirs) = pose
-        mean_error = jnp.stack(relative_log(predicted, observed))
-        parts = compare(mean_error, own, theirs, self.pose_unit, "pose")
         (predicted, own), (observed, theirs) = velocity
         parts |= compare(observed - predicted, own, theirs, self.velocity_unit, "velocity")
         total = weighted(parts, c.mean_weight, c.covariance_weight)
@@ -173,6 +159,31 @@ class MomentsObjective(Objective):
             parts["mse"] = self.error(X[:, :, judged], V[:, :, judged], batch)
             total = total + c.mse_weight * parts["mse"]
         return total, parts
+
+    def motions(
+        self, model: Dynamics, batch: Batch, key: Array, with_path_of_drift: bool
+    ) -> tuple[Float[Array, "T C P W"], Float[Array, "T 6 P W"]]:
+        """Predicted configurations and twists of each window (`predict`)."""
+        return predict(
+            model,
+            batch.X[0],
+            batch.V[0],
+            batch.F,
+            self.error.dt,
+            key,
+            self.config.samples,
+            substeps=self.config.substeps,
+            with_path_of_drift=with_path_of_drift,
+        )
+
+    def pose_parts(self, X: Float[Array, "T C P W"], batch: Batch) -> dict[str, Array]:
+        """What the moments of the configurations add to the loss."""
+        moments = [
+            pose_moments(pooled(a, self.size), self.config.iterations) for a in (X, batch.X[1:])
+        ]
+        (predicted, own), (observed, theirs) = moments
+        mean_error = jnp.stack(relative_log(predicted, observed))
+        return compare(mean_error, own, theirs, self.pose_unit, "pose")
 
 
 def pooled(a: Float[Array, "T C *P W"], size: int) -> Float[Array, "C T G S"]:

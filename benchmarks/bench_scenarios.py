@@ -16,14 +16,15 @@ def _as_the_command_sets_it():
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
+@pytest.mark.parametrize("engine", ["compiled", "drake"])
 @pytest.mark.parametrize("name", ["station_keeping_calm", "station_keeping_harbour"])
-def test_speed_without_planner(benchmark, name):
+def test_speed_without_planner(benchmark, name, engine):
     """The clock of `simulate` leaves building and compiling out; so does the figure given."""
     scenario = load_scenario(name, "duration: 60")
     speeds = []
 
     def fly():
-        speeds.append(simulate(scenario).timing.speed())
+        speeds.append(simulate(scenario, engine=engine).timing.speed())
 
     benchmark.pedantic(fly, rounds=2)
     benchmark.extra_info["times real time"] = max(speeds)

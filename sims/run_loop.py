@@ -7,47 +7,55 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram
 
+from ..models.errors import UserError
 from ..systems.closed_loop import build_diagram, logged, seeded
+from ..systems.compiled import CompiledSimulator
+from ..systems.network import NotPureError
 from .criteria import Monitor, Outcome
 from .run_log import RunLog
 from .run_signals import PlanTap, collect, log_periods, with_present
 from .scenario import Scenario
 
 Progress = Callable[[float, str], None]
+Engine = Literal["auto", "drake", "compiled"]
 _WARM_UP = 0.45  # s: beyond the filter's delay, so that every event has occurred
+_WORTH_A_LOOP = 10.0  # s of a run
+_AT_ONCE = 0.2  # s that a compiled loop advances before the monitor looks at its samples
 
 
 @dataclass
 class Timing:
     """What the clock on the wall said; no part of the log, which is the same for the same seed."""
 
+    engine: str = "drake"
     compilation: float = 0.0
     chunks: list[float] = field(default_factory=list)
     planning: list[bool] = field(default_factory=list)
     dt: float = 0.0
 
-    def add(self, spent: float, planning: bool) -> None:
-        """File the time of one step of the log, and whether a call of the planner fell into it."""
-        self.chunks.append(spent)
-        self.planning.append(planning)
+    def add(self, spent: float, planning: bool, steps: int = 1) -> None:
+        """File the time of some steps of the log, and whether the planner was called in them."""
+        self.chunks += [spent / steps] * steps
+        self.planning += [planning] * steps
 
     def speed(self, last: int = 0) -> float:
         """Simulated time per time on the clock, of the whole run or its last steps."""
         chunks = self.chunks[-last:]
         return len(chunks) * self.dt / max(sum(chunks), 1e-9)
 
-    def summary(self) -> dict[str, float | None]:
-        """Seconds of compilation, real-time factor, planner's time a call (ms)."""
+    def summary(self) -> dict[str, float | str | None]:
+        """Who stepped, seconds of compilation, real-time factor, planner's time a call (ms)."""
         spent, planning = 1e3 * np.array(self.chunks), np.array(self.planning, bool)
         rest = spent[~planning]
         calls = spent[planning] - (np.median(rest) if rest.size else 0.0)
         return {
+            "engine": self.engine,
             "compilation_s": self.compilation,
             "wall_s": sum(self.chunks),
             "real_time_factor": self.speed() if self.chunks else None,
@@ -65,21 +73,26 @@ class Run(NamedTuple):
     timing: Timing
 
 
-def simulate(scenario: Scenario, progress: Progress | None = None) -> Run:
+def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engine = "auto") -> Run:
     """Fly a scenario to its end. The same scenario gives the same log, bit for bit.
+
+    Drake steps the diagram, or one compiled loop does (`systems.compiled`), some times as fast; but
+    for rounding they give the same run. By default the loop is taken if it can be, and if the run
+    may last long enough to repay its compilation.
 
     Ctrl-C ends the flight after the sample at hand with the outcome `interrupted`; what was flown
     until then is returned. A second one, or one before the flight, interrupts at once.
 
     Raises:
-        UserError: the scenario names what can't be read, or its controller lacks a port.
+        UserError: the scenario names what can't be read, its controller lacks a port, or the
+            engine is to be `compiled` and can't.
     """
     tell = progress or (lambda fraction, remark: None)
     tell(0.0, "building")
     diagram = build_diagram(
         scenario.station, scenario.controller, log_periods=log_periods(scenario)
     )
-    simulator = Simulator(diagram)
+    simulator = _simulator(diagram, scenario, engine)
     context = simulator.get_mutable_context()
     seeded(diagram, context, scenario.seed)
     vehicle = scenario.station.load_vehicle()
@@ -89,7 +102,11 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Run:
     timing = Timing(dt=1 / scenario.log.rate)
     started = time.perf_counter()
     with _ticking(tell, "compiling"):
-        _warm_up(diagram, min(scenario.duration, _WARM_UP))
+        if isinstance(simulator, CompiledSimulator):
+            timing.engine = "compiled"
+            simulator.compile()
+        else:
+            _warm_up(diagram, min(scenario.duration, _WARM_UP))
     timing.compilation = time.perf_counter() - started
     with _stop_on_interrupt() as stopped, _few_collections():
         outcome = _fly(scenario, diagram, simulator, monitor, tap, timing, tell, stopped)
@@ -98,10 +115,27 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Run:
     return Run(scenario, log, outcome, timing)
 
 
+def _simulator(
+    diagram: Diagram, scenario: Scenario, engine: Engine
+) -> Simulator | CompiledSimulator:
+    """Who steps a diagram."""
+    if engine == "drake" or (engine == "auto" and scenario.duration < _WORTH_A_LOOP):
+        return Simulator(diagram)
+    periods = {f"log_{name}": period for name, period in log_periods(scenario).items()}
+    try:
+        return CompiledSimulator(diagram, periods)
+    except NotPureError as error:
+        if engine == "compiled":
+            raise UserError(
+                f"engine: this run can't be compiled: {error}; let Drake step it (drake or auto)"
+            ) from error
+        return Simulator(diagram)
+
+
 def _fly(
     scenario: Scenario,
     diagram: Diagram,
-    simulator: Simulator,
+    simulator: Simulator | CompiledSimulator,
     monitor: Monitor,
     tap: PlanTap,
     timing: Timing,
@@ -113,34 +147,49 @@ def _fly(
     station = diagram.GetSubsystemByName("station")
     own = station.GetMyContextFromRoot(context)
     ports = [station.GetOutputPort(name) for name in ("X_WB_cheat", "V_WB_B_cheat")]
+    sinks: list[Any] = [diagram.GetSubsystemByName(f"log_{port.get_name()}") for port in ports]
     dt = timing.dt
     steps = max(1, round(scenario.duration / dt))
+    stride = _samples_at_once(simulator, tap, dt)
     k, done, outcome = 0, 0.0, None
     try:
         simulator.Initialize()
         outcome = monitor.check(0.0, *(port.Eval(own) for port in ports))
         while outcome is None:
+            stride = min(stride, steps - k)
             started = time.perf_counter()
-            simulator.AdvanceTo((k + 1) * dt)
+            simulator.AdvanceTo((k + stride) * dt)
             spent = time.perf_counter() - started
-            k += 1
+            phase = (k * dt + 1e-9) % (tap.period or 1.0)
+            timing.add(spent, tap.period is not None and phase < dt - 1e-9, stride)
+            tap.read(round(k * dt, 9))
+            seen = [sink.FindLog(context).data() for sink in sinks]
+            for n in range(k + 1, k + stride + 1):
+                outcome = outcome or monitor.check(round(n * dt, 9), *(v[:, n] for v in seen))
+            k += stride
             t = round(k * dt, 9)
-            phase = ((k - 1) * dt + 1e-9) % (tap.period or 1.0)
-            timing.add(spent, tap.period is not None and phase < dt - 1e-9)
-            tap.read(t - dt)
-            outcome = monitor.check(t, *(port.Eval(own) for port in ports))
             if outcome is None and k >= steps:
                 outcome = Outcome("duration", t, f"The time was over after {t:.1f} s.")
-            if outcome is None and stopped.is_set():
-                outcome = Outcome("interrupted", t, f"Stopped by hand after {t:.1f} s.")
-            if k % 5 == 0:
+            elif outcome is None and k // 5 > (k - stride) // 5:
                 done = max(done, k / steps, monitor.progress)
                 tell(done, f"{t:.0f} s, {timing.speed(200):.1f} × real time")
+            if outcome is None and stopped.is_set():
+                outcome = Outcome("interrupted", t, f"Stopped by hand after {t:.1f} s.")
         # one period more, in which the filter has its say on the last sample
         simulator.AdvanceTo(k * dt + scenario.station.period)
-    except FloatingPointError as error:  # the plant names what was not finite
-        outcome = outcome or Outcome("not finite", round(k * dt, 9), str(error))
+    except FloatingPointError as error:  # it names what was not finite
+        log = sinks[0].FindLog(context)
+        last = log.sample_times()[np.isfinite(log.data()).all(axis=0)][-1]
+        outcome = outcome or Outcome("not finite", round(float(last), 9), str(error))
     return outcome
+
+
+def _samples_at_once(simulator: Simulator | CompiledSimulator, tap: PlanTap, dt: float) -> int:
+    """How many samples of the log to advance by, so that no plan comes and goes unseen."""
+    if isinstance(simulator, Simulator):
+        return 1
+    plans = getattr(tap.source, "period", _AT_ONCE)
+    return max(1, int(min(plans, _AT_ONCE) / dt + 1e-9))
 
 
 def _warm_up(diagram: Diagram, duration: float) -> None:

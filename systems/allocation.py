@@ -8,6 +8,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from ..models import integrate
 from ..models.thrusters import Thrusters
 from .jit import VectorFunction
+from .pure import Inputs, Pure, State
 
 
 class ThrustAllocation(LeafSystem):
@@ -44,11 +45,24 @@ class ThrustAllocation(LeafSystem):
             force = model.allocate(F_Bo_B, voltage)
             return model.pwm(force, voltage), force
 
+        self._function = allocate
         self._allocate = VectorFunction(allocate, [6], [count, count])
         self._F = self.DeclareVectorInputPort("F_Bo_B", 6)
         once = {self._F.ticket()}  # computed anew for another wrench, not for another time
         self.DeclareVectorOutputPort("pwm", count, self._put_pwm, once)
         self.DeclareVectorOutputPort("thruster_force", count, self._put_forces, once)
+
+    def pure(self) -> Pure:
+        """Both outputs as pure functions."""
+
+        def output(index: int):
+            def put(state: State, inputs: Inputs) -> Array:
+                del state
+                return self._function(inputs["F_Bo_B"])[index]
+
+            return put
+
+        return Pure((), {"pwm": output(0), "thruster_force": output(1)})
 
     def _both(self, context: Context) -> np.ndarray:
         F = np.asarray(self._F.Eval(context))

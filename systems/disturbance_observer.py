@@ -12,6 +12,7 @@ from ..models import se3
 from ..models.dynamics import Dynamics
 from ..models.integrate import cast
 from .jit import VectorFunction
+from .pure import Event, Inputs, Pure, State, shown
 
 
 class ObserverState(eqx.Module):
@@ -127,6 +128,16 @@ class DisturbanceObserver(LeafSystem):
         new = self.observer.step(state, X, V, F, self.period)
         memory = jnp.concatenate([new.X_WB, new.V_WB_B, new.F_Bo_B, new.seen.reshape(1)])
         return new.F_bias_Bo_W, memory
+
+    def pure(self) -> Pure:
+        """The update as a pure function."""
+
+        def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
+            del t
+            given = [inputs[name] for name in ("X_WB", "V_WB_B", "F_Bo_B")]
+            return dict(enumerate(self._call(*state, *given)))
+
+        return Pure((Event(self.period, update),), {"F_bias_Bo_W": shown(0)})
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         bias, memory = self._step(

@@ -9,6 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from ..models import se3
 from ..models.disturbances import Disturbance
 from .jit import VectorFunction, value_or_none, value_or_zeros
+from .pure import Event, Inputs, Pure, State, shown
 
 
 class DisturbanceSource(LeafSystem):
@@ -69,8 +70,22 @@ class DisturbanceSource(LeafSystem):
 
         size = disturbance.state_size
         self._period = period
+        self._function = advance
         self._start = VectorFunction(disturbance.initial, [sizes[1]], [size])
         self._advance = VectorFunction(advance, [7, 6, 2, sizes[0], size], [size, 6, 6])
+
+    def pure(self) -> Pure:
+        """The update as a pure function."""
+
+        def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
+            X = inputs.get("X_WB", se3.identity(t.dtype))
+            V = inputs.get("V_WB_B", jnp.zeros(6))
+            noise = inputs.get("noise", jnp.zeros(self._noise.size()))
+            when = jnp.stack([t, jnp.full_like(t, self._period)])
+            return dict(enumerate(self._function(X, V, when, noise, state[0])))
+
+        outputs = {"F_disturbance_Bo_B": shown(1), "flow_W": shown(2)}
+        return Pure((Event(self._period, update),), outputs, ("noise",))
 
     def _initialise(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = self._start.flat(value_or_zeros(self._initial_noise, context))

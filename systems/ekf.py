@@ -1,5 +1,6 @@
 """The state estimator as a system; the filter itself is in `systems.filtering`."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -14,6 +15,7 @@ from .filtering.delayed import SLOT, STATUS, DelayedFilter, EkfConfig, FilterSta
 from .filtering.error_state import ERRORS
 from .jit import VectorFunction, value_or_zeros
 from .learned_plant import check_state
+from .pure import Event, Inputs, Pure, State, shown
 
 
 class Ekf(LeafSystem):
@@ -123,6 +125,7 @@ class Ekf(LeafSystem):
         def fuse(flat: Array, slot: Array, k: Array) -> Array:
             return ravel_pytree(core.fuse(unravel(flat), slot, k[0]))[0]
 
+        self._functions = take_in, move, fuse, show, unravel
         results = list(outputs.values())
         self._start = VectorFunction(initialise, [9], [n, *results])
         # Several calls, as XLA runs small programs in line and larger ones on its pool of threads.
@@ -139,6 +142,45 @@ class Ekf(LeafSystem):
         core = self.filter
         like = core.init(jnp.zeros(7), jnp.zeros(6))
         return ravel_pytree(like)[1](jnp.asarray(context.get_discrete_state(self._filter).value()))
+
+    def pure(self) -> Pure:
+        """The update as a pure function."""
+        take_in, move, fuse, show, unravel = self._functions
+        n, sizes = self._samples, [port.size() for port in self._readings]
+
+        def step(state: State, given: list[Array], last: Array) -> Array:
+            """The filter's state after the samples that wait and the one that is shown."""
+            flat, at, slots = take_in(state[0], state[5], *given, last[None])
+
+            def fuse_and_move(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+                flat, at = carry
+                slot = jax.lax.dynamic_slice(slots.reshape(-1), (SLOT * at.astype(int),), (SLOT,))
+                flat = fuse(flat, slot, (last - n + 1 + at)[None])
+                return move(flat, slots, (at + 1)[None])  # at the end it moves nothing: at = n
+
+            return jax.lax.while_loop(lambda carry: carry[1] < n, fuse_and_move, (flat, at))[0]
+
+        def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
+            names = ("imu", "dvl", "depth", "compass")
+            given = [
+                inputs.get(name, jnp.zeros(size)) for name, size in zip(names, sizes, strict=True)
+            ]
+            tick = jnp.round(t / self._period)
+            phase = jnp.mod(tick, n)
+            slot = (jnp.maximum(phase, 1) - 1).astype(int)
+            kept = jax.lax.dynamic_update_slice(state[5], given[0], (6 * slot,))
+            waiting = jnp.where(phase > 0, kept, state[5]) if n > 1 else state[5]
+            flat = jax.lax.cond(phase > 0, lambda: state[0], lambda: step(state, given, tick - 1))
+            told = jax.lax.cond(
+                jnp.mod(tick, self._ratio) == 0,
+                lambda: tuple(show(unravel(flat), t)),
+                lambda: tuple(state[1:5]),
+            )
+            return dict(enumerate([flat, *told, waiting]))
+
+        names = ("X_WB", "V_WB_B", "covariance", "status")
+        outputs = {name: shown(i) for i, name in enumerate(names, 1)}
+        return Pure((Event(self._period, update),), outputs)
 
     def _initialise(self, context: Context, discrete_state: DiscreteValues) -> None:
         results = self._start(value_or_zeros(self._initial_noise, context))

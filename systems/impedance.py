@@ -14,6 +14,7 @@ from ..models.dynamics import Dynamics
 from ..models.integrate import cast
 from .jit import VectorFunction
 from .plan import PlanLayout
+from .pure import Event, Inputs, Pure, State, shown
 from .wrench_limits import WrenchLimits
 
 
@@ -137,6 +138,15 @@ class Impedance(LeafSystem):
         wanted = self.layout.at(plan, t[0])
         F = self.law(X, V, wanted.X_WB, wanted.V_WB_B, wanted.F_Bo_B)
         return jnp.where(wanted.valid, F, 0)
+
+    def pure(self) -> Pure:
+        """The update as a pure function."""
+
+        def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
+            del state
+            return {0: self._call(t[None], inputs["plan"], inputs["X_WB"], inputs["V_WB_B"])}
+
+        return Pure((Event(self.period, update),), {"F_Bo_B": shown(0)})
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         F = self._step.flat(

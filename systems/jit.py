@@ -1,6 +1,7 @@
 """Compiled calls from Drake events: one flat NumPy vector in, one out."""
 
 import hashlib
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from itertools import accumulate, pairwise
@@ -28,6 +29,8 @@ class _Program:
 
 
 _PROGRAMS: WeakValueDictionary[bytes, _Program] = WeakValueDictionary()
+_RECENT: deque[_Program] = deque(maxlen=8)
+"""Programs that live on for another of the same text, though nothing has them any more."""
 
 
 class VectorFunction:
@@ -46,8 +49,11 @@ class VectorFunction:
         function: Callable[..., Array | tuple[Array, ...]],
         inputs: Sequence[int],
         outputs: Sequence[int],
+        keep: bool = False,
     ):
         """`function` takes one vector for each of `inputs` and returns one for each of `outputs`.
+
+        With `keep` the program outlives the function for a while, for the next equal one.
 
         Raises:
             ValueError: if JAX runs in single precision.
@@ -58,6 +64,7 @@ class VectorFunction:
                 'jax.config.update("jax_enable_x64", True) before building a diagram'
             )
         self._function = function
+        self._keep = keep
         self._inputs = tuple(inputs)
         self._outputs = tuple(outputs)
         self._slices = [slice(a, b) for a, b in pairwise(accumulate(self._outputs, initial=0))]
@@ -80,6 +87,8 @@ class VectorFunction:
         program = _PROGRAMS.get(key)
         if program is None:
             program = _PROGRAMS[key] = _Program(lowered)
+        if self._keep:
+            _RECENT.append(program)
         return program
 
     def flat(self, *parts: Float[np.ndarray, "_"]) -> Float[np.ndarray, "m"]:

@@ -14,6 +14,7 @@ from ..models.dynamics import Dynamics, Flow
 from ..models.thruster_curves import NEUTRAL
 from ..models.thrusters import Thrusters
 from .jit import VectorFunction, value_or_none, value_or_zeros
+from .pure import Event, Inputs, Pure, State, shown
 
 
 class LearnedPlant(LeafSystem):
@@ -96,8 +97,9 @@ class LearnedPlant(LeafSystem):
         sizes = [7, 6, 6, 6, 6 * substeps, *bank]
         results = [7, 6, 6, 1, *bank[2:]]
         model = integrate.cast(dynamics, jnp.float64)
-        self._still = VectorFunction(self._step(model, False), sizes, results)
-        self._flowing = VectorFunction(self._step(model, True), [*sizes, 6], results)
+        self._steps = self._step(model, False), self._step(model, True)
+        self._still = VectorFunction(self._steps[0], sizes, results)
+        self._flowing = VectorFunction(self._steps[1], [*sizes, 6], results)
 
     def _declare_thrusters(self, thrusters: Thrusters) -> list[int]:
         """Add the thrusters' ports and state; sizes of pwm, of voltage, and of the state."""
@@ -150,6 +152,31 @@ class LearnedPlant(LeafSystem):
             return X, V, (V - start) / period, finite.astype(V.dtype), *bank
 
         return advance
+
+    def pure(self) -> Pure:
+        """The update as a pure function."""
+        still = {"F_Bo_B": np.zeros(6), "F_disturbance_Bo_B": np.zeros(6)}
+        still["noise"] = np.zeros(6 * self.substeps)
+        outputs = {name: shown(i) for i, name in enumerate(("X_WB", "V_WB_B", "A_WB_B"))}
+        outputs["state"] = lambda state, _: jnp.concatenate(state[:2])
+        if self._thrusters is not None:
+            n = self._neutral.size
+            still |= {"pwm": self._neutral, "voltage": self._nominal}
+            outputs["thruster_force"] = lambda state, _: state[3][:n]
+            outputs["voltage_loaded"] = lambda state, _: state[3][2 * n :]
+
+        def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
+            del t
+            parts = [
+                inputs[name] if name in inputs else jnp.asarray(value)
+                for name, value in still.items()
+            ]
+            flow = [inputs["flow_W"]] if "flow_W" in inputs else []
+            advance = self._steps[len(flow)]
+            X, V, A, _, *bank = advance(*state[:2], *parts, *state[3:], *flow)
+            return dict(enumerate([X, V, A, jnp.concatenate(bank)] if bank else [X, V, A]))
+
+        return Pure((Event(self.period, update),), outputs, ("noise",), (0, 1))
 
     def set_state(self, context: Context, X_WB: ArrayLike, V_WB_B: ArrayLike) -> None:
         """Write pose and twist into this system's context.

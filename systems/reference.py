@@ -11,6 +11,7 @@ from ..models.integrate import cast
 from .jit import VectorFunction, value_or_zeros
 from .paths import Motion, Path
 from .plan import Plan, PlanLayout
+from .pure import Event, Inputs, Pure, State, shown
 
 
 def feedforward(
@@ -81,6 +82,15 @@ class Reference(LeafSystem):
         else:
             F = feedforward(self._dynamics, motion, bias)
         return self.layout.pack(Plan(t[0], motion.X_WB, motion.V_WB_B, F[:, :-1]))
+
+    def pure(self) -> Pure:
+        """The update as a pure function."""
+
+        def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
+            del state
+            return {0: self._call(t[None], inputs.get("F_bias_Bo_W", jnp.zeros(6)))}
+
+        return Pure((Event(self.period, update),), {"plan": shown(0)})
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         bias = value_or_zeros(self._bias, context)

@@ -14,6 +14,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from ..models.sensors import Compass, DepthSensor, Dvl, Imu, Sensor
 from .jit import VectorFunction, value_or_zeros
+from .pure import Event, Inputs, Pure, State, shown
 
 Outputs = tuple[Array, ...]
 Motion = tuple[Array, Array, Array]
@@ -103,12 +104,34 @@ class SensorSuite(LeafSystem):
             _Part(depth.rate, _stamped(depth, shares[2]), (n[2],), (n[2], n[6])),
             _Part(compass.rate, _stamped(compass, shares[3]), (n[3],), (n[3], n[7])),
         ]
+        self._parts = parts
         # Sensors whose period is a multiple of the IMU's share its events and its calls.
         shared = [part for part in parts if _divides(part.rate, imu.rate)]
         self._declare(shared)
         for part in parts:
             if part not in shared:
                 self._declare([part])
+
+    def pure(self) -> Pure:
+        """Each sensor's measurement as a pure function."""
+        base = self._parts[0].rate
+
+        def event(part: _Part) -> Event:
+            def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
+                X, V, A, w = (
+                    inputs.get(port.get_name(), jnp.zeros(port.size()))
+                    for port in (self._X, self._V, self._A, self._noise)
+                )
+                own = [state[index] for index in part.reads]
+                return dict(zip(part.writes, part.measure((X, V, A), t, w, *own), strict=True))
+
+            if _divides(part.rate, base):
+                return Event(1 / base, update, round(base / part.rate))
+            return Event(1 / part.rate, update)
+
+        names = ("imu", "dvl", "depth", "compass")
+        outputs = {name: shown(len(names) + i) for i, name in enumerate(names)}
+        return Pure(tuple(event(part) for part in self._parts), outputs, ("noise",))
 
     def _declare(self, parts: list["_Part"]) -> None:
         """Declare events at the first part's rate; the others take part in every so many."""

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
@@ -32,6 +32,9 @@ class Run:
     """YAML laid over the scenario, such as 'station: {disturbance_set: calm}'."""
     model: Path | None = None
     """Learned model (.spinn) for the planner; by default what the scenario says."""
+    engine: Literal["auto", "drake", "compiled"] = "auto"
+    """Who steps the diagram: Drake, or one compiled loop, which is faster but needs systems that
+    tell what they compute (no planner, no system of one's own without `pure`)."""
     duration: float | None = None
     """Longest simulated time (s); by default that of the scenario."""
     report: bool = True
@@ -49,10 +52,10 @@ class Run:
         out = free_folder("runs", scenario) if self.out is None else self.out
         check_free(out)
         if self.quiet:
-            flown = simulate(scenario)
+            flown = simulate(scenario, engine=self.engine)
         else:
             with progress_bar(f"flying {scenario.name}") as update:
-                flown = simulate(scenario, update)
+                flown = simulate(scenario, update, self.engine)
         values = write_run(flown, out, self.report)
         if not self.quiet:
             self._summary(values, out)

@@ -1,0 +1,240 @@
+"""A diagram as a flat network of systems that tell what they compute."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax
+from jaxtyping import Array
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Diagram, InputPortIndex, OutputPortIndex, System
+from pydrake.systems.primitives import ConstantVectorSource, RandomSource, VectorLogSink
+
+from .pure import Event, HasPure, Pure, State
+
+Port = tuple[System, int]
+"""A system's port by its number."""
+
+Group = tuple[System, int]
+"""A system's group of discrete state by its number."""
+
+
+class NotPureError(Exception):
+    """A diagram holds what only Drake can step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Leaf:
+    """A system with what it computes, and the sizes of its groups of discrete state."""
+
+    system: System
+    pure: Pure
+    sizes: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """A diagram's systems without the diagrams that group them, and what feeds what.
+
+    Attributes:
+        leaves: systems that tell what they compute.
+        wires: the output port that feeds an input port.
+        constants: output ports whose values never change.
+        noise: sources of random numbers, with the period (s) at which they draw.
+        logs: log, the output port that it logs, and its period (s).
+    """
+
+    leaves: tuple[Leaf, ...]
+    wires: Mapping[Port, Port]
+    constants: tuple[Port, ...]
+    noise: tuple[tuple[RandomSource, float], ...]
+    logs: tuple[tuple[VectorLogSink, Port, float], ...]
+
+    @staticmethod
+    def of(diagram: Diagram, log_periods: Mapping[str, float]) -> "Network":
+        """The network of a diagram without inputs; `log_periods` (s) by the logs' names.
+
+        Raises:
+            NotPureError: a system is none of these, or a source draws at another period than that
+                of its readers.
+        """
+        wires: dict[Port, Port] = {}
+        leaves, constants, logs, sources = [], [], [], []
+        for system in _flatten(diagram, wires):
+            if isinstance(system, HasPure):
+                context = system.CreateDefaultContext()
+                count = context.num_discrete_state_groups()
+                sizes = (context.get_discrete_state(i).size() for i in range(count))
+                leaves.append(Leaf(system, system.pure(), tuple(sizes)))
+            elif isinstance(system, ConstantVectorSource):
+                constants.append((system, 0))
+            elif isinstance(system, VectorLogSink):
+                name = system.get_name()
+                if name not in log_periods:
+                    raise NotPureError(f"the period of {name} is not given")
+                logs.append((system, wires[system, 0], log_periods[name]))
+            elif isinstance(system, RandomSource):
+                sources.append(system)
+            else:
+                raise NotPureError(f"{system.get_name()} does not tell what it computes")
+        noise = _noise(leaves, wires, sources)
+        return Network(tuple(leaves), wires, tuple(constants), tuple(noise.items()), tuple(logs))
+
+    @cached_property
+    def groups(self) -> tuple[tuple[Group, slice], ...]:
+        """Every group of state with its place among all of them."""
+        found, at = [], 0
+        for leaf in self.leaves:
+            for index, size in enumerate(leaf.sizes):
+                found.append(((leaf.system, index), slice(at, at + size)))
+                at += size
+        return tuple(found)
+
+    @cached_property
+    def by_system(self) -> Mapping[System, Leaf]:
+        """The leaves by their systems."""
+        return {leaf.system: leaf for leaf in self.leaves}
+
+
+class Ports:
+    """Values of output ports for one state, computed when they are asked for."""
+
+    def __init__(self, network: Network, state: Mapping[Group, Array], known: Mapping[Port, Array]):
+        """`known` are the values of constants and of noise."""
+        self._network, self._values = network, dict(known)
+        self._states = {
+            leaf.system: [state[leaf.system, i] for i in range(len(leaf.sizes))]
+            for leaf in network.leaves
+        }
+
+    def value(self, port: Port) -> Array:
+        """Value of an output port."""
+        if port not in self._values:
+            system, index = port
+            output = self._network.by_system[system].pure.outputs[
+                system.get_output_port(index).get_name()
+            ]
+            self._values[port] = output(self._states[system], self._inputs(system))
+        return self._values[port]
+
+    def update(self, leaf: Leaf, event: Event, t: Array) -> dict[Group, Array]:
+        """The groups that an event changes, after it."""
+        state: State = self._states[leaf.system]
+        changed = event.update(t, state, self._inputs(leaf.system))
+        return {(leaf.system, group): value for group, value in changed.items()}
+
+    def _inputs(self, system: System) -> "_Inputs":
+        return _Inputs(self.value, system, self._network.wires)
+
+
+class _Inputs(Mapping[str, Array]):
+    """A system's connected input ports."""
+
+    def __init__(self, value: Callable[[Port], Array], system: System, wires: Mapping[Port, Port]):
+        names = [system.get_input_port(i).get_name() for i in range(system.num_input_ports())]
+        self._value = value
+        self._from = {
+            name: wires[system, i] for i, name in enumerate(names) if (system, i) in wires
+        }
+
+    def __getitem__(self, name: str) -> Array:
+        return self._value(self._from[name])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._from
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._from)
+
+    def __len__(self) -> int:
+        return len(self._from)
+
+
+def _flatten(diagram: Diagram, wires: dict[Port, Port]) -> list[System]:
+    """All systems in a diagram that are no diagrams; adds to `wires` what feeds them."""
+
+    def walk(system: System) -> tuple[list[System], list[list[Port]], list[Port]]:
+        """The systems inside, the ports that each input feeds, the port behind each output."""
+        if not isinstance(system, Diagram):
+            feeds = [[(system, i)] for i in range(system.num_input_ports())]
+            return [system], feeds, [(system, i) for i in range(system.num_output_ports())]
+        inner = {part: walk(part) for part in system.GetSystems()}
+        for (reader, i), (source, j) in system.connection_map().items():
+            for port in inner[reader][1][int(i)]:
+                wires[port] = inner[source][2][int(j)]
+        feeds = [
+            [
+                port
+                for part, i in system.GetInputPortLocators(InputPortIndex(k))
+                for port in inner[part][1][int(i)]
+            ]
+            for k in range(system.num_input_ports())
+        ]
+        shown = []
+        for k in range(system.num_output_ports()):
+            part, i = system.get_output_port_locator(OutputPortIndex(k))
+            shown.append(inner[part][2][int(i)])
+        return [leaf for part in inner.values() for leaf in part[0]], feeds, shown
+
+    return walk(diagram)[0]
+
+
+def _noise(
+    leaves: list[Leaf], wires: Mapping[Port, Port], sources: list[RandomSource]
+) -> dict[RandomSource, float]:
+    """The sources that are read at events, with the period at which they draw."""
+    found: dict[RandomSource, float] = {}
+    for leaf in leaves:
+        for name in leaf.pure.noise:
+            port = leaf.system, int(leaf.system.GetInputPort(name).get_index())
+            source = wires[port][0] if port in wires else None
+            if source in sources:
+                period = leaf.pure.events[0].period
+                if found.setdefault(source, period) != period or not _draws(source, period):
+                    raise NotPureError(f"{source.get_name()} draws at another period than is used")
+    return found
+
+
+def _draws(source: RandomSource, period: float) -> bool:
+    """Whether a source draws at 0 and at every period from then on."""
+    simulator = Simulator(source)
+    counts = []
+    for periods in (0.5, 1.5, 10.5):
+        simulator.AdvanceTo(periods * period)
+        counts.append(simulator.get_num_unrestricted_updates())
+    return counts == [1, 2, 11]
+
+
+def simultaneous(
+    network: Network, periods: list[float]
+) -> dict[tuple[int, int], list[tuple[Leaf, Event]]]:
+    """Events by the number of their period in `periods` and how often they take part."""
+    found: dict[tuple[int, int], list[tuple[Leaf, Event]]] = {}
+    for leaf in network.leaves:
+        for event in leaf.pure.events:
+            key = periods.index(event.period), event.every
+            found.setdefault(key, []).append((leaf, event))
+    return found
+
+
+def changed_by(
+    events: list[tuple[Leaf, Event]], ports: Callable[[], Ports], t: Array
+) -> tuple[list[Group], Callable[[], tuple[Array, ...]]]:
+    """The groups that simultaneous events change, and a function that computes them."""
+
+    def change() -> dict[Group, Array]:
+        own = ports()  # of this trace alone
+        found: dict[Group, Array] = {}
+        for leaf, event in events:
+            found |= own.update(leaf, event, t)
+        return found
+
+    names: list[Group] = []
+
+    def values() -> tuple[Array, ...]:
+        found = change()
+        names[:] = found
+        return tuple(found.values())
+
+    jax.eval_shape(values)
+    return names, values

@@ -5,8 +5,9 @@ Kinematics dg = g ξ dt and momentum balance in B (Palmer et al., eqs. 9-11; Fos
     M dξ = (ad*_ξ(M ξ) - D ξ - D^f (|ξ| ∘ ξ) + F_V(g) + F) dt + b(ξ) ∘ dW,
 
 with ξ = `V_WB_B`, F the commanded wrench, F_V the left-trivialised derivative of -V(g), D and D^f
-the viscous and the fluid drag matrix and b the diagonal diffusion (N√s, N·m√s). A subclass says
-what M, D, D^f, b and V are: constants for a Fossen model, networks for a SPINN.
+the viscous and the fluid drag matrix and b the diagonal diffusion (N√s, N·m√s); a model may
+correlate the axes of dW. A subclass says what M, D, D^f, b and V are: constants for a Fossen model,
+networks for a SPINN.
 """
 
 import abc
@@ -76,6 +77,13 @@ class Dynamics(eqx.Module):
         """The pose after a step in which ξ dt = `twist_dt`: X exp(ξ dt), the Lie-Euler step."""
         return se3.retract(X_WB, twist_dt)
 
+    def correlate(
+        self, V_WB_B: Float[Array, "6 *#batch"], dW: Float[Array, "6 *#batch"]
+    ) -> Float[Array, "6 *#batch"]:
+        """C(ξ) dW, C Cᵀ the correlation matrix of the noise wrench b ∘ (C dW); here dW itself."""
+        del V_WB_B
+        return dW
+
     def drag_wrench(
         self, V_CB_B: Float[Array, "6 *#batch"], coefficients: Coefficients | None = None
     ) -> Float[Array, "6 *#batch"]:
@@ -138,11 +146,11 @@ class Dynamics(eqx.Module):
         dW: Float[Array, "6 *#batch"],
         coefficients: tuple[Spd, Array] | None = None,
     ) -> Float[Array, "6 *#batch"]:
-        """M(ξ)⁻¹ b(ξ) dW: the velocity increment of a Brownian increment dW (√s)."""
+        """M(ξ)⁻¹ b(ξ) C(ξ) dW: the velocity increment of a Brownian increment dW (√s)."""
         if coefficients is None:
             coefficients = self.mass_and_diffusion(V_WB_B)
         mass, b = coefficients
-        b, dW = se3.align(b, dW)
+        b, dW = se3.align(b, self.correlate(V_WB_B, dW))
         return mass.solve(b * dW)
 
     def kinetic_energy(self, V_WB_B: Float[Array, "6 *#batch"]) -> Float[Array, "*#batch"]:

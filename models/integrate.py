@@ -40,8 +40,8 @@ def step(
     elif flow is None:
         c = dynamics.coefficients(V_WB_B)
         mass, wrench = dynamics.balance(X_WB, V_WB_B, F_Bo_B, coefficients=c)
-        b, dW = se3.align(c.diffusion, dW)
-        both = jnp.stack(jnp.broadcast_arrays(wrench, b * dW), axis=1)
+        b, correlated = se3.align(c.diffusion, dynamics.correlate(V_WB_B, dW))
+        both = jnp.stack(jnp.broadcast_arrays(wrench, b * correlated), axis=1)
         drift, first = jnp.unstack(mass.solve(both), axis=1)
         second = dynamics.noise_acceleration(V_WB_B + first, dW)
         dV = h * drift + (first + second) / 2
@@ -109,7 +109,7 @@ class DriftTerm(diffrax.AbstractTerm):
 
 
 class NoiseTerm(diffrax.AbstractTerm):
-    """M⁻¹ b dW; it moves the velocity only (the diffusion is hypoelliptic)."""
+    """M⁻¹ b C dW; it moves the velocity only (the diffusion is hypoelliptic)."""
 
     dynamics: Dynamics
     brownian: diffrax.AbstractBrownianPath

@@ -2,7 +2,8 @@
 
 Palmer et al., "Stochastic physics-informed neural networks on Lie groups": the stochastic
 Euler–Poincaré equation of `models.dynamics` with M_θ(ξ), D_θ(ξ), D^f_θ(ξ) symmetric positive
-definite, b_θ(ξ) diagonal and positive, and V_θ(g) bounded by a learned λ.
+definite, b_θ(ξ) diagonal and positive, and V_θ(g) bounded by a learned λ. Beyond the paper, b may
+be the diagonal of a full factor b C_θ(ξ).
 """
 
 from dataclasses import dataclass
@@ -47,6 +48,8 @@ class SpinnConfig:
     """Without it b = 0 (a geometric PINN)."""
     diffusion: DiffusionKind = "network"
     """b by a network of its own, or one that grows with the distance from the data."""
+    correlated: bool = False
+    """The noise's axes are correlated: b C(ξ) dW, C a lower triangle with rows of length one."""
     coordinates: Literal["group", "euler"] = "group"
     """State on SE(3), or position and Euler angles in R¹² as baselines have it (`EuclideanSpinn`).
     """
@@ -67,6 +70,8 @@ class SpinnConfig:
         require(self.start in ("reference", "scale"), self, "start", "use reference or scale")
         kinds = get_args(DiffusionKind)
         require(self.diffusion in kinds, self, "diffusion", f"use one of {kinds}")
+        plain = not self.correlated or (self.stochastic and self.diffusion == "network")
+        require(plain, self, "correlated", "leave it out, or let b be a network of its own")
         require(self.coordinates in ("group", "euler"), self, "coordinates", "use group or euler")
         require(min(self.velocity_scale) > 0, self, "velocity_scale", "give positive numbers")
         require(self.length_scale > 0, self, "length_scale", "give a positive length in m")
@@ -154,7 +159,9 @@ class Spinn(Dynamics):
                 count, 6, config.width, config.depth, config.activation, network_key, dtype
             ),
             matrix_heads=Heads.constant(variable, config.width),
-            diffusion_head=Heads.constant(jnp.zeros((1, 6), dtype), config.width)
+            diffusion_head=Heads.constant(
+                jnp.zeros((1, 6 + 15 * config.correlated), dtype), config.width
+            )
             if network
             else None,
             constant_mass=jnp.zeros(PACKED, dtype) if config.constant_mass else None,
@@ -223,8 +230,37 @@ class Spinn(Dynamics):
             return expand(scale, factor.ndim) * factor
         if self.diffusion_head is None:
             return jnp.zeros_like(scale)
-        raw = self.diffusion_head(features[:1], 1)[0]
+        raw = self.diffusion_head(features[:1], 1)[0, :6]
         return expand(scale, raw.ndim) * squareplus(raw)
+
+    def correlate(
+        self, V_WB_B: Float[Array, "6 *#batch"], dW: Float[Array, "6 *#batch"]
+    ) -> Float[Array, "6 *#batch"]:
+        if not self.config.correlated:
+            return dW
+        C = self.noise_correlation_root(V_WB_B)
+        dW = jnp.broadcast_to(dW, jnp.broadcast_shapes(dW.shape, V_WB_B.shape))
+        return jnp.sum(C * dW[None], axis=1)
+
+    def noise_correlation_root(
+        self, V_WB_B: Float[Array, "6 *batch"]
+    ) -> Float[Array, "6 6 *batch"]:
+        """C(ξ), lower triangular with rows of length one: b C is the factor of a full diffusion.
+
+        Row i holds free numbers left of the diagonal and 1 on it, divided by the row's length: b
+        stays the noise's size on each axis, and C Cᵀ, its correlation matrix, takes any value.
+
+        Raises:
+            ValueError: the model's noise is not correlated.
+        """
+        if self.diffusion_head is None or not self.config.correlated:
+            raise ValueError("the model has no correlated noise: set SpinnConfig.correlated")
+        raw = self.diffusion_head(self._features(V_WB_B, 1), 1)[0, 6:]
+        rows, columns = np.tril_indices(6, -1)
+        batch = raw.shape[1:]
+        C = jnp.zeros((6, 6, *batch), raw.dtype).at[rows, columns].set(raw)
+        C = C + jnp.eye(6, dtype=raw.dtype).reshape(6, 6, *(1 for _ in batch))
+        return C / jnp.sqrt(jnp.sum(C * C, axis=1, keepdims=True))
 
     def _spd(self, raw: Array, index: int) -> Spd:
         scales = jax.lax.stop_gradient(self.scales)

@@ -50,6 +50,11 @@ class HeldModel(Dynamics):
     ) -> Float[Array, "7 *#batch"]:
         return self.dynamics.displace(X_WB, twist_dt)
 
+    def correlate(
+        self, V_WB_B: Float[Array, "6 *#batch"], dW: Float[Array, "6 *#batch"]
+    ) -> Float[Array, "6 *#batch"]:
+        return self.dynamics.correlate(V_WB_B, dW)
+
     def drag_wrench(
         self, V_CB_B: Float[Array, "6 *#batch"], coefficients: Coefficients | None = None
     ) -> Float[Array, "6 *#batch"]:

@@ -166,6 +166,49 @@ def test_second_stage_repeats_mass_and_diffusion_of_the_first(constant_mass, sto
     assert np.all(b > 0) if stochastic else np.all(b == 0)
 
 
+def test_correlated_noise_starts_uncorrelated_and_can_have_any_correlation():
+    settings = SpinnConfig(**SMALL, correlated=True)
+    new, V = Spinn.create(settings, body(), jax.random.key(0)), states(9, 5)[1]
+    np.testing.assert_allclose(
+        eqx.filter_jit(new.noise_correlation_root)(V), np.eye(6)[..., None] * np.ones(5), atol=1e-15
+    )
+    A = np.random.default_rng(3).normal(size=(6, 9))
+    wanted = np.corrcoef(A)
+    C = np.linalg.cholesky(wanted)
+    free = (C / np.diag(C)[:, None])[np.tril_indices(6, -1)]
+    assert new.diffusion_head is not None
+    model = eqx.tree_at(
+        lambda m: m.diffusion_head.bias, new, new.diffusion_head.bias.at[0, 6:].set(free)
+    )
+
+    @eqx.filter_jit
+    def increments(model, V):
+        dW = jnp.broadcast_to(jnp.eye(6)[:, :, None], (6, 6, 5))
+        return jnp.stack([model.noise_acceleration(V, e) for e in jnp.swapaxes(dW, 0, 1)], axis=1)
+
+    mass = model.coefficients(V).mass.matrix()
+    F = jnp.einsum(
+        "ijb,jkb->ikb", jnp.broadcast_to(mass.reshape(6, 6, -1), (6, 6, 5)), increments(model, V)
+    )
+    covariance = jnp.einsum("ikb,jkb->ijb", F, F)
+    b = np.asarray(body().diffusion)
+    np.testing.assert_allclose(covariance[..., 2], wanted * np.outer(b, b), rtol=1e-9)
+
+
+def test_the_size_of_correlated_noise_is_b_whatever_the_velocity():
+    model, V = spinn(correlated=True), states(9, 5)[1]
+    C = np.asarray(eqx.filter_jit(model.noise_correlation_root)(V))
+    np.testing.assert_allclose(np.sum(C**2, axis=1), 1, rtol=1e-12)
+    assert np.ptp(C[3, 1]) > 1e-3  # the networks say it by velocity
+    np.testing.assert_array_equal(C[np.triu_indices(6, 1)], 0)
+
+
+@pytest.mark.parametrize("other", [{"stochastic": False}, {"diffusion": "distance-aware"}])
+def test_correlation_needs_a_network_of_b(other):
+    with pytest.raises(UserError, match=r"SpinnConfig.correlated"):
+        SpinnConfig(correlated=True, **other)
+
+
 @pytest.mark.parametrize("kind", ["cholesky", "eigenvalues"])
 def test_viscous_drag_dissipates_and_mass_is_positive(kind):
     V = np.asarray(states(7, 200)[1])

@@ -139,3 +139,37 @@ def test_distance_aware_objectives_need_their_diffusion(objective, windows):
     model = start(small("euclidean-fdm"))
     with pytest.raises(UserError, match=r"diffusion is of kind network; set model.diffusion to"):
         objective.build(model, windows)
+
+
+def test_matching_hears_correlations_of_the_noise(windows):
+    """The score of samples is best at the true correlation of sway and yaw, not at none."""
+    config = small("fdm-geodesic")
+    config = replace(config, model=replace(config.model, correlated=True))
+    entry = 6 + 10 + 1  # below the diagonal, row by row: the sixth row begins with number 10
+    model = start(config)
+
+    def with_slope(value):
+        assert model.diffusion_head is not None
+        bias = model.diffusion_head.bias.at[0, entry].set(value)
+        return eqx.tree_at(lambda m: m.diffusion_head.bias, model, bias)
+
+    W = 512
+    X = np.zeros((7, W), np.float32)
+    X[0] = 1
+    V, F = np.zeros((6, W), np.float32), np.zeros((STEPS, 6, W), np.float32)
+    begin = tuple(jnp.asarray(a) for a in (X, V, F))
+    Xs, Vs = eqx.filter_jit(predict)(with_slope(3.0), *begin, DT, jax.random.key(0), 1)
+    seen = Windows(
+        X=np.concatenate([X[None], np.asarray(Xs)[:, :, 0]]),
+        V=np.concatenate([V[None], np.asarray(Vs)[:, :, 0]]),
+        F=F,
+        dt=DT,
+        scenario=np.zeros(W, int),
+        run=np.arange(W),
+        start=np.zeros(W),
+        names=("a",),
+    )
+    objective = replace(config.objective, samples=8, mse_weight=0.0).build(model, seen)
+    score = eqx.filter_jit(lambda m: objective.loss(m, Batch.of(seen), jax.random.key(1))[0])
+    true, none, opposite = (float(score(with_slope(s))) for s in (3.0, 0.0, -3.0))
+    assert true < none < opposite

@@ -88,6 +88,11 @@ class Extended(Dynamics):
         mass, b = self.base.mass_and_diffusion(V_WB_B)
         return self._mass(mass), self._diffusion(V_WB_B, b)
 
+    def correlate(
+        self, V_WB_B: Float[Array, "6 *#batch"], dW: Float[Array, "6 *#batch"]
+    ) -> Float[Array, "6 *#batch"]:
+        return self.base.correlate(V_WB_B, dW)
+
     def potential(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "*#batch"]:
         """Of the base: effects need not have a potential."""
         return self.base.potential(X_WB)
@@ -337,7 +342,7 @@ class Extended(Dynamics):
             if noise is not None:
                 h = jnp.asarray(dt, V.dtype)
                 b = self._diffusion(V, self.base.mass_and_diffusion(V)[1])
-                b, dW = se3.align(b, jnp.sqrt(h) * noise[:6])
+                b, dW = se3.align(b, self.correlate(V, jnp.sqrt(h) * noise[:6]))
                 V = V + times(inertia.inverse, b * dW)
             return (memory, state, X, V), (X, V)
 

@@ -53,6 +53,21 @@ class Dynamics(eqx.Module):
         """Whether b may differ from zero; integrators skip the noise of a model that says no."""
         return True
 
+    @property
+    def brownian_size(self) -> int:
+        """Brownian motions that a rollout takes: 6, and 6 more if pushes of the model last."""
+        return 6
+
+    def lasting_push(
+        self, w: Float[Array, "T 6 *batch"], dt: float | Float[Array, ""]
+    ) -> Float[Array, "T 6 *batch"]:
+        """The wrench on the body of the 6 more, from unit Gaussians at T steps of `dt` (s).
+
+        Raises:
+            ValueError: the model has none.
+        """
+        raise ValueError(f"{type(self).__name__} has no pushes that last: give it noise of 6 axes")
+
     @abc.abstractmethod
     def coefficients(self, V_WB_B: Float[Array, "6 *#batch"]) -> Coefficients:
         """M, D, D^f and b at a body velocity."""

@@ -59,7 +59,7 @@ def rollout(
     V_WB_B: Float[Array, "6 *#batch"],
     F_Bo_B: Float[Array, "T 6 *command"],
     dt: float,
-    dW: Float[Array, "T S 6 *#batch"] | None = None,
+    dW: Float[Array, "T S n *#batch"] | None = None,
     *,
     substeps: int = 1,
     remat: bool = True,
@@ -67,23 +67,31 @@ def rollout(
     """States at dt, 2 dt, …, T dt (the start is left out) under zero-order-held wrenches.
 
     `dW` holds the Brownian increments of S substeps of length dt / S each and must then have
-    variance dt / S; without it `substeps` deterministic ones are taken. `remat` recomputes each
+    variance dt / S; without it `substeps` deterministic ones are taken. They are 6 a substep, or
+    `Dynamics.brownian_size` for a model with pushes that last, which start in their stationary law:
+    with 6 those pushes are left out. `remat` recomputes each
     step in the backward pass: memory then grows with the states alone, not with the networks'
     activations.
     """
     count = substeps if dW is None else dW.shape[1]
     h = dt / count
+    push = None
+    if dW is not None and dW.shape[2] > 6:
+        w = dW[:, :, 6:].reshape(-1, *dW[0, 0, 6:].shape) / jnp.sqrt(jnp.asarray(h, dW.dtype))
+        dW = dW[:, :, :6]
+        push = dynamics.lasting_push(w, h).reshape(dW.shape)
 
-    def advance(carry: tuple[Array, Array], inputs: tuple[Array, Array | None]) -> Any:
+    def advance(carry: tuple[Array, Array], inputs: tuple[Array, Any, Any]) -> Any:
         X, V = carry
-        F, dW_step = inputs
+        F, dW_step, push_step = inputs
         (F,) = (F.reshape(F.shape + (1,) * (V.ndim - F.ndim)),)
         for s in range(count):
-            X, V = step(dynamics, X, V, F, h, None if dW_step is None else dW_step[s])
+            F_s = F if push_step is None else F + push_step[s]
+            X, V = step(dynamics, X, V, F_s, h, None if dW_step is None else dW_step[s])
         return (X, V), (X, V)
 
     body = jax.checkpoint(advance) if remat else advance
-    _, (Xs, Vs) = jax.lax.scan(body, (X_WB, V_WB_B), (F_Bo_B, dW))
+    _, (Xs, Vs) = jax.lax.scan(body, (X_WB, V_WB_B), (F_Bo_B, dW, push))
     return Xs, Vs
 
 

@@ -6,7 +6,7 @@ definite, b_θ(ξ) diagonal and positive, and V_θ(g) bounded by a learned λ. B
 be the diagonal of a full factor b C_θ(ξ).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from .checks import Vector6, check_numbers, require
 from .distance_aware import DiffusionKind, DistanceAware
 from .dynamics import Coefficients, Dynamics
+from .mean_reverting import MeanReverting
 from .networks import ACTIVATIONS, Activation, Heads, MlpStack, expand
 from .potential import BoundedScalar, GravityPotential, PosePotential, Potential, PotentialKind
 from .rigid_body import FossenDynamics
@@ -50,6 +51,8 @@ class SpinnConfig:
     """b by a network of its own, or one that grows with the distance from the data."""
     correlated: bool = False
     """The noise's axes are correlated: b C(ξ) dW, C a lower triangle with rows of length one."""
+    mean_reverting: bool = False
+    """A second, Ornstein–Uhlenbeck disturbance, whose time constants are learned."""
     coordinates: Literal["group", "euler"] = "group"
     """State on SE(3), or position and Euler angles in R¹² as baselines have it (`EuclideanSpinn`).
     """
@@ -73,6 +76,10 @@ class SpinnConfig:
         plain = not self.correlated or (self.stochastic and self.diffusion == "network")
         require(plain, self, "correlated", "leave it out, or let b be a network of its own")
         require(self.coordinates in ("group", "euler"), self, "coordinates", "use group or euler")
+        plain = not self.mean_reverting or (self.stochastic and self.coordinates == "group")
+        require(
+            plain, self, "mean_reverting", "leave it out, or use a stochastic model on the group"
+        )
         require(min(self.velocity_scale) > 0, self, "velocity_scale", "give positive numbers")
         require(self.length_scale > 0, self, "length_scale", "give a positive length in m")
 
@@ -106,6 +113,7 @@ class Spinn(Dynamics):
     constant_mass: Float[Array, "21"] | None
     learned_potential: Potential
     distance_aware: DistanceAware | None = None
+    lasting: MeanReverting | None = None
 
     @classmethod
     def create(
@@ -171,6 +179,7 @@ class Spinn(Dynamics):
             )
             if aware
             else None,
+            lasting=MeanReverting.create(dtype) if config.mean_reverting else None,
         )
 
     @staticmethod
@@ -183,6 +192,31 @@ class Spinn(Dynamics):
     @property
     def stochastic(self) -> bool:
         return self.config.stochastic
+
+    @property
+    def brownian_size(self) -> int:
+        return 6 if self.lasting is None else 12
+
+    def lasting_push(
+        self, w: Float[Array, "T 6 *batch"], dt: float | Float[Array, ""]
+    ) -> Float[Array, "T 6 *batch"]:
+        if self.lasting is None:
+            return super().lasting_push(w, dt)
+        return self.lasting.path(self.scales.diffusion, w, dt)
+
+    def whitened(self) -> "Spinn":
+        """The model with white noise alone that strays as far, for those who hold no latent state.
+
+        Over times much longer than τ a mean-reverting wrench strays like white noise with
+        b = σ √(2τ), which is added to the model's own in squares at the scale of its diffusion.
+        """
+        if self.lasting is None:
+            return self
+        own = self.scales.diffusion
+        b = jnp.sqrt(own**2 + self.lasting.white(own) ** 2)
+        scales = replace(self.scales, diffusion=b)
+        config = replace(self.config, mean_reverting=False)
+        return replace(self, config=config, scales=scales, lasting=None)
 
     def trainable(self) -> "Spinn":
         """The same tree with True at the parameters θ and False at inertia and scales."""

@@ -22,6 +22,7 @@ from ..models.checkpoint import load_model
 from ..models.checks import Vector6, check_numbers, require
 from ..models.dynamics import Dynamics
 from ..models.errors import UserError
+from ..models.spinn import Spinn
 from ..models.vehicle import load_vehicle
 from .disturbance_observer import DisturbanceObserver, MomentumObserver
 from .impedance import Impedance, ImpedanceGains, ImpedanceLaw
@@ -197,7 +198,8 @@ class MppiImpedance(Controller):
     def _model(self, station: StationConfig) -> tuple[Dynamics, Mapping[str, Any]]:
         """The model to plan with and what its checkpoint says of it."""
         if self.model is not None:
-            return load_model(self.model, float)
+            model, metadata = load_model(self.model, float)
+            return (model.whitened() if isinstance(model, Spinn) else model), metadata
         vehicle = load_vehicle(self.vehicle or station.vehicle)
         return vehicle.dynamics(np.array(self.diffusion)), {}
 

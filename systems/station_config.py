@@ -8,9 +8,10 @@ from jaxtyping import Float
 
 from ..models.checkpoint import load_model
 from ..models.checks import Vector6, check_numbers, require
-from ..models.disturbances import Combined, Kind, preset
+from ..models.disturbances import Combined, Kind, OrnsteinUhlenbeckWrench, preset
 from ..models.dynamics import Dynamics
 from ..models.sensors import Compass, DepthSensor, Dvl, Imu
+from ..models.spinn import Spinn
 from ..models.vehicle import Vehicle, load_vehicle
 from .filtering.delayed import EkfConfig
 from .obstacles import Pylon
@@ -91,8 +92,19 @@ class StationConfig:
         return self.load_vehicle().dynamics(np.array(self.diffusion))
 
     def disturbance(self) -> Combined:
-        """All disturbances as one."""
-        return Combined((*preset(self.disturbance_set).members, *self.disturbances))
+        """All disturbances as one, and with them the pushes that last of a learned model.
+
+        Raises:
+            UserError: the checkpoint can't be read.
+        """
+        members = (*preset(self.disturbance_set).members, *self.disturbances)
+        if self.model is not None:
+            model = load_model(self.model, float)[0]
+            if isinstance(model, Spinn) and model.lasting is not None:
+                std = np.asarray(model.lasting.std(model.scales.diffusion)).tolist()
+                time = np.asarray(model.lasting.time_constant).tolist()
+                members += (OrnsteinUhlenbeckWrench(tuple(std), tuple(time)),)
+        return Combined(members)
 
     def initial_state(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6"]]:
         """X_WB and V_WB_B at t = 0."""

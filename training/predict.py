@@ -30,9 +30,10 @@ def predict(
     # substeps as steps of their own: the compiled step is one, however many there are
     dt = dt / substeps
     scale = jnp.asarray(dt**0.5, F.dtype)
-    dW = scale * jax.random.normal(key, (T * substeps, 1, 6, W, samples), F.dtype)
+    n = model.brownian_size
+    dW = scale * jax.random.normal(key, (T * substeps, 1, n, W, samples), F.dtype)
     if with_path_of_drift:
-        dW = jnp.concatenate([dW, jnp.zeros((T * substeps, 1, 6, W, 1), F.dtype)], axis=4)
+        dW = jnp.concatenate([dW, jnp.zeros((T * substeps, 1, n, W, 1), F.dtype)], axis=4)
 
     # one axis of all windows' samples: loops over it are long, whatever W and P are
     def flat(a: Array) -> Array:
@@ -40,7 +41,7 @@ def predict(
         return a.reshape(*a.shape[:-2], W * count)
 
     F = jnp.repeat(flat(F), substeps, axis=0)
-    dW = dW.reshape(T * substeps, 1, 6, W * count)
+    dW = dW.reshape(T * substeps, 1, n, W * count)
     Xs, Vs = rollout(model, flat(X_0), flat(V_0), F, dt, dW)
     return _by_sample(Xs[substeps - 1 :: substeps], W), _by_sample(Vs[substeps - 1 :: substeps], W)
 

@@ -88,6 +88,15 @@ class Extended(Dynamics):
         mass, b = self.base.mass_and_diffusion(V_WB_B)
         return self._mass(mass), self._diffusion(V_WB_B, b)
 
+    @property
+    def brownian_size(self) -> int:
+        return self.base.brownian_size
+
+    def lasting_push(
+        self, w: Float[Array, "T 6 *batch"], dt: float | Float[Array, ""]
+    ) -> Float[Array, "T 6 *batch"]:
+        return self.base.lasting_push(w, dt)
+
     def correlate(
         self, V_WB_B: Float[Array, "6 *#batch"], dW: Float[Array, "6 *#batch"]
     ) -> Float[Array, "6 *#batch"]:

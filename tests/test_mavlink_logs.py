@@ -32,10 +32,11 @@ from spinndrift.models.resample import (
     rotation_log,
     slerp,
 )
+from spinndrift.sims.cli import main
 from spinndrift.systems.mavlink import codec
 from spinndrift.systems.mavlink.cut_tlog import cut_tlog
 from spinndrift.systems.mavlink.log_bytes import read_log_bytes
-from spinndrift.systems.mavlink.logs import import_log, load_data
+from spinndrift.systems.mavlink.logs import LogOptions, import_log, load_data
 from spinndrift.systems.mavlink.logs_bin import read_bin
 from spinndrift.systems.mavlink.logs_tlog import read_tlog
 from spinndrift.systems.mavlink.packets import scan
@@ -43,10 +44,10 @@ from spinndrift.systems.mavlink.packets import scan
 DEMO = ROOT / "sims" / "data" / "sitl_dive.tlog.xz"
 
 
-def imported(tmp_path, data, name="dive.tlog", **options):
+def imported(tmp_path, data, name="dive.tlog", rate=20.0, vehicle="bluerov2_heavy", **options):
     path = tmp_path / name
     path.write_bytes(data)
-    return import_log(path, **options)
+    return import_log(path, rate=rate, vehicle=vehicle, options=LogOptions(**options))
 
 
 def errors(run, dt):
@@ -354,6 +355,19 @@ def test_missing_files_and_folders_and_options(tmp_path):
             imported(tmp_path, b"x", **option)
     with pytest.raises(UserError, match="no stretch of 60 s"):
         imported(tmp_path, dive(duration=8).bytes(), minimum=60.0)
+
+
+def test_the_command_passes_options_for_logs_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dive.tlog").write_bytes(dive(duration=8).bytes())
+    with pytest.raises(SystemExit) as ended:
+        main(["import", "dive.tlog", "--minimum", "60"])
+    assert ended.value.code == 2
+    assert "no stretch of 60 s" in capsys.readouterr().err
+    main(["import", "dive.tlog", "--minimum", "2", "--disarmed", "--out", "dive.nc"])
+    capsys.readouterr()
+    with pytest.raises(UserError, match=r"dive\.nc: gap is for logs of a vehicle; leave it out"):
+        load_data(tmp_path / "dive.nc", options=LogOptions(gap=2.0))
 
 
 @pytest.mark.parametrize("kind", ["tlog", "bin"])

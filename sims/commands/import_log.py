@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import FlagCreatePairsOff, Positional
 
 from ...models.errors import UserError
 from ..progress import console, progress_bar
@@ -27,15 +28,29 @@ class Import:
     vehicle: str | None = None
     """Preset name or YAML file of the vehicle; by default what the data name, or bluerov2_heavy."""
 
+    minimum: float = 5.0
+    """Shortest stretch of a log that is kept (s)."""
+    gap: float = 0.5
+    """Longest pause between samples of one of a log's signals (s); a longer one parts a stretch."""
+    water_density: float | None = None
+    """kg/m³, where a log's autopilot took the sea for fresh water: corrects depth and climb."""
+    disarmed: Annotated[bool, FlagCreatePairsOff] = False
+    """Keep a log's disarmed stretches too."""
+    system: int | None = None
+    """MAVLink system id, where a log holds several autopilots."""
+
     def run(self) -> None:
         """Read, convert, write, summarise."""
-        from ...systems.mavlink.logs import load_data
+        from ...systems.mavlink.logs import LogOptions, load_data
 
         out = self.out if self.out is not None else Path(f"{stem(self.log)}.nc")
         if out.suffix != ".nc":
             raise UserError(f"--out {out}: a Recording is a NetCDF file; give a name ending in .nc")
+        options = LogOptions(self.minimum, self.gap, self.water_density, self.disarmed, self.system)
         with progress_bar(f"reading {self.log.name}") as update:
-            recording = load_data(self.log, rate=self.rate, vehicle=self.vehicle, progress=update)
+            recording = load_data(
+                self.log, rate=self.rate, vehicle=self.vehicle, options=options, progress=update
+            )
         recording.save(out)
         shown = console()
         shown.print(recording.summary())

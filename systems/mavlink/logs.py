@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from ...models.errors import UserError
@@ -20,16 +21,32 @@ from .signals_tlog import WANTED as TLOG_WANTED
 from .signals_tlog import signals_from_tlog
 
 
+@dataclass(frozen=True)
+class LogOptions:
+    """What is taken from a vehicle's log.
+
+    Attributes:
+        minimum: shortest stretch kept (s).
+        gap: longest pause between samples of one signal within a stretch (s).
+        water_density: kg/m³, to correct depth and vertical velocity of an autopilot that assumed
+            fresh water; None takes its figures as they are.
+        disarmed: keep disarmed stretches too.
+        system: MAVLink system id, if several autopilots are in the log.
+    """
+
+    minimum: float = 5.0
+    gap: float = 0.5
+    water_density: float | None = None
+    disarmed: bool = False
+    system: int | None = None
+
+
 def import_log(
     path: str | os.PathLike[str],
     *,
     rate: float = 20.0,
     vehicle: str = "bluerov2_heavy",
-    minimum: float = 5.0,
-    gap: float = 0.5,
-    water_density: float | None = None,
-    disarmed: bool = False,
-    system: int | None = None,
+    options: LogOptions | None = None,
     progress: Progress = no_progress,
 ) -> tuple[Recording, ImportReport]:
     """Import a log: one scenario for each stretch of constant mode, armed, without gaps or resets.
@@ -38,25 +55,25 @@ def import_log(
         path: the log; its kind is told by its content.
         rate: of the recording (Hz).
         vehicle: preset or file whose thruster directions the PWM shall have; named in the result.
-        minimum: shortest stretch kept (s).
-        gap: longest pause between samples of one signal within a stretch (s).
-        water_density: kg/m³, to correct depth and vertical velocity of an autopilot that assumed
-            fresh water; None takes its figures as they are.
-        disarmed: keep disarmed stretches too.
-        system: MAVLink system id, if several autopilots are in the log.
+        options: what is taken from the log.
         progress: called with the fraction done, 0 to 1.
 
     Raises:
         UserError: if there is no such log, it can't be read, or nothing usable is in it.
     """
     path = Path(path)
-    _check_options(rate, minimum, gap, water_density)
+    options = options or LogOptions()
+    _check_options(rate, options)
     motors = [mount.motor for mount in load_vehicle(vehicle).propulsion.mounts]
     raw = read_log_bytes(path, progress)
     try:
-        signals = _signals(raw, motors, water_density, system, progress)
+        signals = _signals(raw, motors, options, progress)
         trajectories, lines, dropped = fuse(
-            signals, rate=rate, minimum=minimum, gap=gap, disarmed=disarmed
+            signals,
+            rate=rate,
+            minimum=options.minimum,
+            gap=options.gap,
+            disarmed=options.disarmed,
         )
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
@@ -67,8 +84,9 @@ def import_log(
         ) from error
     if not trajectories:
         raise UserError(
-            f"{path}: no stretch of {minimum:g} s with attitude and thruster outputs is left "
-            f"({' '.join(dropped) or 'nothing overlaps'}); allow shorter ones or longer gaps"
+            f"{path}: no stretch of {options.minimum:g} s with attitude and thruster outputs is "
+            f"left ({' '.join(dropped) or 'nothing overlaps'}); allow shorter ones (minimum) or "
+            "longer gaps (gap)"
         )
     progress(0.95)
     report = tell(signals, path.name, trajectories, lines, [*raw.notes, *dropped], 1.0 / rate)
@@ -87,6 +105,7 @@ def load_data(
     *,
     rate: float | None = None,
     vehicle: str | None = None,
+    options: LogOptions | None = None,
     progress: Progress = no_progress,
 ) -> Recording:
     """Read any data there is: a recording (.nc), a CSV folder, or a vehicle's log.
@@ -95,12 +114,15 @@ def load_data(
         path: file, or folder with a `recording.yaml`.
         rate: Hz; None keeps that of the data (20 for logs).
         vehicle: preset or file; None keeps what the data name (bluerov2_heavy for logs).
+        options: what is taken from a log.
         progress: called with the fraction done, 0 to 1.
 
     Raises:
-        UserError: if the data can't be read, or a stored recording has another rate.
+        UserError: if the data can't be read, a stored recording has another rate, or options for
+            logs are given for something else.
     """
     path = Path(path)
+    options = options or LogOptions()
     if path.suffix.lower() == ".csv" and path.is_file():
         raise UserError(f"{path}: give its folder, with a {METADATA} in it (see docs/recording.md)")
     if path.is_dir() or path.suffix.lower() in (".yaml", ".yml"):
@@ -116,9 +138,13 @@ def load_data(
             path,
             rate=20.0 if rate is None else rate,
             vehicle=vehicle or "bluerov2_heavy",
+            options=options,
             progress=progress,
         )
         return logged
+    for given in fields(options):
+        if getattr(options, given.name) != given.default:
+            raise UserError(f"{path}: {given.name} is for logs of a vehicle; leave it out here")
     progress(1.0)
     if not vehicle or vehicle == recording.vehicle:
         return recording
@@ -128,21 +154,22 @@ def load_data(
 def _signals(
     raw: LogBytes,
     motors: Sequence[float],
-    density: float | None,
-    system: int | None,
+    options: LogOptions,
     progress: Progress,
 ) -> Signals:
     if raw.kind == "bin":
-        return signals_from_bin(read_bin(raw.data, BIN_WANTED, progress), motors, density)
-    log = read_tlog(raw.data, TLOG_WANTED, system, progress)
-    return signals_from_tlog(log, motors, density)
+        read = read_bin(raw.data, BIN_WANTED, progress)
+        return signals_from_bin(read, motors, options.water_density)
+    log = read_tlog(raw.data, TLOG_WANTED, options.system, progress)
+    return signals_from_tlog(log, motors, options.water_density)
 
 
-def _check_options(rate: float, minimum: float, gap: float, density: float | None) -> None:
+def _check_options(rate: float, options: LogOptions) -> None:
+    density = options.water_density
     for name, value, low, high in (
         ("rate", rate, 1.0, 400.0),
-        ("minimum", minimum, 0.5, 3600.0),
-        ("gap", gap, 0.01, 60.0),
+        ("minimum", options.minimum, 0.5, 3600.0),
+        ("gap", options.gap, 0.01, 60.0),
         ("water_density", 1000.0 if density is None else density, 900.0, 1100.0),
     ):
         if not low <= value <= high:

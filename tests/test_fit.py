@@ -319,6 +319,12 @@ def test_pretraining_brings_the_networks_to_the_preset():
     assert error[1] < 0.05 * error[0]
 
 
+def test_a_drag_of_zero_needs_no_pretraining():
+    target = load_vehicle("bluerov2_heavy_ng").dynamics(dtype=jnp.float32)  # linear about roll: 0
+    model = Spinn.create(SpinnConfig(width=8, depth=1), target, jax.random.key(0), jnp.float32)
+    assert pretrain(model, target, PretrainConfig(), jax.random.key(1))[0] is model
+
+
 def test_the_first_guess_of_the_diffusion_is_of_the_right_size():
     vehicle = load_vehicle("bluerov2_heavy")
     b = np.array([2.0, 1.5, 1.0, 0.1, 0.1, 0.2])

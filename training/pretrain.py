@@ -80,8 +80,9 @@ def coefficient_error(
 ) -> Float[Array, ""]:
     """Mean squared relative differences of M, D, D^f, b and F_V at these velocities and poses.
 
-    Diagonals of the target below 1 % of what stops the vehicle in a second count as that much, so
-    that a drag of zero can be approached but not divided by; a diffusion of zero is left alone.
+    Diagonals of the target below 1 % of what stops the vehicle in a second are raised to that, as a
+    SPINN's scales are: a positive definite drag can't be zero, and networks that are driven there
+    are spoilt on the way. A diffusion of zero is left alone.
     """
     mine, theirs = model.coefficients(V_WB_B), target.coefficients(V_WB_B)
     inertia = jnp.diagonal(theirs.mass.matrix())
@@ -90,6 +91,7 @@ def coefficient_error(
         A, B = getattr(mine, name).matrix(), getattr(theirs, name).matrix()
         A = A.reshape(6, 6, -1)
         d = jnp.maximum(jnp.diagonal(B), 0.01 * inertia)
+        B = B + jnp.diag(d - jnp.diagonal(B))
         total = total + jnp.mean(jnp.sum((A - B[:, :, None]) ** 2 / _outer(d), axis=(0, 1)))
     b = theirs.diffusion[:, None]
     known = b > 0

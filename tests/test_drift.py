@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +11,7 @@ from spinndrift.models.euclidean import create_spinn
 from spinndrift.models.spinn import SpinnConfig
 from spinndrift.models.vehicle import load_vehicle
 from spinndrift.training.config import DriftConfig
-from spinndrift.training.drift import _without_networks, fit_drift
+from spinndrift.training.drift import fit_drift
 from spinndrift.training.predict import predict_drift
 from spinndrift.training.windows import Windows
 
@@ -81,16 +80,6 @@ def test_a_strong_prior_keeps_the_preset(windows):
     before = start()
     after = fit_drift(replace(CONFIG, prior=1e6), before, windows, 2)
     np.testing.assert_allclose(diagonal(after), diagonal(before), rtol=1e-3)
-
-
-@pytest.mark.parametrize("settings", [{}, {"coordinates": "euler"}, {"potential": "pose"}])
-def test_the_small_networks_are_the_same_function(windows, settings):
-    model = start(**settings)
-    small = _without_networks(model)
-    assert sum(a.size for a in small.hidden.weights) < sum(a.size for a in model.hidden.weights)
-    np.testing.assert_allclose(miss(small, windows), miss(model, windows), rtol=1e-4, atol=1e-6)
-    heads = eqx.tree_at(lambda m: m.matrix_heads.weight, model, replace_fn=lambda w: w + 0.1)
-    assert _without_networks(heads) is heads
 
 
 def test_no_iterations_change_nothing(windows):

@@ -62,9 +62,26 @@ class DriftConfig:
     """Weight of the squared change of a raw bias (a change of 1 doubles a coefficient, about) and
     of the relative change of the potential's bound and net buoyancy, against the mean squared error
     in the units of what the model misses."""
+    innovations: Literal["auto", "always", "never"] = "auto"
+    """Whether constants and b are fitted from sample to sample instead (`training.likelihood`): the
+    best there is for states that are known exactly, and misled by noise of measurement. `auto` does
+    it where the innovations that are left are correlated by less than `white`."""
+    white: float = 0.1
+    """Largest correlation of neighbouring innovations, on any axis, that counts as none. Noise of
+    measurement of a tenth of an innovation's variance makes it -0.08."""
+    most_steps: int = 50000
+    """Steps from sample to sample that are used, an even choice of all."""
+    prior_sd: float = 3.0
+    """Standard deviation of raw biases about the preset's in that fit; 3 is a factor of ten in a
+    coefficient. 0 stands for no prior."""
 
     def __post_init__(self) -> None:
         check_numbers(self)
+        kinds = ("auto", "always", "never")
+        require(self.innovations in kinds, self, "innovations", f"use one of {kinds}")
+        require(self.white > 0, self, "white", "give a positive number")
+        require(self.most_steps >= 1, self, "most_steps", "give at least 1")
+        require(self.prior_sd >= 0, self, "prior_sd", "give zero or more")
         require(self.iterations >= 0, self, "iterations", "give zero or more")
         require(self.length_s > 0, self, "length_s", "give a time above 0 s")
         require(self.pieces >= 1, self, "pieces", "give at least 1")

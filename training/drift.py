@@ -18,11 +18,9 @@ import optimistix
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..models.euclidean import EulerPotential
-from ..models.networks import Heads, MlpStack
-from ..models.potential import BoundedScalar, GravityPotential, PosePotential, Potential
 from ..models.spinn import Spinn
 from .config import DriftConfig
+from .constants import constants, without_networks
 from .fit import Progress
 from .losses import SquaredError
 from .objective import Batch
@@ -49,9 +47,9 @@ def fit_drift(
     if config.iterations == 0:
         return model
     steps = int(np.clip(round(config.length_s / windows.dt), 1, windows.steps))
-    small = _without_networks(model)
+    small = without_networks(model)
     pieces = _telling(windows.subdivide(steps), small, config.pieces, substeps)
-    start, unravel = ravel_pytree(_constants(model))
+    start, unravel = ravel_pytree(constants(model))
     residuals = _residuals(config, unravel, start, substeps, pieces.dt)
     solver = optimistix.Dogleg(rtol=1e-3, atol=1e-3)
 
@@ -72,14 +70,14 @@ def fit_drift(
     for n in range(_PASSES):
         if progress is not None:
             progress(n, _PASSES, float("nan"))
-        current = eqx.tree_at(_constants, small, unravel(values.astype(start.dtype)))
+        current = eqx.tree_at(constants, small, unravel(values.astype(start.dtype)))
         unit = SquaredError.build("typical", substeps, current, pieces)
         with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
             found = solve(values, (small, Batch.of(pieces), unit))
         if not bool(jnp.all(jnp.isfinite(found))):
             break
         values = found
-    return eqx.tree_at(_constants, model, unravel(values.astype(start.dtype)))
+    return eqx.tree_at(constants, model, unravel(values.astype(start.dtype)))
 
 
 def _telling(pieces: Windows, model: Spinn, count: int, substeps: int) -> Windows:
@@ -108,7 +106,7 @@ def _residuals(
 ) -> Callable[[Array, Any], Any]:
     def residuals(values: Array, arguments: Any) -> Any:
         model, batch, unit = arguments
-        model = eqx.tree_at(_constants, model, unravel(values.astype(start.dtype)))
+        model = eqx.tree_at(constants, model, unravel(values.astype(start.dtype)))
         X, V = predict_drift(model, batch.X[0], batch.V[0], batch.F, dt, substeps=substeps)
         errors = jnp.stack(unit.by_axis(X[:, :, None], V[:, :, None], batch))
         errors = errors[:, :, 1::4]  # neighbouring times say nearly the same
@@ -119,58 +117,3 @@ def _residuals(
         return errors, config.prior**0.5 * change.astype(values.dtype)
 
     return residuals
-
-
-def _constants(model: Spinn) -> list[Any]:
-    """The numbers that make M, D, D^f and V where networks give zero."""
-    potential = model.learned_potential
-    network = _network(potential)
-    found = [model.matrix_heads.bias, network.skip, network.bound]
-    if model.constant_mass is not None:
-        found.append(model.constant_mass)
-    if isinstance(potential, (GravityPotential, EulerPotential)):
-        found.append(potential.net_buoyancy)
-    return found
-
-
-def _network(potential: Potential) -> BoundedScalar | EulerPotential:
-    if isinstance(potential, GravityPotential):
-        return potential.restoring
-    if isinstance(potential, PosePotential):
-        return potential.scalar
-    assert isinstance(potential, EulerPotential)
-    return potential
-
-
-def _without_networks(model: Model) -> Model:
-    """The same function by the smallest networks, where the heads' weights are zero."""
-
-    def small(hidden: MlpStack) -> MlpStack:
-        count, _, inputs = hidden.weights[0].shape
-        weight = jnp.zeros((count, 1, inputs), hidden.weights[0].dtype)
-        return MlpStack((weight,), (weight[:, :, 0],), hidden.activation)
-
-    def narrow(heads: Heads | None) -> Heads | None:
-        return None if heads is None else Heads(heads.weight[..., :1], heads.bias)
-
-    network = _network(model.learned_potential)
-    if any(bool(jnp.any(h.weight != 0)) for h in (model.matrix_heads, network.head)):
-        return model
-    return eqx.tree_at(
-        lambda m: (
-            m.hidden,
-            m.matrix_heads,
-            m.diffusion_head,
-            _network(m.learned_potential).hidden,
-            _network(m.learned_potential).head,
-        ),
-        model,
-        (
-            small(model.hidden),
-            narrow(model.matrix_heads),
-            narrow(model.diffusion_head),
-            small(network.hidden),
-            narrow(network.head),
-        ),
-        is_leaf=lambda x: x is None,
-    )

@@ -15,6 +15,7 @@ from ..models.vehicle import Vehicle
 from .config import TrainingConfig
 from .drift import fit_drift
 from .fit import Progress
+from .likelihood import fit_innovations
 from .objective import Batch
 from .predict import predict, predict_drift
 from .pretrain import pretrain
@@ -84,8 +85,14 @@ def starting_model(
     model_key, pretrain_key = jax.random.split(jax.random.key(config.seed))
     model = create_spinn(config.model, reference, model_key, dtype)
     model = pretrain(model, reference, config.pretrain, pretrain_key)[0]
-    model = fit_drift(config.drift, model, windows, config.objective.substeps, progress)
+    substeps = config.objective.substeps
+    fitted = fit_innovations(config.drift, model, windows, substeps)
+    if fitted is None:
+        model = fit_drift(config.drift, model, windows, substeps, progress)
+    else:
+        model = fitted.apply(model)
     if not config.model.stochastic:
         return model
-    b = estimate_diffusion(model, windows, substeps=config.objective.substeps)
-    return with_diffusion(model, b)
+    if fitted is not None and config.model.diffusion == "network":
+        return with_diffusion(model, fitted.diffusion)
+    return with_diffusion(model, estimate_diffusion(model, windows, substeps=substeps))

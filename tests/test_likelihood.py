@@ -14,7 +14,6 @@ from spinndrift.models.spinn import SpinnConfig
 from spinndrift.models.vehicle import load_vehicle
 from spinndrift.training.config import DriftConfig
 from spinndrift.training.constants import constants
-from spinndrift.training.drift import fit_drift
 from spinndrift.training.generate import GenerateConfig, generate
 from spinndrift.training.likelihood import fit_innovations
 from spinndrift.training.windows import make_windows
@@ -24,7 +23,7 @@ SUBSTEPS = 2
 DATA = GenerateConfig(trajectories=2, duration=8.0, substeps=SUBSTEPS, diffusion=B)
 TRUTH = load_vehicle("bluerov2_heavy")
 CONFIG = DriftConfig()
-SEEDS = 4
+SEEDS = 3
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +55,7 @@ TRUE_INERTIA = np.asarray(inertia(TRUTH.dynamics(dtype=jnp.float32)), float)
 
 
 def test_the_constants_spread_as_the_cramer_rao_bound_says(model, found):
-    """Errors in units of the bound's own are normal: squares of 24 sum to χ²."""
+    """Errors in units of the bound's own are normal: squares of 18 sum to χ²."""
     unravel = ravel_pytree(constants(model))[1]
 
     def of(values):
@@ -69,26 +68,15 @@ def test_the_constants_spread_as_the_cramer_rao_bound_says(model, found):
         error = np.asarray(inertia(fitted.apply(model)), float) - TRUE_INERTIA
         squares.append(error**2 / variance)
     count = 6 * SEEDS
-    assert np.sum(squares) < count + 5 * (2 * count) ** 0.5
-    assert np.sum(squares) > count - 5 * (2 * count) ** 0.5 / 2
-
-
-def test_it_beats_the_fit_of_pieces(model, data, found):
-    errors = [[], []]
-    for windows, fitted in zip(data[:2], found, strict=False):
-        pieces = fit_drift(CONFIG, model, windows, SUBSTEPS)
-        for side, end in zip(errors, (fitted.apply(model), pieces), strict=True):
-            side.append(np.asarray(inertia(end), float) - TRUE_INERTIA)
-    innovations, pieces = (np.sqrt(np.mean(np.square(side))) for side in errors)
-    assert 2 * innovations < pieces
+    assert count / 5 < np.sum(squares) < count + 5 * (2 * count) ** 0.5
 
 
 def test_the_diffusion_is_found(data, found):
     for windows, fitted in zip(data, found, strict=True):
-        numbers = 20 * 160  # steps; M's error comes on top, of the same size
+        numbers = windows.steps * len(windows)
+        # that of M, which b is known in proportion to, comes on top of b's own error
         np.testing.assert_allclose(fitted.diffusion, B, rtol=10 / (2 * numbers) ** 0.5)
         assert fitted.white(CONFIG.white)
-        assert len(windows) > 0
 
 
 def test_noisy_states_are_left_to_the_fit_of_pieces(model, data):

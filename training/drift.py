@@ -4,7 +4,8 @@ A preset may be off by factors, where kernels hardly feel a difference, and a gr
 masses and drags through very unequal slopes. With the networks' weights left alone a SPINN is a
 vehicle with constant M, D and D^f: some 70 numbers, which Powell's dogleg method (Nocedal and
 Wright 2006, chapter 4) finds in a few steps from the noise-free motion over short pieces. What the
-data don't tell (an axis that never moves) stays where the preset has it, held by a weak prior.
+data don't tell (an axis that never moves) stays where the preset has it, held by a weak prior. It
+is meant for measured states; `likelihood` tells much more of exact ones.
 """
 
 from collections.abc import Callable

@@ -56,9 +56,14 @@ class Steps(eqx.Module):
             chosen = np.concatenate([parts[i] for i in np.unique(kept)])
         key, pieces = key[:, chosen], pieces.take(chosen)
         after = (np.diff(key, axis=1) == np.array([[0], [0], [1]])).all(axis=0)
-        states = (pieces.X[0], pieces.V[0], pieces.F[0], pieces.V[1])
-        follows = jnp.asarray(np.append(after, np.zeros(min(1, len(chosen)), bool)))
-        return cls(*(jnp.asarray(a) for a in states), follows, pieces.dt)
+        return cls(
+            X=jnp.asarray(pieces.X[0]),
+            V=jnp.asarray(pieces.V[0]),
+            F=jnp.asarray(pieces.F[0]),
+            V_next=jnp.asarray(pieces.V[1]),
+            follows=jnp.asarray(np.append(after, np.zeros(min(1, len(chosen)), bool))),
+            dt=pieces.dt,
+        )
 
     def __len__(self) -> int:
         return self.V.shape[1]
@@ -114,10 +119,11 @@ def likely_diffusion(
         mass = model.coefficients(jnp.zeros(6, steps.V.dtype)).mass.matrix()
         wrench = np.asarray(mass, np.float64) @ np.asarray(innovations(model, steps, substeps))
         b = np.sqrt(np.mean(wrench**2, axis=1) / steps.dt)
+    found = np.asarray(b, np.float64)
     for _ in range(4):
-        factor = whitening(model, steps, jnp.asarray(b, steps.V.dtype), substeps)[1]
-        b = b * np.sqrt(np.clip(np.asarray(factor, np.float64), 1 / 16, 16.0))
-    return b
+        factor = whitening(model, steps, jnp.asarray(found, steps.V.dtype), substeps)[1]
+        found = found * np.sqrt(np.clip(np.asarray(factor, np.float64), 1 / 16, 16.0))
+    return found
 
 
 def _motion(

@@ -74,16 +74,16 @@ def fit_innovations(
     if len(every) == 0:
         return None
     fit = _Fit.of(config, model, substeps)
-    found = Fitted(fit.start, np.full(6, np.nan), np.zeros((0, 0)), np.full(6, np.nan))
     # the first pass weighs by the preset's errors; the last is over once weights are nearly right
-    for steps in (few, few, every)[: 2 if len(few) == len(every) else 3]:
-        refined = len(found.information) > 0
-        found = fit.from_here(found, steps)
-        if not (np.isfinite(found.values).all() and np.isfinite(found.diffusion).all()):
-            return None
-        if config.innovations == "auto" and refined and not found.white(config.white):
-            return None
-    return found
+    first = fit.from_here(fit.start, None, few)
+    found = None if first is None else fit.from_here(first.values, first.diffusion, few)
+    if found is not None and len(every) > len(few) and _may_stay(config, found):
+        found = fit.from_here(found.values, found.diffusion, every)
+    return found if found is not None and _may_stay(config, found) else None
+
+
+def _may_stay(config: DriftConfig, found: Fitted) -> bool:
+    return config.innovations == "always" or found.white(config.white)
 
 
 class _Fit(eqx.Module):
@@ -112,11 +112,14 @@ class _Fit(eqx.Module):
         dtype = self.small.matrix_heads.bias.dtype
         return _with(self.small, self.unravel, jnp.asarray(values, dtype))
 
-    def from_here(self, found: Fitted, steps: Steps) -> Fitted:
-        """One pass: weights by what was found, then the constants by least squares, then b."""
-        b = found.diffusion if np.isfinite(found.diffusion).all() else None
-        b = likely_diffusion(self.model(found.values), steps, self.substeps, b)
-        whiten = self.whitening(found.values, steps, b)
+    def from_here(
+        self, values: Float[np.ndarray, " p"], b: Float[np.ndarray, "6"] | None, steps: Steps
+    ) -> Fitted | None:
+        """One pass: weights from `values`, then the constants by least squares, then b."""
+        b = likely_diffusion(self.model(values), steps, self.substeps, b)
+        if not np.isfinite(b).all():
+            return None
+        whiten = self.whitening(values, steps, b)
 
         def cost(values: Float[np.ndarray, " p"]) -> float:
             errors = self.whitened(values, steps, whiten)
@@ -133,9 +136,11 @@ class _Fit(eqx.Module):
                 g + self.precision * (values - self.start),
             )
 
-        values, information = _descend(cost, gram, found.values, self.iterations)
+        values, information = _descend(cost, gram, values, self.iterations)
         b = likely_diffusion(self.model(values), steps, self.substeps, b)
         errors = self.whitened(values, steps, self.whitening(values, steps, b))
+        if not (np.isfinite(values).all() and np.isfinite(b).all()):
+            return None
         return Fitted(values, b, information, correlation(steps, errors))
 
     def whitening(

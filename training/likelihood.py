@@ -122,19 +122,15 @@ class _Fit(eqx.Module):
         whiten = self.whitening(values, steps, b)
 
         def cost(values: Float[np.ndarray, " p"]) -> float:
-            errors = self.whitened(values, steps, whiten)
-            return (
-                float(np.sum(errors**2) + self.precision * np.sum((values - self.start) ** 2)) / 2
-            )
+            errors, change = self.whitened(values, steps, whiten), values - self.start
+            return float(errors.ravel() @ errors.ravel() + self.precision * change @ change) / 2
 
         def gram(values: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
             flat = jnp.asarray(values, steps.V.dtype)
             parts = _gram(self.small, self.unravel, flat, steps, whiten, self.substeps)
             H, g = (np.asarray(a, np.float64) for a in parts)
-            return (
-                H + self.precision * np.eye(len(g)),
-                g + self.precision * (values - self.start),
-            )
+            g = g + self.precision * (values - self.start)
+            return H + self.precision * np.eye(len(g)), g
 
         values, information = _descend(cost, gram, values, self.iterations)
         b = likely_diffusion(self.model(values), steps, self.substeps, b)

@@ -98,7 +98,7 @@ def test_every_epoch_shows_every_window_once():
 
 
 def test_the_learning_rate_rises_and_falls():
-    config = TrainingConfig(steps=100, warm_up=10, learning_rate=1.0)
+    config = TrainingConfig(steps=100, warm_up=10, learning_rate=1.0, head_decay=1.0)
     rates = [learning_rate(config, n) for n in range(100)]
     assert rates[0] == pytest.approx(0.1)
     assert max(rates) == rates[9] == pytest.approx(1.0)
@@ -317,6 +317,11 @@ def test_pretraining_brings_the_networks_to_the_preset():
     X = jnp.zeros((7, 20), jnp.float32).at[0].set(1)
     error = [coefficient_error(m, target, V, X) for m in (model, fitted)]
     assert error[1] < 0.05 * error[0]
+
+
+def test_a_decay_that_overshoots_is_refused():
+    with pytest.raises(UserError, match="head_decay is 30"):
+        TrainingConfig(learning_rate=0.1)
 
 
 def test_a_drag_of_zero_needs_no_pretraining():

@@ -128,5 +128,7 @@ class TrainingConfig:
         for name in ("warm_up", "clip", "head_decay", "patience", "max_recoveries", "seed"):
             require(getattr(self, name) >= 0, self, name, "give zero or more")
         require(self.learning_rate > 0, self, "learning_rate", "give a positive number")
+        decay = self.learning_rate * self.head_decay
+        require(decay <= 1, self, "head_decay", "give at most 1 / learning_rate")
         for fraction in self.refit_at:
             require(0 < fraction < 1, self, "refit_at", "give fractions between 0 and 1")

@@ -82,7 +82,13 @@ def _euclidean(
     return Method(summary, config, (*_KIND, *(f"objective.{f}" for f in fixed)))
 
 
-_PUBLISHED = {"batch": 64, "learning_rate": 1e-2, "clip": 0.0, "refit_at": ()}
+_PUBLISHED = {
+    "batch": 64,
+    "learning_rate": 1e-2,
+    "head_decay": 30.0,
+    "clip": 0.0,
+    "refit_at": (),
+}
 """Adam from 1e-2 without clipping, as the code of the distance-aware methods has it."""
 
 

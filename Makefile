@@ -82,6 +82,10 @@ bench: $(INSTALLED) ## the benchmarks, on a quiet machine; ONLY=word picks some
 	$(BIN)/python -m pytest -q -o addopts= --import-mode=importlib --benchmark-only \
 		benchmarks $(if $(ONLY),-k "$(ONLY)")
 
+.PHONY: blind
+blind: $(INSTALLED) ## write cases of hidden effects for `spinndrift check diagnosis` into runs/blind
+	PYTHONPATH=tests $(BIN)/python -m hidden runs/blind --scale $(or $(SCALE),small)
+
 .PHONY: lock
 lock: ## write requirements.txt anew with the newest versions that pyproject.toml allows
 	@rm -rf build/lock && mkdir -p build && $(PYTHON) -m venv build/lock

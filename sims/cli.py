@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from ..models.errors import UserError
+from .commands.check import Check
 from .commands.demo import Demo
 from .commands.diagnose import Diagnose
 from .commands.evaluate import Evaluate
@@ -25,6 +26,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Diagnose, tyro.conf.subcommand("diagnose")]
+    | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[Study, tyro.conf.subcommand("study")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
@@ -33,8 +35,8 @@ _DESCRIPTION = """Learned stochastic dynamics and control for underwater vehicle
 
 The usual order: `import` a log (or `generate` one), `train` a model on it, `evaluate` the model on
 data it has not seen, `run` a mission with it. `diagnose` names what a simulation gets wrong,
-`study` compares the methods of training on simulated data, `demo` goes the whole way from a log
-that comes along to a dive.
+`check` measures how well on cases whose answer is known, `study` compares the methods of training
+on simulated data, `demo` goes the whole way from a log that comes along to a dive.
 `spinndrift COMMAND --help` explains each."""
 
 

@@ -190,9 +190,43 @@ def test_wrenches_of_body_and_environment():
     spring = wrench("tether", stiffness=2.0, pull_east=1.0, pull_north=-3.0)
     F_W = np.asarray(se3.rotate(X, jnp.asarray(spring[:3])))
     p = np.asarray(X[4:])
-    np.testing.assert_allclose(F_W, [1 - 2 * p[0], -3 - 2 * p[1], 0 * p[0]], atol=1e-12)
-    near = wrench("proximity", "surface", force=5.0, drag=0.0)
-    np.testing.assert_allclose(near[:3], 5 * np.exp(p[2] / 0.3) * UP, atol=1e-12)
+    np.testing.assert_allclose(F_W, [1 - 2 * p[0], -3 - 2 * p[1], -2 * p[2]], atol=1e-12)
+    arm = jnp.asarray([-0.2, 0.1, 0.05])[:, None]
+    aft = wrench("tether", stiffness=2.0, pull_up=1.0, arm_x=-0.2, arm_y=0.1, arm_z=0.05)
+    ends = np.asarray(se3.act(X, jnp.broadcast_to(arm, (3, N))))
+    F_B = np.asarray(se3.rotate_inverse(X, jnp.asarray([[0.0], [0], [1]] - 2 * ends)))
+    np.testing.assert_allclose(aft, [*F_B, *cross(arm, F_B)], atol=1e-12)
+    near = wrench("proximity", "surface", force=5.0, gain=0.0)
+    np.testing.assert_allclose(near[:3], 5 * np.exp(p[2] / 0.5) * UP, atol=1e-12)
+    wall = wrench("proximity", "wall_east", gain=2.0, longer=0.1)
+    drag = np.asarray(BASE.drag_wrench(V))
+    np.testing.assert_allclose(wall, 2 * np.exp((p[0] - 10) / 0.6) * drag, atol=1e-12)
+
+
+def test_loads_and_moved_centres_act_as_rigid_bodies_do():
+    """The mass matrix about Bo of point masses, (Fossen 2011, eq. 3.44), against their sum."""
+    r, m = np.array([0.1, -0.05, -0.12]), 0.4
+    weight = 2.0
+    load = KINDS["payload"].of(
+        mass=m, weight=weight, moment_x=weight * r[0], moment_y=weight * r[1], height=r[2]
+    )
+    v, w = np.asarray(V[:3]), np.asarray(V[3:])
+    momentum = m * (v + cross(w, r[:, None]))
+    np.testing.assert_allclose(
+        np.asarray(load.inertia(PLANT)) @ np.asarray(V),
+        np.concatenate([momentum, cross(r[:, None], momentum)]),
+        atol=5e-4 * m,  # a load without weight has no place: x, y to w² / (w² + 0.05²)
+    )
+    np.testing.assert_allclose(
+        np.asarray(load.wrench(X, V, PLANT))[3:], cross(r[:, None], -weight * UP), atol=1e-12
+    )
+    moved = KINDS["centre_of_gravity"].of("z", shift=-0.004)
+    first = VEHICLE.mass * np.array([0, 0, -0.004])[:, None]
+    np.testing.assert_allclose(
+        np.asarray(moved.inertia(PLANT)) @ np.asarray(V),
+        np.concatenate([cross(w, first), cross(first, v)]),
+        atol=1e-12,
+    )
 
 
 def test_added_mass_acts_as_a_heavier_base():
@@ -232,6 +266,8 @@ def test_a_steady_current_carries_the_vehicle_like_the_base_in_moving_water():
         ("heading_error", None, {"sine": 0.02, "cosine": -0.01, "offset": 0.2}),
         ("clock_offset", "twist", {"delay": 0.02}),
         ("clock_offset", "pose", {"delay": -0.02}),
+        ("clock_offset", "linear", {"delay": 0.03}),
+        ("clock_offset", "angular", {"delay": -0.01}),
     ],
 )
 def test_measurement_effects_invert(name, where, values):
@@ -251,6 +287,17 @@ def test_measurements_by_hand():
     np.testing.assert_allclose(far[:3], np.asarray(V[:3]) + cross(V[3:], arm))
     _, turned = KINDS["dvl_misalignment"].of("yaw", angle=0.3).measure(X, V, none)
     np.testing.assert_allclose(turned[0], np.cos(0.3) * V[0] + np.sin(0.3) * V[1])
+    X0, V0 = X[:, :1], V[:, :1]
+    A = 0.3 * V0[::-1]
+    late = 0.04
+    X1, _ = KINDS["clock_offset"].of("pose", delay=late).measure(X0, V0, A)
+    fine = 100  # a twist that changes evenly, backwards in small steps
+    past = X0
+    for k in range(fine):
+        past = se3.retract(past, -late / fine * (V0 - A * (k + 0.5) * late / fine))
+    np.testing.assert_allclose(X1, past, atol=2e-6)
+    _, V1 = KINDS["clock_offset"].of("linear", delay=late).measure(X0, V0, A)
+    np.testing.assert_allclose(V1, [*(V0 - late * A)[:3], *V0[3:]], atol=1e-15)
     off, _ = KINDS["heading_error"].of(sine=0.1).measure(X, V, none)
     np.testing.assert_allclose(se3.yaw(off), se3.yaw(X) + 0.1 * np.sin(se3.yaw(X)), atol=1e-12)
 

@@ -25,7 +25,7 @@ class AddedMass(Effect):
     places: ClassVar = AXES
     source: ClassVar[str] = "published sets differ by a factor of 2"
 
-    def inertia(self) -> Float[Array, "6 6 *batch"]:
+    def inertia(self, plant: Plant) -> Float[Array, "6 6 *batch"]:
         eye = jnp.eye(6, dtype=self.values.dtype)
         return eye.reshape((6, 6) + (1,) * (self.values.ndim - 1)) * self.values[None]
 
@@ -43,7 +43,7 @@ class AddedMassCoupling(Effect):
     places: ClassVar = (*(name for name, _, _ in ENTRIES), "munk")
     source: ClassVar[str] = "a few cm between Bo and the centre of the water's inertia"
 
-    def inertia(self) -> Float[Array, "6 6 *batch"]:
+    def inertia(self, plant: Plant) -> Float[Array, "6 6 *batch"]:
         M = jnp.zeros((6, 6, *self.values.shape[1:]), self.values.dtype)
         for k, (_, i, j) in enumerate(ENTRIES):
             M = M.at[i, j].add(self.values[k]).at[j, i].add(self.values[k])

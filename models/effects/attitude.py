@@ -86,20 +86,22 @@ class HeadingError(Effect):
 class ClockOffset(Effect):
     """One channel's stamps are late by δ: what is recorded at t is the value of t - δ.
 
-    `twist`: V(t - δ) ≈ V - δ dV/dt; `pose`: X exp(-δ V). Both against the command's clock.
+    `linear`, `angular`: velocities of their instrument, `twist` both: V(t - δ) ≈ V - δ dV/dt;
+    `pose`: X exp(-δ V + δ² dV/dt / 2). All against the command's clock.
     """
 
     name: ClassVar[str] = "clock_offset"
     family: ClassVar = "measurement"
     parameters: ClassVar = (Parameter("delay", "s", (0.005, -0.005), -0.3, 0.3),)
-    places: ClassVar = ("twist", "pose")
+    places: ClassVar = ("twist", "pose", "linear", "angular")
     echoes: ClassVar = ("thruster_lag", "actuation_delay")
     order: ClassVar[int] = 10
     source: ClassVar[str] = "5 to 50 ms between computers"
 
     def _moved(self, X: Array, V: Array, A: Array, sign: float) -> tuple[Array, Array]:
-        late_V, late_X = sign * self.part(0, V)[None], sign * self.part(1, V)[None]
-        return se3.retract(X, V * late_X), V + A * late_V
+        twist, pose, linear, angular = (self.part(i, V)[None] for i in range(4))
+        late = jnp.concatenate([twist + linear] * 3 + [twist + angular] * 3)
+        return se3.retract(X, sign * pose * (V - A * pose / 2)), V + sign * A * late
 
     def measure(
         self,

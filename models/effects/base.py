@@ -17,6 +17,7 @@ hypothesis. All parameters are zero for "not there"; `neutral` values change not
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -63,6 +64,9 @@ class Plant(NamedTuple):
     directions: Float[Array, "3 n"]
     mass: Float[Array, "6 6"]
     weight: Float[Array, ""]
+    rigid_mass: Float[Array, ""]
+    drag: Callable[[Array], Array]
+    """The drag wrench at a velocity relative to the water."""
 
 
 class Effect(eqx.Module):
@@ -206,8 +210,9 @@ class Effect(eqx.Module):
 
     # ---------------------------------------------------------------------- body and water
 
-    def inertia(self) -> Float[Array, "6 6 *batch"]:
+    def inertia(self, plant: Plant) -> Float[Array, "6 6 *batch"]:
         """What is added to the mass matrix (kg, kg·m, kg·m²)."""
+        del plant
         return jnp.zeros((6, 6, *self.values.shape[1:]), self.values.dtype)
 
     def wrench(

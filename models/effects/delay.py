@@ -54,6 +54,7 @@ class ActuationDelay(Effect):
                 share = jnp.clip(jnp.minimum(end, high) - jnp.maximum(start, low), 0, None) * S
                 total = total + share * command
             means.append(total)
-        return jnp.concatenate([level[..., 0], memory[: n * (self.steps - 1)]]), jnp.stack(
-            jnp.broadcast_arrays(*means), axis=-1
-        )
+        batch = jnp.broadcast_shapes(level.shape[1:-1], memory.shape[1:])
+        kept = [level[..., 0], memory[: n * (self.steps - 1)]]
+        kept = [jnp.broadcast_to(part, (part.shape[0], *batch)) for part in kept]
+        return jnp.concatenate(kept), jnp.stack(jnp.broadcast_arrays(*means), axis=-1)

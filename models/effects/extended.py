@@ -144,14 +144,19 @@ class Extended(Dynamics):
         zero = jnp.zeros(6, self.positions.dtype)
         mass = self.base.coefficients(zero).mass.matrix()
         weight = getattr(self.base, "weight", self.base.displaced_mass * 9.80665)
-        return Plant(self.positions, self.directions, mass, jnp.asarray(weight))
+        rigid = self.base.rigid_inertia[0, 0]
+        drag = self.base.drag_wrench
+        return Plant(self.positions, self.directions, mass, jnp.asarray(weight), rigid, drag)
 
     def _any(self, hook: str) -> bool:
         return any(effect.acts(hook) for effect in self.effects)
 
     def _extra_inertia(self) -> Array | None:
-        parts = [effect.inertia() for effect in self.effects if effect.acts("inertia")]
-        return sum(parts[1:], parts[0]) if parts else None
+        if not self._any("inertia"):
+            return None
+        plant = self.plant
+        parts = [effect.inertia(plant) for effect in self.effects if effect.acts("inertia")]
+        return sum(parts[1:], parts[0])
 
     def _base_mass(self, V: Array) -> Spd:
         return self.base.mass_and_diffusion(V)[0]

@@ -30,7 +30,11 @@ class NetBuoyancy(Effect):
 
 
 class CentreOfGravity(Effect):
-    """The centre of gravity moved by r along an axis of B: moment r × weight."""
+    """The centre of gravity moved by r along an axis of B: moment r × weight, and inertia.
+
+    The mass matrix about Bo couples translation and rotation by m S(r) (Fossen 2011, eq. 3.44); its
+    part of second order in r is left out.
+    """
 
     name: ClassVar[str] = "centre_of_gravity"
     family: ClassVar = "body"
@@ -38,21 +42,21 @@ class CentreOfGravity(Effect):
     places: ClassVar = XYZ
     source: ClassVar[str] = "mm to cm: batteries, tools, ballast"
 
+    def inertia(self, plant: Plant) -> Float[Array, "6 6 *batch"]:
+        return _coupled(plant.rigid_mass * self.values)
+
     def wrench(
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
     ) -> Float[Array, "6 *#batch"]:
-        down = -plant.weight * up_in_body(X_WB)
-        r = jnp.broadcast_to(self.column(V_CB_B), (3, *jnp.broadcast_shapes(
-            self.column(V_CB_B).shape[1:], down.shape[1:])))  # fmt: skip
-        moment = se3.cross(r, jnp.broadcast_to(down, r.shape))
-        return jnp.concatenate([jnp.zeros_like(moment), moment])
+        return _hung(self.column(V_CB_B), -plant.weight * up_in_body(X_WB))
 
 
 class Payload(Effect):
-    """A load: inertia m, weight in water w and its moment w·(x, y) about Bo.
+    """A load at (x, y, z): mass m, weight in water w, and their moments about Bo.
 
-    The mass includes the water that moves with it; its own rotational inertia and the coupling of
-    its lever with acceleration are left out.
+    The mass includes the water that moves with it. The moments w x, w y are what data tell; x and y
+    follow from them and the weight, z is the height. m acts at that point: coupling m S(r) and
+    inertia -m S(r)²; its own rotational inertia is left out.
     """
 
     name: ClassVar[str] = "payload"
@@ -62,22 +66,52 @@ class Payload(Effect):
         Parameter("weight", "N", (0.5,), 0.0, 100.0),
         Parameter("moment_x", "N·m", (0.05,), -30.0, 30.0),
         Parameter("moment_y", "N·m", (0.05,), -30.0, 30.0),
+        Parameter("height", "m", (0.05,), -1.0, 1.0),
     )
     simpler: ClassVar = ("net_buoyancy", "centre_of_gravity")
     source: ClassVar[str] = "0.1 to 3 kg"
 
-    def inertia(self) -> Float[Array, "6 6 *batch"]:
-        m = self.values[0]
-        shape = (6,) + (1,) * m.ndim
-        translates = jnp.asarray([1, 1, 1, 0, 0, 0], m.dtype).reshape(shape)
-        eye = jnp.eye(6, dtype=m.dtype).reshape((6, 6) + (1,) * m.ndim)
-        return eye * (translates * m[None])[None]
+    def inertia(self, plant: Plant) -> Float[Array, "6 6 *batch"]:
+        m, w, a, b, z = self.values
+        square = w * w + _LIGHT**2
+        r = jnp.stack([a * w / square, b * w / square, z])
+        S = _skew(r)
+        turning = -jnp.einsum("ij...,jk...->ik...", S, S)
+        eye = jnp.eye(3, dtype=m.dtype).reshape((3, 3) + (1,) * m.ndim)
+        upper = jnp.concatenate([jnp.broadcast_to(eye, S.shape), -S], axis=1)
+        return m * jnp.concatenate([upper, jnp.concatenate([S, turning], axis=1)])
 
     def wrench(
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
     ) -> Float[Array, "6 *#batch"]:
-        ux, uy, uz = jnp.unstack(up_in_body(X_WB))
-        w, a, b = (self.part(i, V_CB_B) for i in (1, 2, 3))
-        # (a, b, 0) × (-up): the moment of a weight with lever (a, b)/w
-        moment = [-b * uz, a * uz, b * ux - a * uy]
-        return jnp.stack(jnp.broadcast_arrays(-w * ux, -w * uy, -w * uz, *moment))
+        up = up_in_body(X_WB)
+        w, a, b, z = (self.part(i, V_CB_B) for i in range(1, 5))
+        moment = _hung(jnp.stack(jnp.broadcast_arrays(a, b, w * z)), -up)
+        force = jnp.broadcast_to(-w[None] * up, moment[:3].shape)
+        return jnp.concatenate([force, moment[3:]])
+
+
+_LIGHT = 0.05
+"""Weight (N) below which a load's place is not told by its moments."""
+
+
+def _skew(r: Float[Array, "3 *batch"]) -> Float[Array, "3 3 *batch"]:
+    x, y, z = jnp.unstack(r)
+    o = jnp.zeros_like(x)
+    rows = [[o, -z, y], [z, o, -x], [-y, x, o]]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def _coupled(moment: Float[Array, "3 *batch"]) -> Float[Array, "6 6 *batch"]:
+    """A mass matrix's coupling of translation and rotation by a first moment m r."""
+    S = _skew(moment)
+    zero = jnp.zeros_like(S)
+    upper, lower = jnp.concatenate([zero, -S], axis=1), jnp.concatenate([S, zero], axis=1)
+    return jnp.concatenate([upper, lower])
+
+
+def _hung(r: Float[Array, "3 *#batch"], force: Float[Array, "3 *#batch"]) -> Array:
+    """The moment r × force as a wrench without force."""
+    r, force = jnp.broadcast_arrays(r, force)
+    moment = se3.cross(r, force)
+    return jnp.concatenate([jnp.zeros_like(moment), moment])

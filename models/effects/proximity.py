@@ -6,36 +6,43 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .base import Effect, Parameter, Plant
+from .base import Effect, Parameter, Plant, force_only
 from .load import up_in_body
+
+REACH = 0.5
+"""Length (m) over which a boundary is felt, about that of the hull, unless `longer` says else."""
 
 
 class Proximity(Effect):
-    """exp(-d / ℓ) times a vertical force (N) and times more quadratic drag, d the clearance.
+    """More drag and a vertical force near a boundary: e^(-d / ℓ) times g D(ξ) and times F.
 
-    `bottom` lies at height `floor` (m, in W), `surface` at z = 0; ℓ = `reach`, about the hull's
-    height. Both signs occur: suction and cushion.
+    d is the clearance to the height `floor` (`bottom`), to z = 0 (`surface`), or to a vertical wall
+    at the edge of the box `walls` (west, east, south, north; m in W), ℓ = 0.5 m + `longer`. Where
+    the boundary itself lies can't be told from the drag: g refers to the places stated.
     """
 
     name: ClassVar[str] = "proximity"
     family: ClassVar = "body"
     parameters: ClassVar = (
+        Parameter("gain", "1", (0.3,), -1.0, 50.0),
         Parameter("force", "N", (0.5,), -60.0, 60.0),
-        Parameter("drag", "N·s²/m²", (5.0,), -300.0, 600.0),
+        Parameter("longer", "m", (0.1,), -0.4, 3.0),
     )
-    places: ClassVar = ("bottom", "surface")
+    places: ClassVar = ("bottom", "surface", "wall_west", "wall_east", "wall_south", "wall_north")
     source: ClassVar[str] = "drag up by half within one hull height of a wall"
     floor: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=-10.0)
-    reach: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.3)
+    walls: Float[Array, "4"] = eqx.field(converter=jnp.asarray, default=(-10.0, 10.0, -10.0, 10.0))
 
     def wrench(
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
     ) -> Float[Array, "6 *#batch"]:
-        z, v = X_WB[6], V_CB_B[:3]
-        near = jnp.exp(-jnp.maximum(z - self.floor, 0) / self.reach)
-        shallow = jnp.exp(jnp.minimum(z, 0) / self.reach)
-        part = [self.part(i, V_CB_B) for i in range(4)]
-        push = part[0] * near + part[2] * shallow
-        drag = part[1] * near + part[3] * shallow
-        f = push[None] * up_in_body(X_WB) - drag[None] * jnp.abs(v) * v
-        return jnp.concatenate([f, jnp.zeros_like(f)])
+        x, y, z = X_WB[4], X_WB[5], X_WB[6]
+        west, east, south, north = self.walls
+        clearances = (z - self.floor, -z, x - west, east - x, y - south, north - y)
+        more = push = jnp.zeros_like(z)
+        for k, clearance in enumerate(clearances):
+            gain, force, longer = (self.part(3 * k + i, V_CB_B) for i in range(3))
+            near = jnp.exp(-jnp.maximum(clearance, 0) / jnp.maximum(REACH + longer, 0.05))
+            more, push = more + gain * near, push + force * near
+        drag = more[None] * plant.drag(V_CB_B)
+        return drag + force_only(push[None] * up_in_body(X_WB))

@@ -6,14 +6,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import se3
-from .base import Effect, Parameter, Plant, force_only
+from .base import Effect, Parameter, Plant
 
 
 class Tether(Effect):
-    """F = -k (p - p_A) horizontally: a spring to an anchor, in W, acting at Bo.
+    """F = -k (p_T - p_A): a spring from its fastening T on the vehicle to an anchor A, both fixed.
 
-    Written linearly as -k p + F_0; the anchor is p_A = F_0 / k. A force that does not grow with
-    distance (k = 0) is a steady pull.
+    Written as F_0 - k p_T in W; the anchor is p_A = F_0 / k. A force that does not grow with
+    distance (k = 0) is a steady pull. T lies at `arm` in B.
     """
 
     name: ClassVar[str] = "tether"
@@ -22,6 +22,10 @@ class Tether(Effect):
         Parameter("stiffness", "N/m", (0.1,), 0.0, 200.0),
         Parameter("pull_east", "N", (0.3,), -200.0, 200.0),
         Parameter("pull_north", "N", (0.3,), -200.0, 200.0),
+        Parameter("pull_up", "N", (0.3,), -200.0, 200.0),
+        Parameter("arm_x", "m", (0.1,), -2.0, 2.0),
+        Parameter("arm_y", "m", (0.1,), -2.0, 2.0),
+        Parameter("arm_z", "m", (0.1,), -2.0, 2.0),
     )
     places: ClassVar = ("W",)
     simpler: ClassVar = ("current_steady", "net_buoyancy")
@@ -30,7 +34,9 @@ class Tether(Effect):
     def wrench(
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
     ) -> Float[Array, "6 *#batch"]:
-        k, east, north = (self.part(i, V_CB_B) for i in range(3))
-        x, y = X_WB[4], X_WB[5]
-        pull = jnp.stack(jnp.broadcast_arrays(east - k * x, north - k * y, jnp.zeros_like(x) * k))
-        return force_only(se3.rotate_inverse(X_WB, pull))
+        k, *rest = (self.part(i, V_CB_B) for i in range(7))
+        pull, arm = (jnp.stack(jnp.broadcast_arrays(*part)) for part in (rest[:3], rest[3:]))
+        stretched = pull - k[None] * X_WB[4:]
+        force = se3.rotate_inverse(X_WB, stretched) - k[None] * arm
+        arm, force = jnp.broadcast_arrays(arm, force)
+        return jnp.concatenate([force, se3.cross(arm, force)])

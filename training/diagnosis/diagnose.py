@@ -26,11 +26,14 @@ from .looking import Bench, Look
 from .naming import Hypothesis
 from .search import Found, Search, laws_of, refitted
 from .unknowns import accept, seek, structure
+from .waves import all_laws, is_apart
 
 Progress = Callable[[float, str], None]
 _MOST_UNKNOWN = 2
 _RESAMPLED, _OF_A_STEP = 0.02, 0.1
 """Nats a sample that a law, and share of a step that a time must have, in resampled data."""
+_OF_NAMES = 1e-3
+"""Share of what all names win that a law must win besides."""
 _LAW_MARGIN = 5.0
 """Nats above the threshold of names that a law must win: it is tried on a grid on every axis."""
 
@@ -122,11 +125,15 @@ class Diagnoser:
             theta, _, joint = bench.polish(found.current.theta, rows)
             final = bench.look(theta)
         self.progress(0.78, "laws of the disturbance")
-        laws = laws_of(bench, final)
         least = found.threshold + _LAW_MARGIN
         if self.resampled:  # interpolation makes the noise uneven
             least += _RESAMPLED * bench.data.steps
-        passing = [law for law in laws if law.heldout_gain > least]
+        # what the names leave of their own is no law
+        least = max(least, _OF_NAMES * sum(choice.fit.heldout_gain for choice, _ in found.accepted))
+        laws = all_laws(bench, final, least)
+        passing = [law for law in laws if law.heldout_gain > least and is_apart(law, bench)]
+        structured = [law for law in passing if law.name != "disturbance_level"]
+        passing = structured or passing
         tested = len(found.fits) + len(laws)
         causes, stirring = [], []
         if joint is not None:

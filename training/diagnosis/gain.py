@@ -22,7 +22,7 @@ from . import result
 from .blackbox import BlackBox
 from .innovations import Arrays, as_arrays, difference, predict, settle
 from .looking import Bench
-from .noise import Filter, estimate, make_filter, mean_jacobian
+from .noise import estimate, filtered, make_filter, mean_jacobian
 
 GROUPS = {"position": slice(0, 3), "rotation": slice(3, 6), "velocity": slice(6, 9)}
 HORIZONS = (0.5, 1.0, 2.0, 4.0)
@@ -55,17 +55,6 @@ class Judged(NamedTuple):
     energy: Float[np.ndarray, "h F"]
     inside: Float[np.ndarray, "b h F"]
     count: Float[np.ndarray, "h F"]
-
-
-def filtered(
-    error: Float[np.ndarray, "N 12 R"], jacobian: Float[np.ndarray, "N 12 12 R"], kalman: Filter
-) -> Float[np.ndarray, "N 12 R"]:
-    """Whitened innovations of one-step errors."""
-    nu, found = np.zeros(error.shape[1:]), np.empty(error.shape)
-    for n in range(len(error)):
-        nu = error[n] + np.einsum("ijr,jr->ir", jacobian[n], kalman.keep[n] @ nu)
-        found[n] = kalman.whiten[n] @ nu
-    return found
 
 
 def judge(bench: Bench, contender: Contender, horizon: float, seed: int) -> Judged:
@@ -202,11 +191,11 @@ def _errors(
         return se3.retract(X, n[:6]), V + n[6:]
 
     def body(carry: Any, given: Any) -> Any:
-        memory, x, v = carry
+        memory, x, v, rate = carry
         n, X0, V0, X1, V1, command, before, volts = given
         draw = jax.random.normal(jax.random.fold_in(key, n), (30, S, R), V.dtype)
         start = read(X0[:, None], V0[:, None], draw[:12])
-        fresh = model.infer(*start, ((V1 - V0) / dt)[:, None])
+        fresh = model.infer(*start, rate)
         starts = n % every == 0
         x, v = (jnp.where(starts, a, b) for a, b in zip(fresh, (x, v), strict=True))
         push = None
@@ -222,10 +211,12 @@ def _errors(
         v = kicked(v, draw[12:18])
         seen = model.observe(x, v, a)
         e = difference(*read(*seen, draw[18:]), X1[:, None], V1[:, None])
-        return (memory, x, v), e.astype(jnp.float32)
+        return (memory, x, v, a), e.astype(jnp.float32)
 
     zero = jnp.zeros((1, S, R), V.dtype)
-    start = (settle(model, u[0][:, None] + zero, dt, 1), X[0][:, None] + zero, V[0][:, None] + zero)
+    rate = ((V[1] - V[0]) / dt)[:, None] + zero
+    memory = settle(model, u[0][:, None] + zero, dt, 1)
+    start = (memory, X[0][:, None] + zero, V[0][:, None] + zero, rate)
     before = jnp.concatenate([u[:1], u[:-1]])
     xs = (jnp.arange(len(u)), X[:-1], V[:-1], X[1:], V[1:], u, before, voltage)
     return jax.lax.scan(body, start, xs)[1]

@@ -118,6 +118,11 @@ class Evidence:
         """The column of a parameter's first probe."""
         return 1 + int(np.flatnonzero(self.design.owner == i)[0])
 
+    def shows(self, i: int) -> bool:
+        """Whether a parameter changes anything here (an arm shows once there is a pull)."""
+        own = 1 + np.flatnonzero(self.design.owner == i)
+        return bool(np.any(np.diag(self.total)[own] * self.design.size[own - 1] ** 2 > 1e-12))
+
     def prior(self, parameters: Sequence[int]) -> np.ndarray:
         """Precision of the weak prior."""
         sizes = [self.library.entries[i].parameter.probes[0] for i in parameters]
@@ -172,8 +177,9 @@ class Evidence:
 
     def fit(self, parameters: Sequence[int], nuisance: Sequence[int] = ()) -> Fit:
         """Fit a hypothesis, with nuisance parameters free in it and in what it is compared with."""
-        parameters = list(parameters)
-        extra = [i for i in nuisance if i not in parameters]
+        named, parameters = list(parameters), [i for i in parameters if self.shows(i)]
+        parameters = parameters or named
+        extra = [i for i in nuisance if i not in named and self.shows(i)]
         curved, linear = self._split([*parameters, *extra])
         weights, t, theta = self._combine(self.total, curved, linear)
         base = self._combine(self.total, None, extra)[0]
@@ -194,11 +200,13 @@ class Evidence:
             heldout[here] = loss(w0, self.runs[here]) - loss(w, self.runs[here])
         tangent = self._tangent(curved, t, [*parameters, *extra])
         errors, p_value = self._wald(weights, base, tangent, len(parameters))
+        known = dict(zip(parameters, errors, strict=False))
+        unknown = 1 / np.sqrt(self.prior(named))
         return Fit(
-            tuple(parameters),
-            np.array([values[i] for i in parameters]),
+            tuple(named),
+            np.array([values.get(i, 0.0) for i in named]),
             {i: float(values[i]) for i in extra},
-            errors[: len(parameters)],
+            np.array([known.get(i, e) for i, e in zip(named, unknown, strict=True)]),
             float(loss(base, self.total) - loss(weights, self.total)),
             heldout,
             p_value,

@@ -34,12 +34,14 @@ class Predictions(NamedTuple):
         X: predicted pose itself, before it is observed (N, 7, R).
         V: predicted twist (N, 6, R).
         jacobian: A_n, of errors (pose in B, twist) over a step (N, 12, 12, R).
+        rate: predicted dV/dt at the step's end, under the command that ends there (N, 6, R).
     """
 
     error: Float[Array, "N 12 R"]
     X: Float[Array, "N 7 R"]
     V: Float[Array, "N 6 R"]
     jacobian: Float[Array, "N 12 12 R"]
+    rate: Float[Array, "N 6 R"]
 
 
 def difference(
@@ -64,19 +66,19 @@ def _predict(model: Extended, effects: Any, arrays: Arrays, dt: float) -> Predic
     plain = model.with_effects(())
     rest = plain.inertia()
 
-    def body(memory: Memory, given: Any) -> Any:
+    def body(carry: tuple[Memory, Array], given: Any) -> Any:
+        memory, rate = carry
         X0, V0, X1, V1, command, volts = given
-        rate = (V1 - V0) / dt
+        # what late instruments missed happened under the command before
         x, v = model.infer(X0, V0, rate)
         memory, Xp, Vp, a = advance(
             model, inertia, memory, x, v, command, dt, SUBSTEPS, volts[None]
         )
         error = difference(*model.observe(Xp, Vp, a), X1, V1)
-        return memory, Predictions(
-            error, Xp, Vp, _jacobian(plain, rest, x, (v + Vp) / 2, command, dt)
-        )
+        jacobian = _jacobian(plain, rest, x, (v + Vp) / 2, command, dt)
+        return (memory, a), Predictions(error, Xp, Vp, jacobian, a)
 
-    start = settle(model, u[0], dt, SUBSTEPS)
+    start = settle(model, u[0], dt, SUBSTEPS), (V[1] - V[0]) / dt
     return jax.lax.scan(body, start, (X[:-1], V[:-1], X[1:], V[1:], u, voltage))[1]
 
 

@@ -25,6 +25,8 @@ class Law:
     heldout: Float[np.ndarray, " R"]
     loss: Callable[[np.ndarray], np.ndarray] | None = None
     """Nats lost by each piece at the logarithms of the parameters, in their order."""
+    errors: dict[str, float] | None = None
+    """Standard errors of the parameters where they were estimated without a loss."""
 
     @property
     def heldout_gain(self) -> float:
@@ -136,7 +138,7 @@ def colour(
 
 def run_constants(
     products: Float[np.ndarray, "R m m"], columns: list[int], sizes: np.ndarray, fold: np.ndarray
-) -> tuple[np.ndarray, dict[str, float]]:
+) -> Told:
     """Gain of effects whose size is drawn anew for each run: z ~ N(0, I + σ² J Jᵀ).
 
     By the matrix determinant lemma the likelihood of a run needs J'J and J'z alone. σ is the
@@ -146,15 +148,16 @@ def run_constants(
     g = products[:, columns, 0]
     H, g = H * sizes[:, None] * sizes, g * sizes
     factors = np.concatenate([[0.0], np.geomspace(0.125, 64, 28)])
-    losses = [np.zeros(len(H))]
     eye = np.eye(len(columns))
-    for s in factors[1:]:
+
+    def at(s: float) -> np.ndarray:
         inner = eye + s**2 * H
         inside = np.linalg.solve(inner, (s**2 * g)[..., None])[..., 0]
-        losses.append(np.linalg.slogdet(inner)[1] / 2 - np.sum(g * inside, axis=1) / 2)
-    table = np.array(losses)
-    held, best = _held_out(table, fold)
-    return -held, {"std": float(factors[best] * sizes[0])}
+        return np.linalg.slogdet(inner)[1] / 2 - np.sum(g * inside, axis=1) / 2
+
+    held, best = _held_out(np.array([at(s) for s in factors]), fold)
+    values = {"std": float(factors[best] * sizes[0])}
+    return -held, values, lambda logs: at(float(np.exp(logs[0])) / sizes[0])
 
 
 def find_laws(
@@ -191,10 +194,13 @@ def estimated(
     labels, index = np.unique(cluster, return_inverse=True)
 
     def total(x: np.ndarray) -> float:
-        return float(loss(x).sum()) if np.all(np.abs(x - x0) < 4) else np.inf
+        return float(loss(x).sum())
+
+    def near(x: np.ndarray) -> float:
+        return total(x) if np.all(np.abs(x - x0) < 4) else np.inf
 
     found = scipy.optimize.minimize(
-        total, x0, method="Nelder-Mead", options={"maxfev": 120, "xatol": 1e-3, "fatol": 1e-2}
+        near, x0, method="Nelder-Mead", options={"maxfev": 120, "xatol": 1e-3, "fatol": 1e-2}
     ).x
     k, h = len(found), 0.02
     steps = h * np.eye(k)
@@ -211,6 +217,8 @@ def estimated(
             for a in steps
         ]
     ) / (4 * h * h)  # fmt: skip
+    if not np.isfinite(H).all() or np.any(np.diag(H) <= 0):
+        return found, np.full((k, k), np.nan)  # at the edge of what is possible
     inverse = np.linalg.pinv(H + 1e-9 * np.eye(k))
     n = len(labels)
     return found, inverse @ (g.T @ g) @ inverse * n / max(n - 1, 1)

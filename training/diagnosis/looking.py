@@ -182,8 +182,9 @@ def _key(entry: tuple) -> tuple[str, str, str]:
 
 
 def _library(data: Data, effects: Sequence[Effect]) -> tuple[Library, np.ndarray]:
-    floor = float(data.X[:, 6].min()) - 0.3
-    options = {"proximity": {"floor": floor}}
+    low, high = data.X[:, 4:].min(axis=(0, 2)) - 0.3, data.X[:, 4:].max(axis=(0, 2)) + 0.3
+    walls = (low[0], high[0], low[1], high[1])
+    options = {"proximity": {"floor": float(low[2]), "walls": tuple(map(float, walls))}}
     left_out = set(_RANDOM) | (set() if data.has_voltage else {"voltage_sag"})
     kinds = [k for k in KINDS.values() if k.family != "disturbance" and k.name not in left_out]
     own = [e for e in effects if e.name not in {k.name for k in kinds}]

@@ -107,3 +107,14 @@ def make_filter(
         P = gap @ prior
         P = (P + P.T) / 2
     return Filter(keep, whiten, log_det)
+
+
+def filtered(
+    error: Float[np.ndarray, "N 12 R"], jacobian: Float[np.ndarray, "N 12 12 R"], kalman: Filter
+) -> Float[np.ndarray, "N 12 R"]:
+    """Whitened innovations of one-step errors."""
+    nu, found = np.zeros(error.shape[1:]), np.empty(error.shape)
+    for n in range(len(error)):
+        nu = error[n] + np.einsum("ijr,jr->ir", jacobian[n], kalman.keep[n] @ nu)
+        found[n] = kalman.whiten[n] @ nu
+    return found

@@ -38,13 +38,12 @@ def _respond(
     inertia = model.inertia()
 
     def body(carry: Any, given: Any) -> Any:
-        memory, nu = carry
+        memory, nu, rate = carry
         p, X0, V0, command, volts, gap, white, exists = given
-        rate = ((p.V - V0) / dt)[:, None]
-        x, v = model.infer(X0[:, None], V0[:, None], rate)
+        x, v = model.infer(X0[:, None], V0[:, None], rate[:, None])
         kept = jnp.tensordot(gap, nu, 1)
         if instruments:
-            seen = model.observe(p.X[:, None], p.V[:, None], rate)
+            seen = model.observe(p.X[:, None], p.V[:, None], p.rate[:, None])
             direct = _apart(seen)
             moved = kept - _apart((x, v))
         else:
@@ -58,11 +57,11 @@ def _respond(
         nu = jnp.sum(p.jacobian[:, :, None] * moved[None], axis=1) - direct
         nu = nu.at[:, 0].add(p.error)
         # lane 0 carries the base's own innovation: nothing was changed there
-        return (memory, nu), jnp.tensordot(white, nu, 1) * exists[None, None]
+        return (memory, nu, p.rate), jnp.tensordot(white, nu, 1) * exists[None, None]
 
     zero = jnp.zeros((12, lanes, V.shape[2]), V.dtype)
     memory = () if instruments else settle(model, u[0][:, None], dt, 1)
-    start = (memory, zero)
+    start = (memory, zero, (V[1] - V[0]) / dt)
     xs = (predictions, X[:-1], V[:-1], u, voltage, keep, whiten, weight)
     return jax.lax.scan(body, start, xs)[1].astype(jnp.float32)
 

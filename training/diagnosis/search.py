@@ -63,9 +63,8 @@ def laws_of(bench: Bench, look: Look) -> list[Law]:
     if set(rows) <= set(evidence.design.owner.tolist()) and len(evidence.runs) > 2:
         columns = [evidence.column(i) for i in rows]
         sizes = np.array([bench.library.entries[i].parameter.probes[0] for i in rows])
-        gain, values = run_constants(evidence.runs, columns, sizes, evidence.fold)
-        values["time_constant"] = float(data.weight.sum(axis=0).mean() * data.dt)
-        found.append(Law("current_varying", "W", values, gain))
+        gain, values, loss = run_constants(evidence.runs, columns, sizes, evidence.fold)
+        found.append(Law("current_varying", "W", values, gain, loss))
     return sorted(found, key=lambda law: -law.heldout_gain)
 
 

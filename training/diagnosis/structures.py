@@ -42,7 +42,7 @@ class Group:
 
     Attributes:
         effect: that has these columns as its terms (of a memory: with the first node's numbers).
-        action: `wrench`, `thruster`, `force` (in W) or `flow` (in W).
+        action: `wrench`, `thruster`, `force`, `swell` or `flow` (all three in W).
         variables: inputs, in the words of recordings.
         columns: of the wrench (N, component of the action, k, R) for a range of pieces.
         nodes: columns of each alternative.
@@ -147,14 +147,22 @@ class Screen:
             unit = np.eye(len(model.inverse))[:, int(group.effect.acts_on) - 1]
             wrench = self.inverse @ np.asarray(model.allocate(jnp.asarray(unit)))
             return wrench[:, None, None] * phi
-        F = self._of_world() if group.action == "force" else self._of_flow
+        if group.action == "swell":
+            base = self.bench.model.base
+            displaced = float(base.displaced_mass)
+            total = float(np.mean(np.diag(self.bench.mass(self.look.theta))[:3]))
+            lever = np.asarray(base.p_BoCb_B) * displaced / total
+            turn = np.cross(np.eye(3), lever)  # rows: e_i × r
+            F = self._of_world(self.inverse[:, :3] - self.inverse[:, 3:] @ turn.T)
+        else:
+            F = self._of_world(self.inverse[:, :3]) if group.action == "force" else self._of_flow
         return np.einsum("nijr,njkr->nikr", F, phi)
 
-    def _of_world(self) -> Float[np.ndarray, "N 6 3 R"]:
+    def _of_world(self, inverse: Float[np.ndarray, "6 3"]) -> Float[np.ndarray, "N 6 3 R"]:
         X = self.bench.data.X[:-1][..., self.kept].swapaxes(0, 1)
         unit = np.eye(3)[:, :, None, None] + np.zeros((1, 1, *X.shape[1:]))
         turned = se3.rotate_inverse(jnp.asarray(X)[:, None], jnp.asarray(unit))
-        return np.einsum("ij,jknr->nikr", self.inverse[:, :3], np.asarray(turned))
+        return np.einsum("ij,jknr->nikr", inverse, np.asarray(turned))
 
     @property
     def _of_flow(self) -> Float[np.ndarray, "N 6 3 R"]:

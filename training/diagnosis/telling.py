@@ -120,6 +120,7 @@ def law_causes(
         return [], []
     top = laws[0]
     same = [law for law in laws if law.name == top.name]
+    same.sort(key=lambda law: law.where in AXES[3:])  # newtons before newton metres
     parameters: dict[str, result.Value] = {}
     cls = kind(top.name)
     values = np.zeros(cls.size())
@@ -144,6 +145,12 @@ def _law_values(law: Law, bench: Bench, look: Look) -> dict[str, result.Value]:
     """A law's numbers in the units of its effect, with intervals by the delta method."""
     data = bench.data
     units = {p.name: p.unit for p in kind(law.name).parameters}
+    if law.errors is not None:
+        spreads = {name: 1.96 * law.errors[name] for name in law.parameters}
+        return {
+            name: result.Value(v, units[name], (v - spreads[name], v + spreads[name]))
+            for name, v in law.parameters.items()
+        }
     cluster = data.cluster
     if law.loss is not None and len(law.heldout) != len(cluster):
         cluster = np.arange(len(law.heldout))
@@ -171,8 +178,8 @@ def _law_values(law: Law, bench: Bench, look: Look) -> dict[str, result.Value]:
         low, high = value * np.exp(-1.96 * s), value * np.exp(1.96 * s)
         found[name] = result.Value(float(value), units[name], (float(low), float(high)))
     if law.name == "current_varying":
-        tau = law.parameters["time_constant"]
-        found["time_constant"] = result.Value(tau, "s", (tau, _NAN))
+        least = float(data.weight.sum(axis=0).mean() * data.dt)  # it stays over a run
+        found["time_constant"] = result.Value(least, "s", (_NAN, _NAN))
     return found
 
 

@@ -1,0 +1,1 @@
+"""Checks of what a command promises, on cases whose answer is known."""

@@ -1,0 +1,203 @@
+"""The judgements of many cases as tables: confusion, detection, false alarms, gain, parameters."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.stats
+
+from .judging import CLOSE
+
+Row = dict[str, Any]
+ENOUGH = 0.9
+"""Share of the true model's gain that an extended model should reach."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with its caption."""
+
+    caption: str
+    header: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+
+    def markdown(self) -> str:
+        """As Markdown."""
+        lines = [
+            f"| {' | '.join(self.header)} |",
+            f"|{'---|' * len(self.header)}",
+            *(f"| {' | '.join(row)} |" for row in self.rows),
+        ]
+        return f"{self.caption}\n\n" + "\n".join(lines) + "\n"
+
+
+def interval(hits: int, total: int, level: float = 0.95) -> tuple[float, float]:
+    """Of a share: Clopper and Pearson 1934, exact by the beta distribution."""
+    tail = (1 - level) / 2
+    low = 0.0 if hits == 0 else float(scipy.stats.beta.ppf(tail, hits, total - hits + 1))
+    high = 1.0 if hits == total else float(scipy.stats.beta.ppf(1 - tail, hits + 1, total - hits))
+    return low, high
+
+
+def share(hits: int, total: int) -> str:
+    """`9 of 10 (0.55 to 1.00)`."""
+    if total == 0:
+        return "–"
+    low, high = interval(hits, total)
+    return f"{hits} of {total} ({low:.2f} to {high:.2f})"
+
+
+def tables(rows: Sequence[Row]) -> list[Table]:
+    """All tables for which there are cases."""
+    found = [_summary(rows), _confusion(rows), _sizes(rows), _mixed(rows), _faults(rows)]
+    return [table for table in found if table.rows]
+
+
+def _of(rows: Sequence[Row], *kinds: str) -> list[Row]:
+    return [r for r in rows if r["kind"] in kinds]
+
+
+def _middle(values: Sequence[float], digits: int = 2) -> str:
+    return f"{np.median(values):.{digits}f}" if len(values) else "–"
+
+
+def gain_share(row: Row) -> float | None:
+    """The share over all parts of the state; None where no gain was judged."""
+    return row["gain"].get("all")
+
+
+def _summary(rows: Sequence[Row]) -> Table:
+    nulls, singles = _of(rows, "null"), _of(rows, "single")
+    true = [r for r in singles if r["size"] == 1]
+    lines = []
+    if nulls:
+        lines.append(("false alarms", share(sum(bool(r["named"]) for r in nulls), len(nulls))))
+    if true:
+        lines.append(
+            (
+                "single causes of realistic size named first",
+                share(sum(r["first_right"] for r in true), len(true)),
+            )
+        )
+        alone = sum(r["first_right"] and len(r["named"]) == 1 for r in true)
+        lines.append(("and no other name beside them", share(alone, len(true))))
+        placed = [r["place_right"] for r in true if r["place_right"] is not None]
+        lines.append(("place right, of those", share(sum(placed), len(placed))))
+    z = np.abs([z for r in rows for z in r["z"].values()])
+    if len(z):
+        lines.append(
+            (f"parameters within {CLOSE:g} standard errors", share(int(sum(z <= CLOSE)), len(z)))
+        )
+        lines.append(("median of their deviation, in standard errors", _middle(list(z))))
+        off = [abs(x - 1) for r in rows for x in r["ratio"].values()]
+        lines.append(
+            ("median of their deviation, relative", f"{100 * float(np.median(off)):.1f} %")
+        )
+    gains = [g for r in singles if (g := gain_share(r)) is not None]
+    if gains:
+        good = sum(g >= ENOUGH for g in gains)
+        lines.append(
+            ("gain of single causes at least 90 % of the true model's", share(good, len(gains)))
+        )
+        lines.append(("median of that share", _middle(gains, 3)))
+    unknown = _of(rows, "unknown")
+    if unknown:
+        hits = sum(r["first_right"] for r in unknown)
+        lines.append(
+            (
+                "effects without a name called unknown, by the right variables",
+                share(hits, len(unknown)),
+            )
+        )
+    if singles:
+        wrong = sum("unknown" in r["named"] for r in singles)
+        lines.append(("named effects called unknown", share(wrong, len(singles))))
+    seconds = [r["seconds"] for r in rows]
+    if seconds:
+        lines.append(
+            (
+                "time of a diagnosis, median and longest",
+                f"{np.median(seconds):.0f} s, {max(seconds):.0f} s",
+            )
+        )
+    return Table("Shares with 95 % intervals (Clopper and Pearson).", ("", ""), lines)
+
+
+def _confusion(rows: Sequence[Row]) -> Table:
+    chosen = [r for r in _of(rows, "single", "unknown") if r["size"] == 1]
+    lines = []
+    for label in dict.fromkeys(r["label"] for r in chosen):
+        own = [r for r in chosen if r["label"] == label]
+        others: dict[str, int] = {}
+        for r in own:
+            told = ", ".join(dict.fromkeys(r["named"])) or "adequate"
+            others[told] = others.get(told, 0) + 1
+        told = "; ".join(f"{k} × {n}" if len(own) > 1 else k for k, n in others.items())
+        z = [abs(v) for r in own for v in r["z"].values()]
+        gains = [g for r in own if (g := gain_share(r)) is not None]
+        hits = sum(r["first_right"] for r in own)
+        lines.append(
+            (
+                label,
+                f"{hits} of {len(own)}",
+                told,
+                f"{max(z):.1f}" if z else "–",
+                _middle(gains),
+                f"{np.median([r['seconds'] for r in own]):.0f}",
+            )
+        )
+    header = ("hidden", "first name right", "named, in order", "largest z", "gain", "s")
+    caption = (
+        "Single causes of realistic size: what was said, the largest deviation of a parameter in "
+        "standard errors, the share of the true model's gain."
+    )
+    return Table(caption, header, lines)
+
+
+def _sizes(rows: Sequence[Row]) -> Table:
+    chosen = _of(rows, "single", "unknown")
+    sizes = sorted({r["size"] for r in chosen})
+    if len(sizes) < 2:
+        return Table("", (), [])
+    lines = []
+    for size in sizes:
+        own = [r for r in chosen if r["size"] == size]
+        seen = sum(bool(r["named"]) for r in own)
+        right = sum(r["first_right"] for r in own)
+        lines.append((f"{size:g}", share(seen, len(own)), share(right, len(own))))
+    return Table(
+        "Detection against size, in realistic sizes.",
+        ("size", "something named", "first name right"),
+        lines,
+    )
+
+
+def _mixed(rows: Sequence[Row]) -> Table:
+    lines = []
+    for name in ("pair", "triple"):
+        own = _of(rows, name)
+        if own:
+            hidden = sum(len(r["hidden"]) for r in own)
+            lines.append(
+                (
+                    f"{name}s",
+                    share(sum(r["first_right"] for r in own), len(own)),
+                    share(sum(r["recalled"] for r in own), hidden),
+                    f"{sum(r['spurious'] for r in own) / len(own):.2f}",
+                )
+            )
+    header = ("", "first name right", "causes found", "wrong names a case")
+    return Table("Several causes at once.", header, lines)
+
+
+def _faults(rows: Sequence[Row]) -> Table:
+    lines = [
+        (
+            r["label"],
+            "yes" if r["told"] else "no",
+            ", ".join(r["named"]) or "adequate",
+        )
+        for r in _of(rows, "fault")
+    ]
+    return Table("Data at fault.", ("fault", "told", "named besides"), lines)

@@ -1,0 +1,57 @@
+"""`spinndrift check`: a command's promises, on cases whose answer is known."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from ...models.errors import UserError
+from ..progress import console, progress_bar
+
+
+@dataclass(frozen=True)
+class Check:
+    """Diagnose cases of hidden effects, judge what was said by the sealed answers, tell the result.
+
+    A case is a folder with CSV data and the answer; docs/blind-cases.md describes the form. Each is
+    judged once: the same command goes on where it was interrupted.
+    """
+
+    name: Annotated[Positional[Literal["diagnosis"]], arg(metavar="diagnosis")] = "diagnosis"
+    """What to check."""
+    cases: Path = Path("runs/blind")
+    """Folder of cases, such as `make blind` writes."""
+    only: tuple[str, ...] = ()
+    """Patterns of the names of cases or of causes to take (`'lag-*' net_buoyancy`)."""
+    alpha: float = 0.01
+    """Rate of false alarms that is promised."""
+    out: Path = Path("runs/check")
+    """Folder for what was found in each case."""
+    docs: Path | None = None
+    """Markdown file to write the tables into, such as docs/diagnosis.md."""
+
+    def run(self) -> None:
+        """Diagnose, judge, tell."""
+        from rich.table import Table as Shown
+
+        from ..check.cases import find_cases
+        from ..check.pages import write_page
+        from ..check.run import run_cases
+        from ..check.tables import tables
+
+        if self.docs is not None and self.docs.suffix != ".md":
+            raise UserError(f"--docs {self.docs}: end the name in .md")
+        cases = find_cases(self.cases, self.only)
+        with progress_bar(f"{len(cases)} cases") as update:
+            rows = run_cases(cases, self.out, self.alpha, update)
+        shown = console()
+        for table in tables(rows):
+            grid = Shown(*table.header, title=table.caption, title_justify="left")
+            for row in table.rows:
+                grid.add_row(*row)
+            shown.print(grid)
+        write_page(self.out / "diagnosis.md", rows, cases)
+        if self.docs is not None:
+            write_page(self.docs, rows, cases)
+        shown.print(f"wrote {self.docs or self.out / 'diagnosis.md'}")

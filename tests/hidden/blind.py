@@ -1,0 +1,232 @@
+"""Blind cases as folders: data to diagnose, data to judge by, and the sealed answer.
+
+docs/blind-cases.md describes the form. `told` says what is hidden in the definitions of that form,
+which are those of the published effects; where they differ from the simulator's by more than a
+change of variables, nothing is said of a parameter, or a tolerance is given.
+"""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import effects_actuation as actuation
+from . import effects_body as body
+from . import effects_disturbance as disturbance
+from . import effects_environment as environment
+from . import effects_measurement as measurement
+from .draw import TWINS, Case, draw
+from .effect import Effect
+from .effects import CAUSES, UNKNOWN
+from .faults import spoil
+from .oracle import predict
+from .scenarios import Plan
+from .vehicle import Vehicle
+from .write import STATE, write_folder
+
+FRESH = 7_000_000
+"""Added to a case's seed for the runs that the diagnosis never sees."""
+EVERY = 20
+"""Samples of a window of forecasts: 1 s at 20 Hz."""
+SCALES = {
+    "tiny": (Plan(scenarios=5, runs=1, seconds=6.0), 1),
+    "small": (Plan(scenarios=10, runs=3, seconds=10.0), 10),
+    "full": (Plan(scenarios=10, runs=20, seconds=10.0), 20),
+}
+"""Amount of data, and number of nulls."""
+NOMINAL = (*(float(b) for b in disturbance.NOMINAL_DIFFUSION),)
+
+
+@dataclass(frozen=True)
+class Blind:
+    """A case with its name and the table that it belongs to."""
+
+    name: str
+    kind: str
+    case: Case
+    size: float = 1.0
+    fault: str = ""
+
+    def write(self, folder: Path) -> None:
+        """Write data/, truth.yaml last, and, where means differ, fresh/ and oracle/."""
+        case = self.case
+        folder.mkdir(parents=True, exist_ok=True)
+        runs, limits, problems = case.logged(), [], []
+        if self.fault:
+            runs, _ = spoil(runs, self.fault, case.seed)
+            problems = [SAID[self.fault]]
+        if case.plan.idle:
+            limits = [AXES[i] for i in case.plan.idle]
+        write_folder(folder / "data", runs, rate=case.plan.rate)
+        if case.plan.even and any(has_mean(e) for e in case.effects):
+            fewer = replace(case, plan=replace(case.plan, runs=min(case.plan.runs, 2)))
+            truth = fewer.simulate(case.seed + FRESH)
+            write_folder(
+                folder / "fresh", fewer.logged(case.seed + FRESH, truth), rate=case.plan.rate
+            )
+            write_oracle(folder / "oracle", fewer, truth)
+        answer = case.answer()
+        told_ = {
+            "kind": self.kind,
+            "verdict": answer["verdict"],
+            "label": self.fault or " + ".join(label(e) for e in case.effects) or self.kind,
+            "size": self.size,
+            "causes": [told(e) for e in case.effects],
+            "diffusion": list(NOMINAL),
+            "every": EVERY,
+            "problems": problems,
+            "limits": limits,
+        }
+        lines = [f"{key}: {json.dumps(value)}" for key, value in told_.items()]
+        (folder / "truth.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+SAID = {
+    "stuck": "stuck",
+    "lost_lock": "stuck",
+    "gap": "lost samples",
+    "clock_jump": "clock",
+    "pose_jump": "jumps",
+    "outliers": "outliers",
+}
+"""What the diagnosis must say of a fault."""
+
+
+def has_mean(effect: Effect) -> bool:
+    """Whether an effect changes what is expected, and not only its scatter."""
+    scatter = (environment.CurrentVarying, environment.Waves)
+    return not isinstance(effect, scatter) and not effect.cause.startswith("disturbance")
+
+
+def label(effect: Effect) -> str:
+    return getattr(effect, "kind", "") or effect.cause
+
+
+def write_oracle(folder: Path, case: Case, truth: Any) -> None:
+    """A file a run: what the true model expects to be recorded, from each window's first record."""
+    folder.mkdir(parents=True)
+    steps = truth.t.shape[0] - 1
+    starts = range(0, steps - EVERY + 1, EVERY)
+    seen = predict(case, truth, list(starts), EVERY)
+    for b in range(truth.t.shape[1]):
+        X, V = [truth.X[:1, :, b]], [truth.V[:1, :, b]]
+        for k in range(len(starts)):
+            X.append(seen.X[k, 1:, :, b])
+            V.append(seen.V[k, 1:, :, b])
+        X, V = np.concatenate(X), np.concatenate(V)
+        t = truth.t[: len(X), b]
+        table = np.concatenate([t[:, None], X[:, 4:], X[:, :4], V], axis=1)
+        np.savetxt(
+            folder / f"run_{b + 1:03d}.csv", table, "%.10g", ",", header=",".join(["t", *STATE]),
+            comments="",
+        )  # fmt: skip
+
+
+def told(effect: Effect) -> dict[str, Any]:
+    """Name, place, parameters in the published definitions, and what they may be confused with."""
+    found = {"name": effect.cause, "twins": list(TWINS.get(effect.cause, ()))}
+    if effect.cause == "unknown":
+        return found | {"variables": list(getattr(effect, "variables", ()))}
+    own = {name: number["value"] for name, number in effect.parameters().items()}
+    place, values, tolerance = effect.where, own, 0.0
+    match effect:
+        case actuation.ThrustCurve():
+            change = effect.exponent - 1
+            values = {"exponent": change, "gain": (10 / actuation.FULL_THRUST) ** change - 1}
+        case actuation.ThrustAsymmetry():
+            values = {"reverse_gain": effect.reverse - 1}
+        case actuation.ThrusterGain():
+            values = {"gain": effect.gain - 1}
+        case actuation.ThrustScale():
+            values = {"scale": effect.scale - 1}
+        case actuation.LoadDroop():
+            values = {"loss": own["loss_at_40_N"]}
+            tolerance = 0.1  # published to first order in the loss
+        case actuation.InflowThrustLoss():
+            values = {"loss": effect.coefficient}
+        case body.NetBuoyancy() | body.Payload():
+            place = "all"
+            if isinstance(effect, body.Payload):
+                values = {
+                    "mass": effect.mass + own["added_mass"],
+                    "weight": own["weight_in_water"],
+                    "moment_x": own["weight_times_x"],
+                    "moment_y": own["weight_times_y"],
+                }
+        case body.CentreOfGravity():
+            values = {"shift": effect.offset}
+        case body.DragAsymmetry():
+            d = Vehicle().quadratic[effect.axis]
+            values = {"difference": float(effect.coefficient * d)}
+        case body.DragCoupling():
+            values = {"quadratic": own["coefficient"]}
+            tolerance = 0.1  # the moment follows from the speed at the lever's end
+        case body.Lift():
+            place = "heave_from_surge"
+        case body.AddedMassCoupling():
+            values = {"change": effect.mass}
+        case body.MunkMoment():
+            values = {"change": effect.scale - 1}
+        case body.Proximity():
+            values = {}
+            place = "" if effect.boundary == "wall" else effect.boundary
+        case environment.Tether():
+            k, a = effect.stiffness, effect.anchor
+            values = {"stiffness": k, "pull_east": k * a[0], "pull_north": k * a[1]}
+        case environment.Waves():
+            values = {"frequency": own["frequency"]}
+        case disturbance.DisturbanceLevel():
+            place, values = "", {"change": effect.factor - 1}
+        case disturbance.DisturbanceColour() | disturbance.DisturbanceImpacts():
+            place = ""
+            values.pop("impulse", None)
+        case disturbance.DisturbanceStateDependence():
+            place, values = "", {}
+        case measurement.DvlLeverArm():
+            values = {"offset": own[place]}
+        case measurement.DvlScale():
+            place, values = "all", {"scale": effect.error}
+        case measurement.GyroBias():
+            place = "xyz"[effect.axis]
+        case measurement.ClockOffset():
+            values = {"delay": effect.seconds}
+        case measurement.HeadingError():
+            place = "all"
+            values["offset"] = values.pop("constant")
+        case _:
+            pass
+    return found | {
+        "where": place,
+        "parameters": {k: float(v) for k, v in values.items()},
+        "tolerance": tolerance,
+    }
+
+
+def table(
+    plan: Plan, nulls: int, seeds: int = 1, sizes: tuple[float, ...] = (1.0,), mixed: int = 4
+) -> Iterator[Blind]:
+    """Singles of every cause at each size, effects without a name, nulls, mixtures, faulty data."""
+    for size in sizes:
+        for k, name in enumerate(CAUSES):
+            for i in range(seeds):
+                case = draw(1000 * (i + 1) + k, names=(name,), size=size, plan=plan)
+                yield Blind(f"{name}-{size:g}-{i}", "single", case, size)
+    for k, name in enumerate(UNKNOWN):
+        for i in range(seeds):
+            case = draw(70_000 + 10 * i + k, "unknown", names=(name,), plan=plan)
+            yield Blind(f"{name}-{i}", "unknown", case)
+    for i in range(nulls):
+        loop = "closed" if i % 4 == 3 else "open"
+        case = draw(50_000 + i, "null", plan=replace(plan, loop=loop))
+        yield Blind(f"null-{loop}-{i}", "null", case)
+    for kind, first in (("pair", 60_000), ("triple", 61_000)):
+        for i in range(mixed):
+            yield Blind(f"{kind}-{i}", kind, draw(first + i, kind, plan=plan))
+    for k, fault in enumerate(SAID):
+        yield Blind(f"fault-{fault}", "fault", draw(80_000 + k, "null", plan=plan), fault=fault)
+    idle = replace(plan, idle=(1,))
+    yield Blind("fault-idle-sway", "fault", draw(80_100, "null", plan=idle), fault="")

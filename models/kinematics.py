@@ -9,13 +9,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .resample import conjugate, continuous, multiply, rotate, rotation_log
 
 _WINDOW_S = 0.5
 _MOVES_M, _TURNS_RAD = 0.02, 0.02  # rms in a window below which nothing can be told
 _AGREED, _EXPLAINED, _DOUBTFUL, _CONTRADICTED = 0.98, 0.9, 0.8, 0.5
+_SHORT = (0.1, 5.0)  # m/s, rad/s: second difference that is no outlier yet
+_MOST = 0.5  # share of the windows that must contradict, all but faults of an instrument
+_SPIKE, _FEW = 20.0, 8  # times the usual second difference; samples that tell what is usual
 _BETTER = 0.3  # a reading that leaves less than this part of the residual is the right one
 
 Arrays = tuple[np.ndarray, np.ndarray]
@@ -132,16 +135,53 @@ _ANGULAR: list[tuple[str, Callable[[np.ndarray, np.ndarray], Arrays]]] = [
 ]
 
 
+def _mostly(t: np.ndarray, X_WB: np.ndarray, V: np.ndarray, rows: slice) -> float:
+    """What is explained in the half of the windows that agrees best."""
+    moved, integrated = (a[rows] for a in _increments(t, X_WB, V))
+    off = np.sum((moved - integrated) ** 2, axis=0)
+    kept = np.argsort(off)[: max(round(_MOST * off.size), 1)]
+    size = np.sum(moved[:, kept] ** 2)
+    return float(1 - off[kept].sum() / size) if size > 0 else -np.inf
+
+
+def spikes(V: Float[np.ndarray, "6 N"]) -> Bool[np.ndarray, "6 N"]:
+    """Single samples far from both their neighbours, which agree: outliers of an instrument.
+
+    A hull's turning may be damped within a sample, so rates must lie far off.
+    """
+    found = np.zeros(V.shape, bool)
+    if V.shape[1] < _FEW:
+        return found
+    curve, apart = np.abs(np.diff(V, 2, axis=1)), np.abs(V[:, 2:] - V[:, :-2])
+    usual = np.nanmedian(np.nan_to_num(curve), axis=1, keepdims=True)
+    least = np.where(np.arange(len(V)) < 3, *_SHORT)[:, None]
+    found[:, 1:-1] = (curve > _SPIKE * usual + least) & (apart < 0.2 * curve)
+    return found
+
+
+def _without(V: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Spikes replaced by the mean of their neighbours."""
+    mean = np.concatenate([V[:, :1], (V[:, 2:] + V[:, :-2]) / 2, V[:, -1:]], axis=1)
+    return np.where(found, mean, V)
+
+
 def contradictions(
     t: Float[np.ndarray, " N"], X_WB: Float[np.ndarray, "7 N"], V_WB_B: Float[np.ndarray, "6 N"]
 ) -> tuple[list[str], list[str]]:
     """Return (errors, doubts): sentences on poses and twists that can't both be right.
 
-    An error names the reading that would make them agree, or says that none known does.
+    An error names the reading that would make them agree, or says that none known does. Faults of
+    an instrument are no such mix-up: single outliers, and what at most half of the windows
+    contradicts, are doubts.
     """
     if t.size < 3:
         return [], []
     errors, doubts = [], []
+    outliers = spikes(V_WB_B)
+    V_WB_B = _without(V_WB_B, outliers)
+    if outliers.any():
+        count = int(outliers.any(axis=0).sum())
+        doubts.append(f"{count} single velocities lie far from both their neighbours.")
     for what, rows, readings in (
         ("p,q,r", slice(3, 6), _ANGULAR),
         ("u,v,w", slice(0, 3), _LINEAR),
@@ -157,7 +197,7 @@ def contradictions(
         if scores[best] > _EXPLAINED and 1 - scores[best] < _BETTER * (1 - now.explained):
             errors.append(f"{found}: {readings[best][0]}")
             break  # what follows from a wrong attitude need not be told again
-        if now.explained < _CONTRADICTED:
+        if now.explained < _CONTRADICTED and _mostly(t, X_WB, V_WB_B, rows) < _CONTRADICTED:
             errors.append(f"{found}: check units, frames and the order of the quaternion")
             break
         if now.explained < _DOUBTFUL:

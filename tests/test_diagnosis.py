@@ -307,11 +307,16 @@ def test_axes_that_are_not_driven_and_filled_samples_are_told(tmp_path):
     assert Diagnoser(read_csv(tmp_path / "idle"), VEHICLE).quiet == ["sway"]
     case = draw(3, "null", plan=PLAN)
     assert problems(_read(tmp_path / "clean", case.logged())) == ([], [])
-    for fault, word in (("stuck", "stuck"), ("clock_jump", "clock")):
+    faults = (("stuck", "stuck"), ("clock_jump", "clock"), ("outliers", "outliers"))
+    for fault, word in faults:
         runs, told = spoil(case.logged(), fault, seed=3)
         found, faulty = problems(_read(tmp_path / fault, runs))
         assert word in " ".join(found)
         assert faulty == [int(told[0]["file"][4:7]) - 1]
+    runs, _ = spoil(case.logged(), "gap", seed=3)
+    assert "missing" in problems(_read(tmp_path / "gap", runs))[0][0]
+    blows = draw(3, names=("disturbance_impacts",), size=3.0, plan=PLAN)
+    assert problems(_read(tmp_path / "blows", blows.logged())) == ([], [])
 
 
 def _read(folder, runs):

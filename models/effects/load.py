@@ -79,7 +79,7 @@ class Payload(Effect):
         turning = -jnp.einsum("ij...,jk...->ik...", S, S)
         eye = jnp.eye(3, dtype=m.dtype).reshape((3, 3) + (1,) * m.ndim)
         upper = jnp.concatenate([jnp.broadcast_to(eye, S.shape), -S], axis=1)
-        return m * jnp.concatenate([upper, jnp.concatenate([S, turning], axis=1)])
+        return m[None, None] * jnp.concatenate([upper, jnp.concatenate([S, turning], axis=1)])
 
     def wrench(
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant

@@ -67,7 +67,7 @@ class ThrustAsymmetry(Effect):
 
     name: ClassVar[str] = "thrust_asymmetry"
     family: ClassVar = "actuation"
-    parameters: ClassVar = (Parameter("reverse_gain", "1", (-0.05,), -0.6, 0.6),)
+    parameters: ClassVar = (Parameter("reverse_gain", "1", (-0.05,), -0.6, 1.5),)
     places: ClassVar = ALL_OR_ONE
     order: ClassVar[int] = 12
     source: ClassVar[str] = "reverse ≈ 0.78 of forward: Blue Robotics T200 data, 2019"
@@ -87,7 +87,7 @@ class ThrusterGain(Effect):
 
     name: ClassVar[str] = "thruster_gain"
     family: ClassVar = "actuation"
-    parameters: ClassVar = (Parameter("gain", "1", (-0.05,), -2.3, 0.6),)
+    parameters: ClassVar = (Parameter("gain", "1", (-0.05,), -2.3, 3.0),)
     places: ClassVar = THRUSTERS
     order: ClassVar[int] = 13
     source: ClassVar[str] = "5 to 100 %: worn, fouled or wrongly wired propellers"
@@ -107,7 +107,7 @@ class ThrustScale(Effect):
 
     name: ClassVar[str] = "thrust_scale"
     family: ClassVar = "actuation"
-    parameters: ClassVar = (Parameter("scale", "1", (0.03,), -0.8, 1.0),)
+    parameters: ClassVar = (Parameter("scale", "1", (0.03,), -0.8, 4.0),)
     order: ClassVar[int] = 14
     source: ClassVar[str] = "bollard thrust of equal thrusters scatters by 10 to 20 %"
 

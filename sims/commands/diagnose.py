@@ -24,6 +24,9 @@ class Diagnose:
     """Preset name or YAML file; by default what the data name."""
     model: Path | None = None
     """Model file (.spinn) to believe instead of the preset."""
+    diffusion: tuple[float, float, float, float, float, float] | None = None
+    """Disturbance that is believed with a preset: b of surge, sway, heave (N√s), roll, pitch, yaw
+    (N·m√s). Without it a level other than believed can't be told."""
     alpha: float = 0.01
     """Rate of false alarms over all names together."""
     refit: Literal["none", "scales", "linear"] = "none"
@@ -34,6 +37,8 @@ class Diagnose:
     def run(self) -> None:
         """Load, diagnose, write."""
         import json
+
+        import numpy as np
 
         from ...models.checkpoint import load_model, save_model
         from ...models.vehicle import load_vehicle
@@ -49,6 +54,12 @@ class Diagnose:
             recording = load_data(self.data, vehicle=self.vehicle, progress=update)
         base = None if self.model is None else load_model(self.model, dtype=float)[0]
         vehicle = load_vehicle(self.vehicle or recording.vehicle or "bluerov2_heavy")
+        if self.diffusion is not None:
+            if base is not None:
+                raise UserError("--diffusion: the model of --model has its own; leave one out")
+            if min(self.diffusion) < 0:
+                raise UserError("--diffusion: give six numbers of at least 0")
+            base = vehicle.dynamics(np.array(self.diffusion))
         with progress_bar("diagnosing") as update:
             finding = diagnose(recording, vehicle, base, config, update)
         finding.diagnosis.save(self.out / "diagnosis.json")

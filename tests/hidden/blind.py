@@ -88,7 +88,7 @@ AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 SAID = {
     "stuck": "stuck",
     "lost_lock": "stuck",
-    "gap": "lost samples",
+    "gap": "missing",
     "clock_jump": "clock",
     "pose_jump": "jumps",
     "outliers": "outliers",

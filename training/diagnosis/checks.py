@@ -3,6 +3,7 @@
 import numpy as np
 
 from ...models.effects.base import AXES
+from ...models.kinematics import spikes
 from ...models.recording import Recording
 from .data import Data
 
@@ -17,15 +18,17 @@ _CHANNELS = {
 
 
 def problems(recording: Recording) -> tuple[list[str], list[int]]:
-    """Sensors that stand still, jumps of the pose, stretches without samples.
+    """Sensors that stand still, jumps of the pose, outliers, stretches without samples.
 
     One sentence each, and the runs (by number, scenario by scenario) that have them. A channel is
     stuck where it repeats one value exactly for longer than half a second while others change; it
     is no fault if it does so in every run and is part of the pose (a vehicle held in place).
-    Samples on a straight line in all velocities were filled in: a gap or a jump of the clock.
+    Samples on a straight line in all velocities were filled in: a gap or a jump of the clock. An
+    outlier is a single velocity far from both its neighbours, which agree: no blow is that short.
     """
     stuck: dict[str, list[int]] = {}
     jumps: list[int] = []
+    spiked: list[int] = []
     filled: list[int] = []
     longest, count = 0.0, 0
     for number, run in enumerate(recording.trajectories()):
@@ -40,6 +43,8 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
         excess = np.abs(moved - speed)
         if np.nansum(excess > 30 * np.nanmedian(excess) + 0.1):
             jumps.append(number)
+        if spikes(run.V_WB_B.T).any():
+            spiked.append(number)
         bend = np.abs(np.diff(run.V_WB_B, 2, axis=0)).max(axis=1, initial=0.0)
         line = _longest(bend < 1e-7 * np.nanstd(run.V_WB_B))
         if line >= _FILLED:
@@ -57,7 +62,13 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
             f"samples were filled in on a straight line, for up to {longest:.2g} s, in "
             f"{len(filled)} runs: lost samples or a jump of the clock"
         )
-    return found, sorted({*jumps, *filled, *(n for runs in stuck.values() for n in runs)})
+    if spiked:
+        found.append(
+            f"single velocities lie far from both their neighbours in {len(spiked)} runs: outliers"
+        )
+    found += [f"samples are missing: {note}" for note in recording.notes if "cut at" in note]
+    bad = {*jumps, *filled, *spiked, *(n for runs in stuck.values() for n in runs)}
+    return found, sorted(bad)
 
 
 def _longest(holds: np.ndarray) -> int:

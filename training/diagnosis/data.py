@@ -18,6 +18,7 @@ SEGMENT = 256
 _BLOCKS, _LEAST = 8, 16
 """Pieces that a single run is cut into at least, and samples of a piece at least."""
 _MOST_FOLDS = 10
+_FEW_RUNS = 6
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,12 @@ class Data:
 
     @property
     def cluster(self) -> Int[np.ndarray, " R"]:
-        """Within which pieces may depend on each other: runs, or the blocks of a single run."""
-        return np.arange(len(self.run)) if self.left_out == "block" else self.run
+        """Within which pieces may depend on each other: runs; of a few long runs their pieces.
+
+        A test between clusters needs more of them than a handful.
+        """
+        few = len(np.unique(self.run)) < _FEW_RUNS
+        return np.arange(len(self.run)) if few else self.run
 
     @property
     def steps(self) -> int:

@@ -24,7 +24,7 @@ from .hypotheses import Fit
 from .laws import Law
 from .looking import Bench, Look
 from .naming import Hypothesis
-from .search import Found, Search, laws_of, refitted
+from .search import RIVALS, Found, Search, laws_of, refitted
 from .unknowns import accept, seek, structure
 from .waves import all_laws, is_apart
 
@@ -194,7 +194,7 @@ class Diagnoser:
     ) -> tuple[Bench, list[int], dict[Hypothesis, result.Structure]]:
         """Names, structure without a name, and names beside it; it widens the library by an effect.
 
-        Where a law of the disturbance wins more than any name, structure is looked for first.
+        Where a law of the disturbance wins far more than any name, structure is looked for first.
         """
         config, structures = self.config, {}
         search = self._names(bench, nuisance, 0.1, 0.5)
@@ -202,7 +202,7 @@ class Diagnoser:
         found.fits = found.left
         best = 0.0 if choice is None else choice.fit.heldout_gain
         law = laws_of(bench, found.first)[0].heldout_gain
-        if law < max(best, found.threshold + _LAW_MARGIN):
+        if RIVALS * law < max(best, found.threshold + _LAW_MARGIN):
             search.run(found)
         for number in range(_MOST_UNKNOWN):
             self.progress(0.52 + 0.1 * number, "structure without a name")
@@ -248,7 +248,8 @@ class Diagnoser:
         judged = {}
         for number, (name, contender) in enumerate(contenders.items()):
             self.progress(0.84 + 0.04 * number, f"gain: {name.replace('_', ' ')}")
-            judged[name] = judge(bench, contender, horizon, seed)
+            in_use = [] if contender.box is not None else [*belief, *rows]
+            judged[name] = judge(bench, contender, horizon, seed, in_use)
         return {
             name: told(j, judged["base"], bench, horizon, np.random.default_rng(seed))
             for name, j in judged.items()

@@ -4,6 +4,7 @@ Every number of a model (parameters, diffusion, measurement noise) is fitted wit
 that it is judged on; of one scenario runs are left out in turn, of one run blocks.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -57,8 +58,14 @@ class Judged(NamedTuple):
     count: Float[np.ndarray, "h F"]
 
 
-def judge(bench: Bench, contender: Contender, horizon: float, seed: int) -> Judged:
-    """Score a model's innovations, and simulate it over `horizon` s from recorded states."""
+def judge(
+    bench: Bench, contender: Contender, horizon: float, seed: int, in_use: Sequence[int]
+) -> Judged:
+    """Score a model's innovations, and simulate it over `horizon` s from recorded states.
+
+    Effects that own none of the parameters `in_use` are left out of the simulations; contenders
+    with the same ones share a compiled program.
+    """
     data, theta = bench.data, contender.theta
     p = predict(bench.model, bench.library, theta, data)
     error, jacobian = np.asarray(p.error), np.asarray(p.jacobian)
@@ -83,7 +90,9 @@ def judge(bench: Bench, contender: Contender, horizon: float, seed: int) -> Judg
         score[own] -= 6 * np.log(2 * np.pi) * weight.sum(axis=0)
     kept = _spread(data.fold, _PIECES)
     levels = record[:, kept], diffusion[:, kept]
-    return _simulated(bench, contender, levels, kept, horizon, seed, score + contender.won)
+    kinds = {bench.library.entries[i][:2] for i in in_use}
+    kinds |= {bench.library.entries[i][:2] for i in np.flatnonzero(np.any(theta != 0, axis=1))}
+    return _simulated(bench, contender, levels, kept, horizon, seed, score + contender.won, kinds)
 
 
 def _spread(fold: np.ndarray, most: int) -> np.ndarray:
@@ -105,6 +114,7 @@ def _simulated(
     horizon: float,
     seed: int,
     score: np.ndarray,
+    kinds: set[tuple[str, str]],
 ) -> Judged:
     data = bench.data
     X, V, u, voltage = as_arrays(data)
@@ -112,9 +122,7 @@ def _simulated(
     theta = contender.theta[:, kept]
     every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))
     effects = bench.library.filled(jnp.asarray(theta)[:, None])
-    used = tuple(
-        e for e in effects if bool(np.any(np.asarray(e.values) != 0))
-    )  # others would only cost time
+    used = tuple(e for e in effects if any((e.name, where) in kinds for where in e.places))
     box = contender.box
     if box is not None:
         box = eqx.tree_at(lambda b: b.weights, box, box.weights[..., kept])

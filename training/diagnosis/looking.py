@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jaxtyping import Float
 
 from ...models.dynamics import Dynamics
@@ -24,6 +25,14 @@ from .responses import respond
 
 _RANDOM = ("waves", "current_varying")
 """Causes that are sought as laws: their motion differs from run to run."""
+
+
+_HALVINGS = 4
+"""Steps that may fail before a fit ends."""
+_WORSE = 20.0
+"""Nats by which one-step errors may become less likely: the filter weighs them otherwise."""
+_LIGHTEST = 0.1
+"""Share of the believed mass along any direction below which a step is too long."""
 
 
 class Look(NamedTuple):
@@ -98,6 +107,8 @@ class Bench:
         """Predictions with the noise and the filter that they ask for."""
         p = predict(self.model, self.library, theta, self.data)
         error, weight = np.asarray(p.error), self.data.weight
+        if not np.isfinite(error[:, :, weight.any(axis=0)]).all():
+            raise FloatingPointError("predictions diverge")
         A = mean_jacobian(np.asarray(p.jacobian), weight)
         mass = self.mass(theta)
         noise = estimate(error, weight, A, mass, self.data.dt)
@@ -132,10 +143,13 @@ class Bench:
         chosen: Sequence[int],
         kalman: Filter | None = None,
         rounds: int = 4,
+        origin: Look | None = None,
     ) -> tuple[np.ndarray, Look, Fit]:
         """Gauss–Newton on the parameters chosen, with exact predictions at every step.
 
-        The fit returned is at the θ returned: its errors are joint, clustered by run.
+        A step that makes one-step errors clearly larger is halved; so is the way to the start from
+        `origin`, if one is given. The fit returned is at the θ returned: its errors are joint,
+        clustered by run.
         """
         chosen = list(chosen)
         low = np.array([self.library.entries[i].parameter.low for i in chosen])
@@ -143,17 +157,57 @@ class Bench:
         theta = theta.copy()
         theta[chosen] = np.clip(theta[chosen], low, high)
         best: tuple[np.ndarray, Look, Fit] | None = None
-        for _ in range(rounds):
-            seen = self.look(theta, chosen, kalman)
+        back = self.believed if origin is None else origin.theta
+        bar = np.inf if origin is None else self._merit(origin)
+        done = failed = 0
+        while done < rounds and failed < _HALVINGS:
+            seen = self._seen(theta, chosen, kalman)
+            if seen is None or not self._merit(seen) <= bar + _WORSE:
+                # a step too far: back towards what was good
+                theta = (theta + (back if best is None else best[0])) / 2
+                failed += 1
+                continue
             fit = seen.evidence.fit(chosen)
-            if best is not None and kalman is not None and seen.loss > best[1].loss:
-                break
-            best = theta.copy(), seen, fit
-            theta[chosen] = np.clip(theta[chosen] + fit.values, low, high)
+            best, bar = (theta.copy(), seen, fit), self._merit(seen)
+            done += 1
+            theta[chosen] = self._stepped(theta, chosen, fit.values, low, high)
             if np.all(np.abs(fit.values) < 0.15 * fit.errors + 1e-12):
                 break
-        assert best is not None
+        if best is None:
+            seen = self.look(back, chosen, kalman)
+            best = back.copy(), seen, seen.evidence.fit(chosen)
         return best
+
+    def _seen(self, theta: np.ndarray, chosen: list[int], kalman: Filter | None) -> Look | None:
+        """A look, or None where predictions diverge."""
+        try:
+            return self.look(theta, chosen, kalman)
+        except (FloatingPointError, np.linalg.LinAlgError):
+            return None
+
+    def _merit(self, seen: Look) -> float:
+        """Minus the log likelihood of one-step errors under a covariance of their own.
+
+        It asks for no filter, whose noise levels change with what is fitted.
+        """
+        w = self.data.weight
+        e = np.asarray(seen.predictions.error) * w[:, None]
+        C = np.einsum("nir,njr->ij", e, e) / w.sum()
+        return float(w.sum() * np.linalg.slogdet(C)[1] / 2)
+
+    def _stepped(
+        self, theta: np.ndarray, chosen: list[int], step: np.ndarray, low: np.ndarray,
+        high: np.ndarray,
+    ) -> Float[np.ndarray, " k"]:  # fmt: skip
+        """θ after a step, halved until the mass matrix keeps a share of the believed one."""
+        believed = self.mass(self.believed)
+        moved, share = theta.copy(), 1.0
+        while True:
+            moved[chosen] = np.clip(theta[chosen] + share * step, low, high)
+            least = scipy.linalg.eigh(self.mass(moved), believed, eigvals_only=True)[0]
+            if least > _LIGHTEST or share < 1e-3:
+                return moved[chosen] if least > 0 else theta[chosen]
+            share /= 2
 
     def without_each(self, look: Look, chosen: Sequence[int]) -> Float[np.ndarray, "p R"]:
         """θ of each piece, the parameters chosen refitted without the pieces it is left out with.

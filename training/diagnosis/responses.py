@@ -17,7 +17,7 @@ from .data import Data
 from .innovations import Arrays, Predictions, as_arrays, settle
 from .noise import Filter
 
-LANES = 28
+LANES, FEW = 28, 8
 """Probes that one call of the compiled program runs side by side, besides the base."""
 
 
@@ -79,8 +79,8 @@ def respond(
     """Whitened innovations at `theta`, then the changes that each row of `probes` makes in them.
 
     Rows of `probes` are differences from `theta`. Those of instruments go through one compiled
-    program, all others through another one, `LANES` at a time: reading instruments costs several
-    times what a wrench costs.
+    program, all others through another one, `LANES` (or `FEW`) at a time: reading instruments costs
+    several times what a wrench costs.
     """
     arrays = as_arrays(data)
     filters = (jnp.asarray(kalman.keep), jnp.asarray(kalman.whiten), jnp.asarray(data.weight))
@@ -91,7 +91,7 @@ def respond(
     done = 0
     for instruments in (False, True):
         rows = np.flatnonzero(of_instruments == instruments)
-        size = LANES if len(rows) > LANES // 2 or not instruments else LANES // 2
+        size = LANES if len(rows) > FEW else FEW
         for first in range(0, len(rows), size):
             some = rows[first : first + size]
             chunk = np.zeros((size + 1, library.size))

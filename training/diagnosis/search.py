@@ -18,6 +18,8 @@ BELIEFS = ("added_mass", "linear_drag", "quadratic_drag", "net_buoyancy")
 REFITS = {"none": (), "scales": ("thrust_scale",), "linear": BELIEFS}
 _TIMES = ("thruster_lag", "actuation_delay", "clock_offset")
 _CLOSE = 0.7
+RIVALS = 0.25
+"""Share of what the best law wins on data left out that no imitation of random structure wins."""
 _OF_A_LAW = 0.02
 """Share of what the best law wins that a name must win where the law wins more."""
 
@@ -133,7 +135,7 @@ class Search:
             fits |= self._single_thrusters(current, beside, taken)
             choice = chosen(False, 0.0)
         law = laws_of(bench, current)[0].heldout_gain
-        if choice is not None and law > choice.fit.heldout_gain:
+        if choice is not None and RIVALS * law > choice.fit.heldout_gain:
             # random structure is imitated by names: they must hold between runs by themselves
             choice = chosen(True, _OF_A_LAW * law)
         return choice, fits
@@ -170,7 +172,8 @@ class Search:
 
         def fitted(h: Hypothesis, kalman: Filter | None) -> tuple[np.ndarray, Look]:
             chosen = [*library.at(*h), *beside]
-            return bench.polish(self._start(fits[h], found.current.theta), chosen, kalman)[:2]
+            start = self._start(fits[h], found.current.theta)
+            return bench.polish(start, chosen, kalman, origin=found.current)[:2]
 
         top = choice.hypothesis
         theta, seen = fitted(top, None)

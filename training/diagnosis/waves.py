@@ -26,7 +26,8 @@ def all_laws(bench: Bench, look: Look, least: float) -> list[Law]:
     coloured = {law.where: law.heldout_gain for law in found if law.name == "disturbance_colour"}
     if max(coloured.values()) > least:
         waves = find_waves(bench, look)
-        if waves.heldout_gain > sum(gain for gain in coloured.values() if gain > 0):
+        # turning follows from swell in ways of its own: pushes decide
+        if waves.heldout_gain > sum(max(coloured[axis], 0.0) for axis in AXES[:3]):
             found.append(waves)
     found += find_levels(bench, look)
     return sorted(found, key=lambda law: -law.heldout_gain)

@@ -35,6 +35,11 @@ TINY = TrainingConfig(
 )
 
 
+COMMANDS = (
+    "import", "generate", "train", "evaluate", "run", "diagnose", "check", "study", "demo",
+)  # fmt: skip
+
+
 def called(*arguments):
     """Exit code of the command; None is success."""
     try:
@@ -60,11 +65,11 @@ def generated(tmp_path_factory):
 def test_help_names_every_command(capsys):
     assert called("--help") == 0
     told = capsys.readouterr().out
-    for command in ("import", "generate", "train", "evaluate", "run", "demo"):
+    for command in COMMANDS:
         assert re.search(rf"\b{command}\b", told)
 
 
-@pytest.mark.parametrize("command", ["import", "generate", "train", "evaluate", "run", "demo"])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_option_is_explained(command, capsys):
     assert called(command, "--help") == 0
     told = capsys.readouterr().out

@@ -16,7 +16,8 @@ from spinndrift.training.diagnosis.hypotheses import Fit
 from spinndrift.training.diagnosis.innovations import predict
 from spinndrift.training.diagnosis.laws import find_laws
 from spinndrift.training.diagnosis.naming import admissible, choose
-from spinndrift.training.diagnosis.noise import Noise, make_filter
+from spinndrift.training.diagnosis.noise import Noise, filtered, make_filter
+from spinndrift.training.diagnosis.responses import respond
 from spinndrift.training.diagnosis.result import Diagnosis, schema
 
 VEHICLE = load_vehicle("bluerov2_heavy")
@@ -87,6 +88,28 @@ def test_noise_is_found_and_innovations_are_white_on_a_null(null):
         acf = (z[1:] * z[:-1]).mean(axis=(0, 2)) / (z**2).mean(axis=(0, 2))
         assert np.abs(acf).max() * n < 6
         assert diagnoser.data.steps == 20 * 120
+
+
+def test_responses_of_instruments_are_derivatives_of_the_innovations(null):
+    """Also where instruments are at fault already: records differ as they show states."""
+    bench = null[0][0]
+    library = bench.library
+    rows = [library.index("heading_error", "all", "sine")]
+    rows += [library.index("dvl_misalignment", "yaw", "angle")]
+    theta = bench.believed.copy()
+    theta[rows] = 0.06, 0.04
+    p, _, kalman = bench.predict(theta)
+    probes = np.zeros((2, library.size))
+    probes[[0, 1], rows] = 0.002
+    z = respond(bench.model, library, theta, probes, bench.data, p, kalman)
+    before = filtered(np.asarray(p.error), np.asarray(p.jacobian), kalman)
+    for response, probe in zip(z[1:], probes, strict=True):
+        q = predict(bench.model, library, theta + probe, bench.data)
+        after = filtered(np.asarray(q.error), np.asarray(q.jacobian), kalman)
+        change = (after - before) * bench.data.weight[:, None]
+        off = response.reshape(change.shape) - change
+        # what is left out is of the order of both angles together
+        assert np.sum(off**2) < (0.06 + 0.04) ** 2 * np.sum(change**2)
 
 
 def test_nulls_are_adequate(null):

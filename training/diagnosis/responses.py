@@ -25,6 +25,7 @@ LANES, FEW = 28, 8
 def _respond(
     model: Extended,
     effects: Any,
+    believed: Any,
     predictions: Predictions,
     arrays: Arrays,
     filters: tuple[Array, Array, Array],
@@ -34,6 +35,7 @@ def _respond(
 ) -> Float[Array, "N 12 L R"]:
     """Whitened innovations of lane 0 (the base) and changes of them in the other lanes."""
     (X, V, u, voltage), (keep, whiten, weight) = arrays, filters
+    base = model.with_effects(believed)
     model = model.with_effects(effects)
     inertia = model.inertia()
 
@@ -45,7 +47,8 @@ def _respond(
         if instruments:
             seen = model.observe(p.X[:, None], p.V[:, None], p.rate[:, None])
             direct = _apart(seen)
-            moved = kept - _apart((x, v))
+            # states that differ, as the base's instruments show them: ν is of records
+            moved = kept - _apart(base.observe(x, v, rate[:, None]))
         else:
             middle_V = (v + p.V[:, None]) / 2
             middle_X = se3.retract(x, dt / 4 * (v + middle_V))
@@ -97,9 +100,18 @@ def respond(
             chunk = np.zeros((size + 1, library.size))
             chunk[1 : 1 + len(some)] = probes[some]
             effects = _values(library, theta, chunk, instruments)
+            believed = library.filled(jnp.asarray(theta[:, None, None]))
             z = np.asarray(
                 _respond(
-                    model, effects, predictions, arrays, filters, data.dt, size + 1, instruments
+                    model,
+                    effects,
+                    believed,
+                    predictions,
+                    arrays,
+                    filters,
+                    data.dt,
+                    size + 1,
+                    instruments,
                 )
             )
             found[1 + some] = np.moveaxis(z[:, :, 1 : 1 + len(some)], 2, 0).reshape(

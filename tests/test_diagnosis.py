@@ -19,6 +19,7 @@ from spinndrift.training.diagnosis.naming import admissible, choose
 from spinndrift.training.diagnosis.noise import Noise, filtered, make_filter
 from spinndrift.training.diagnosis.responses import respond
 from spinndrift.training.diagnosis.result import Diagnosis, schema
+from spinndrift.training.diagnosis.search import Found, Search
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(runs=2, seconds=6.0)
@@ -347,3 +348,14 @@ def _read(folder, runs):
 
     write_folder(folder, runs)
     return read_csv(folder)
+
+
+def test_a_name_nested_in_another_keeps_the_data(tmp_path):
+    """A tether can push up as buoyancy does, with six numbers more: the simple name is given."""
+    _, recording = recorded(tmp_path, 12, names=("net_buoyancy",))
+    bench = Diagnoser(recording, VEHICLE).bench
+    look = bench.look(bench.believed)
+    found = Found(look, look, look)
+    search = Search(bench, [], 0.01, 1, np.random.default_rng(0), lambda fraction, remark: None)
+    assert search.run(found).hypotheses == [("net_buoyancy", "all")]
+    assert ("tether", "W") in [h for h, _ in found.accepted[0][0].rivals]

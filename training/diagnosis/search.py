@@ -10,7 +10,7 @@ from ...models.effects.library import Library, kind
 from .hypotheses import Fit
 from .laws import Law, find_laws, run_constants
 from .looking import Bench, Look
-from .naming import Choice, Hypothesis, admissible, choose, parameters_of
+from .naming import Choice, Hypothesis, admissible, choose, margin, parameters_of
 from .noise import Filter
 
 BELIEFS = ("added_mass", "linear_drag", "quadratic_drag", "net_buoyancy")
@@ -187,7 +187,12 @@ class Search:
                 continue
             other, rival = fitted(h, seen.kalman)
             within = admissible(library, np.zeros_like(other), _as_fit(library, h, other))
-            if within and rival.loss < best.loss - (2.0 if best.loss == start_loss else 0.0):
+            # what is nested in a name keeps it unless clearly beaten; more numbers must pay
+            least = 2.0 if best.loss == start_loss else 0.0
+            least += max(len(library.at(*h)) - len(library.at(*top)), 0)
+            if top[0] in kind(h[0]).simpler:
+                least = margin(choice.fit.heldout_gain)
+            if within and rival.loss < best.loss - least:
                 top, theta, best = h, other, rival
         if top == choice.hypothesis:
             return choice, theta

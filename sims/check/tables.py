@@ -84,7 +84,7 @@ def _summary(rows: Sequence[Row]) -> Table:
         lines.append(("and no other name beside them", share(alone, len(true))))
         placed = [r["place_right"] for r in true if r["place_right"] is not None]
         lines.append(("place right, of those", share(sum(placed), len(placed))))
-    z = np.abs([z for r in rows for z in r["z"].values()])
+    z = np.abs([z for r in rows for z in r["z"].values() if z == z])
     if len(z):
         lines.append(
             (f"parameters within {CLOSE:g} standard errors", share(int(sum(z <= CLOSE)), len(z)))

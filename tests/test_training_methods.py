@@ -68,6 +68,7 @@ def small(name):
         steps=6,
         batch=GROUPS * RUNS,
         learning_rate=3e-2,
+        head_decay=30.0,
         warm_up=0,
         refit_at=(),
         max_recoveries=2,

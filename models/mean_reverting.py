@@ -33,9 +33,9 @@ class MeanReverting(eqx.Module):
 
     def std(self, scale: Float[Array, "6"]) -> Float[Array, "6"]:
         """σ (N, N·m) for the diffusion's scale (N√s, N·m√s)."""
-        return jax.lax.stop_gradient(scale) * self.white(1.0) / jnp.sqrt(2 * self.time_constant)
+        return self.white(jax.lax.stop_gradient(scale)) / jnp.sqrt(2 * self.time_constant)
 
-    def white(self, scale: Float[Array, "6"] | float) -> Float[Array, "6"]:
+    def white(self, scale: Float[Array, "6"]) -> Float[Array, "6"]:
         """σ √(2τ): the b of the white noise that moves as far over times much longer than τ."""
         return scale * jnp.exp(self.log_ratio)
 

@@ -1,6 +1,6 @@
 """A whole diagram in one compiled loop, for simulations at many times real time."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, RandomSource
 
 from .jit import VectorFunction
-from .network import Network, Port, Ports, changed_by, simultaneous
+from .network import Network, Port, Ports, changed_by, places, simultaneous
 
 _STEPS = 32  # of one call
 _DRAWN = 500  # periods of noise at once
@@ -40,7 +40,9 @@ class CompiledSimulator:
         """
         self._drake = Simulator(diagram)
         self._context = self._drake.get_mutable_context()
-        self._network = Network.of(diagram, log_periods or {})
+        self._network = network = Network.of(diagram, log_periods or {})
+        self._drawn: list[Port] = [(source, 0) for source, _ in network.noise]
+        self._columns, self._logged = places(port for _, port, _ in network.logs)
         self._schedule = _Schedule(self._network)
         self._noise: list[_Noise] = []
         self._state: Float[np.ndarray, " n"] | None = None
@@ -62,12 +64,11 @@ class CompiledSimulator:
             state = system.GetMyContextFromRoot(root).get_discrete_state(group)
             self._state[part] = state.value()
         self._constants = np.zeros(self._sizes[1])
-        at = 0
-        for source, index in network.constants:
+        for (source, index), part in zip(
+            network.constants, places(network.constants)[0], strict=True
+        ):
             port: Any = source.get_output_port(index)
-            value = port.Eval(source.GetMyContextFromRoot(root))
-            self._constants[at : at + value.size] = value
-            at += value.size
+            self._constants[part] = port.Eval(source.GetMyContextFromRoot(root))
         self._schedule.start(root.get_time())
         self._noise = [_Noise(source, period, root) for source, period in network.noise]
 
@@ -83,12 +84,11 @@ class CompiledSimulator:
         assert self._state is not None
         size, state = self._state.size, self._state
         for block in self._schedule.blocks(boundary_time):
-            noise = np.zeros((_STEPS, self._sizes[5] // _STEPS))
-            at = 0
-            for source in self._noise:
-                rows = source.rows(block.ticks[:, self._schedule.periods.index(source.period)])
-                noise[:, at : at + rows.shape[1]] = rows
-                at += rows.shape[1]
+            drawn = [
+                source.rows(block.ticks[:, self._schedule.periods.index(source.period)])
+                for source in self._noise
+            ]
+            noise = np.concatenate([np.zeros((_STEPS, 0)), *drawn], axis=1)
             count = np.array([float(block.count)])
             result = self._loop.flat(
                 state, self._constants, count, block.times, block.ticks.ravel(), noise.ravel()
@@ -126,50 +126,30 @@ class CompiledSimulator:
         """Sizes of the loop's inputs: state, constants, count, times, ticks, noise."""
         network = self._network
         state = network.groups[-1][1].stop if network.groups else 0
-        constants = sum(source.get_output_port(i).size() for source, i in network.constants)
-        noise = sum(source.get_output_port(0).size() for source, _ in network.noise)
+        constants, noise = (places(ports)[1] for ports in (network.constants, self._drawn))
         width = self._schedule.width
         return [state, constants, 1, _STEPS, _STEPS * width, _STEPS * noise]
 
     @cached_property
-    def _columns(self) -> list[slice]:
-        """Where in a row of what is logged each log's values are."""
-        found, at = [], 0
-        for _, (source, index), _ in self._network.logs:
-            size = source.get_output_port(index).size()
-            found.append(slice(at, at + size))
-            at += size
-        return found
-
-    @cached_property
     def _loop(self) -> VectorFunction:
-        logged = self._columns[-1].stop if self._columns else 0
-        return VectorFunction(self._run, self._sizes, [self._sizes[0], _STEPS * logged], keep=True)
+        results = [self._sizes[0], _STEPS * self._logged]
+        return VectorFunction(self._run, self._sizes, results, keep=True)
 
     def _run(
         self, state: Array, constants: Array, count: Array, times: Array, ticks: Array, noise: Array
     ) -> tuple[Array, Array]:
         """Some steps of the diagram: the state after them, and what the logs saw before each."""
-        network = self._network
+        network, logged = self._network, self._logged
         ticks, noise = ticks.reshape(_STEPS, -1), noise.reshape(_STEPS, -1)
-        noise_ports: list[Port] = [(source, 0) for source, _ in network.noise]
-        logged = self._columns[-1].stop if self._columns else 0
 
-        def known(drawn: Array) -> dict[Port, Array]:
-            found, at = {}, 0
-            for ports, values in ((network.constants, constants), (noise_ports, drawn)):
-                at = 0
-                for system, index in ports:
-                    size = system.get_output_port(index).size()
-                    found[system, index] = values[at : at + size]
-                    at += size
-            return found
+        def by_port(ports: Sequence[Port], values: Array) -> dict[Port, Array]:
+            return {p: values[part] for p, part in zip(ports, places(ports)[0], strict=True)}
 
         def step(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
             flat, seen = carry
             t, due = times[i], ticks[i]
             old = {name: flat[part] for name, part in network.groups}
-            given = known(noise[i])
+            given = by_port(network.constants, constants) | by_port(self._drawn, noise[i])
 
             def ports() -> Ports:
                 return Ports(network, old, given)

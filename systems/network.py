@@ -1,6 +1,6 @@
 """A diagram as a flat network of systems that tell what they compute."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -94,6 +94,16 @@ class Network:
     def by_system(self) -> Mapping[System, Leaf]:
         """The leaves by their systems."""
         return {leaf.system: leaf for leaf in self.leaves}
+
+
+def places(ports: Iterable[Port]) -> tuple[list[slice], int]:
+    """Where the values of output ports lie, one after the other, and how long they are in all."""
+    found, at = [], 0
+    for system, index in ports:
+        size = system.get_output_port(index).size()
+        found.append(slice(at, at + size))
+        at += size
+    return found, at
 
 
 class Ports:

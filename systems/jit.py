@@ -3,7 +3,8 @@
 import hashlib
 from collections import deque
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, cached_property
 from itertools import accumulate, pairwise
 from typing import Any
 from weakref import WeakValueDictionary
@@ -13,24 +14,64 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-_INLINE = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
-"""Runs a program's kernels one after the other: small ones cost less than handing them to threads
-(54 µs to 14 µs for one call of the impedance law)."""
+_INLINE = {
+    "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
+    "xla_cpu_multi_thread_eigen": False,
+}
+"""Runs a program's kernels one after the other in the thread that calls: small ones cost less than
+handing them to threads (54 µs to 14 µs for one call of the impedance law)."""
 
 
-class _Program:
-    """Compiled code, which every function of the same text shares."""
+class Program:
+    """Compiled code, which all functions of the same text share while one of them lives."""
 
     def __init__(self, lowered: Any):
+        """Compile what `jax.jit(…).lower(…)` gave; `compiled` shares."""
         try:
-            self.call = lowered.compile(_INLINE)
-        except jax.errors.JaxRuntimeError:  # another version's compiler without this option
+            self.call: Callable[..., Any] = lowered.compile(_INLINE)
+        except jax.errors.JaxRuntimeError:  # another version's compiler without these options
             self.call = lowered.compile()
 
 
-_PROGRAMS: WeakValueDictionary[bytes, _Program] = WeakValueDictionary()
-_RECENT: deque[_Program] = deque(maxlen=8)
+_PROGRAMS: WeakValueDictionary[bytes, Program] = WeakValueDictionary()
+_RECENT: deque[Program] = deque(maxlen=8)
 """Programs that live on for another of the same text, though nothing has them any more."""
+
+
+def compiled(function: Callable[..., Any], *like: Any, keep: bool = False) -> Program:
+    """`function` compiled for arguments like these (arrays or their shapes), or what is there.
+
+    With `keep` the program outlives those that hold it for a while, for the next equal one.
+    """
+    lowered = jax.jit(function).lower(*like)
+    text = lowered.as_text()  # whole, with all digits of all constants
+    key = hashlib.sha256(text.encode()).digest()
+    program = _PROGRAMS.get(key)
+    if program is None:
+        program = _PROGRAMS[key] = Program(lowered)
+    if keep:
+        _RECENT.append(program)
+    return program
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(thread_name_prefix="spinndrift")
+
+
+def together(programs: Sequence[Program], arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+    """Results of several programs at once, each called with its arguments in a thread of its own.
+
+    A program runs in the thread that calls it and leaves other processors idle; XLA would run
+    independent parts of one program one after the other.
+    """
+
+    def call(program: Program, arguments: tuple[Any, ...]) -> Any:
+        return jax.block_until_ready(program.call(*arguments))
+
+    first, *others = zip(programs, arguments, strict=True)
+    futures = [_threads().submit(call, *other) for other in others]
+    return [call(*first), *(future.result() for future in futures)]
 
 
 class VectorFunction:
@@ -79,17 +120,9 @@ class VectorFunction:
         return jnp.concatenate([result.reshape(-1) for result in results])
 
     @cached_property
-    def _program(self) -> _Program:
+    def _program(self) -> Program:
         size = jax.ShapeDtypeStruct((sum(self._inputs),), np.float64)
-        lowered = jax.jit(self._packed).lower(size)
-        text = lowered.as_text()  # whole, with all digits of all constants
-        key = hashlib.sha256(text.encode()).digest()
-        program = _PROGRAMS.get(key)
-        if program is None:
-            program = _PROGRAMS[key] = _Program(lowered)
-        if self._keep:
-            _RECENT.append(program)
-        return program
+        return compiled(self._packed, size, keep=self._keep)
 
     def flat(self, *parts: Float[np.ndarray, "_"]) -> Float[np.ndarray, "m"]:
         """Call with one array for each input and return all results in one (read-only) array."""

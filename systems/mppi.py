@@ -1,5 +1,8 @@
 """The path integral planner in a diagram."""
 
+from collections.abc import Sequence
+from functools import cached_property
+from itertools import accumulate, pairwise
 from typing import Any
 
 import equinox as eqx
@@ -10,8 +13,8 @@ from jaxtyping import Array, Float, UInt32
 from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from .jit import VectorFunction, value_or_zeros
-from .mppi_core import MppiPlanner, MppiState
+from .jit import Program, compiled, together, value_or_zeros
+from .mppi_core import Draw, MppiPlanner, MppiState, Rolled
 from .plan import Plan
 from .plan_samples import SampleLayout
 
@@ -79,33 +82,70 @@ class Mppi(LeafSystem):
         self.DeclareStateOutputPort("figures", self._figures)
         self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._update)
         sizes = [start.size, self.layout.size, self.samples.size, len(FIGURES)]
-        self._step = VectorFunction(self._call, [1, start.size, 7, 6, 6, 4], sizes)
+        ends = [0, *accumulate(sizes)]
+        self._slices = [slice(a, b) for a, b in pairwise(ends)]
 
-    def _call(self, t: Array, nominal: Array, X: Array, V: Array, bias: Array, noise: Array):
-        planner = self.planner
-        single = planner.V_goal.dtype
-        state = MppiState(nominal.reshape(-1, 6).astype(single))
-        state, out = planner.step(state, key_from_gaussians(noise), X, V, bias)
+    @cached_property
+    def _programs(self) -> tuple[Program, list[Program], Program]:
+        """Draws, rolls out (a program for each part: of equal parts it is one) and chooses."""
+        vector = {n: jax.ShapeDtypeStruct((n,), np.float64) for n in (1, 4, 6, 7)}
+        nominal = jax.ShapeDtypeStruct((6 * self.planner.config.horizon,), np.float64)
+        now = vector[7], vector[6], vector[6]
+        of_draw = nominal, vector[6], vector[4]
+        draw = jax.eval_shape(self._draw, *of_draw)
+        roll = [compiled(self._roll, part, draw.dW, *now) for part in draw.parts]
+        rolled = [jax.eval_shape(self._roll, part, draw.dW, *now) for part in draw.parts]
+        choose = compiled(self._choose, vector[1], draw, rolled, *now)
+        return compiled(self._draw, *of_draw), roll, choose
+
+    def _draw(self, nominal: Array, bias: Array, noise: Array) -> Draw:
+        state = MppiState(nominal.reshape(-1, 6))
+        return self.planner.draw(state, key_from_gaussians(noise), bias)
+
+    def _roll(self, part: Array, dW: Array | None, X: Array, V: Array, bias: Array) -> Rolled:
+        return self.planner.roll(part, dW, X, V, bias)
+
+    def _choose(
+        self, t: Array, draw: Draw, rolled: Sequence[Rolled], X: Array, V: Array, bias: Array
+    ):
+        state, out = self.planner.choose(draw, rolled, X, V, bias)
         wide = jax.tree.map(lambda a: a.astype(t.dtype), out)
-        vector = self.layout.pack(Plan(t[0], wide.X_WB, wide.V_WB_B, wide.F_Bo_B))
+        plan = self.layout.pack(Plan(t[0], wide.X_WB, wide.V_WB_B, wide.F_Bo_B))
         samples = self.samples.pack(t[0], wide.paths, wide.path_weights)
-        return (
-            state.F_Bo_B.ravel().astype(t.dtype),
-            jnp.where(out.valid, vector, 0),
-            jnp.where(out.valid, samples, 0),
-            jnp.stack([getattr(wide, name) for name in FIGURES]),
-        )
+        plan, samples = jnp.where(out.valid, plan, 0), jnp.where(out.valid, samples, 0)
+        figures = jnp.stack([getattr(wide, name) for name in FIGURES])
+        return jnp.concatenate([state.F_Bo_B.ravel().astype(t.dtype), plan, samples, figures])
+
+    def plan(
+        self,
+        t: float,
+        nominal: Float[np.ndarray, " n"],
+        X_WB: Float[np.ndarray, "7"],
+        V_WB_B: Float[np.ndarray, "6"],
+        F_bias_Bo_W: Float[np.ndarray, "6"],
+        noise: Float[np.ndarray, "4"],
+    ) -> list[Float[np.ndarray, "_"]]:
+        """One call at time t (s): the next `nominal`, and the values of the three ports.
+
+        `nominal` holds the wrenches (horizon × 6) that the call before planned from its time on.
+        """
+        draw, roll, choose = self._programs
+        now = X_WB, V_WB_B, F_bias_Bo_W
+        drawn = draw.call(nominal, F_bias_Bo_W, noise)
+        rolled = together(roll, [(part, drawn.dW, *now) for part in drawn.parts])
+        flat = np.asarray(choose.call(np.array([t]), drawn, rolled, *now))
+        return [flat[part] for part in self._slices]
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        nominal, plan, samples, figures = self._step(
-            np.array([context.get_time()]),
+        values = self.plan(
+            context.get_time(),
             context.get_discrete_state(self._nominal).value(),
             self._X.Eval(context),
             self._V.Eval(context),
             value_or_zeros(self._bias, context),
             self._noise.Eval(context),
         )
-        state.set_value(self._nominal, nominal)
-        state.set_value(self._plan, plan)
-        state.set_value(self._samples, samples)
-        state.set_value(self._figures, figures)
+        for group, value in zip(
+            (self._nominal, self._plan, self._samples, self._figures), values, strict=True
+        ):
+            state.set_value(group, value)

@@ -56,6 +56,7 @@ class MppiConfig:
         tracked: the noise paths are held to the plan by the tracking controller's gains, as the
             vehicle will be; false lets them stray over the whole horizon.
         shown_paths: sampled paths in the output for reports.
+        threads: the sequences are rolled out in so many parts, each in a thread of its own.
     """
 
     horizon: int = 80
@@ -85,11 +86,12 @@ class MppiConfig:
     clearance_std: float = 0.08
     tracked: bool = True
     shown_paths: int = 48
+    threads: int = 2
 
     def __post_init__(self) -> None:
         """Check numbers."""
         check_numbers(self)
-        for name in ("horizon", "sequences", "realisations", "shown_paths"):
+        for name in ("horizon", "sequences", "realisations", "shown_paths", "threads"):
             require(getattr(self, name) >= 1, self, name, "give a whole number of 1 or more")
         require(
             self.substeps is None or self.substeps >= 1,
@@ -135,6 +137,7 @@ class MppiConfig:
             "effective_samples",
             "give fewer than `sequences`",
         )
+        require(self.threads <= self.sequences, self, "threads", "give no more than `sequences`")
         require(
             self.collision_risk is None or 0 < self.collision_risk < 1,
             self,

@@ -1,5 +1,6 @@
 """Model predictive path integral control of a vehicle among pylons, as a pure function."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -47,10 +48,26 @@ class MppiOutput(NamedTuple):
     path_weights: Float[Array, " shown"]
 
 
-class _Rollouts(NamedTuple):
+class Draw(NamedTuple):
+    """What a call draws: its sequences in parts, and the noise that all of them meet.
+
+    Attributes:
+        nominal: the last plan, shifted by the time that went by.
+        parts: the sequences, in as many parts as `MppiConfig.threads`.
+        dW: Brownian increments (√s) of the realisations; None for a single one.
+    """
+
+    nominal: Float[Array, "horizon 6"]
+    parts: tuple[Float[Array, "horizon 6 _"], ...]
+    dW: Float[Array, "horizon substeps 6 r"] | None
+
+
+class Rolled(NamedTuple):
+    """What became of n sequences in r realisations; the states are those of the first."""
+
     cost: Float[Array, "r n"]
     clearance: Float[Array, "r n"]
-    kept: tuple[Array, ...]
+    states: tuple[Array, ...]
 
 
 class MppiPlanner(eqx.Module):
@@ -135,37 +152,71 @@ class MppiPlanner(eqx.Module):
         V_WB_B: Float[Array, "6"],
         F_bias_W: Float[Array, "6"] | None = None,
     ) -> tuple[MppiState, MppiOutput]:
-        """Plan from a state; the same arguments give the same plan, bit for bit."""
-        c, dtype = self.config, self.V_goal.dtype
-        X, V = X_WB.astype(dtype), V_WB_B.astype(dtype)
-        bias = jnp.zeros(6, dtype) if F_bias_W is None else F_bias_W.astype(dtype)
-        control_key, noise_key = jax.random.split(key)
-        last = state.F_Bo_B.astype(dtype)
-        nominal = jnp.concatenate([last[c.shift :], jnp.repeat(last[-1:], c.shift, 0)])[: c.horizon]
-        dW = self._process_noise(noise_key)
+        """Plan from a state; the same arguments give the same plan, bit for bit.
 
-        F = self.sample(control_key, nominal, bias)
-        stride = max(1, c.sequences // c.shown_paths)
-        shown = slice(0, stride * min(c.shown_paths, c.sequences), stride)
-        rolled = self._rollouts(X, V, F, bias, dW, lambda X, V: (X[4:, shown],))
-        cost, _ = self.sequence_cost(F, rolled, bias)
+        It draws, rolls out and chooses; who has threads to spare rolls each part out by itself.
+        """
+        bias = jnp.zeros_like(self.V_goal) if F_bias_W is None else F_bias_W
+        draw = self.draw(state, key, bias)
+        whole = jnp.concatenate(draw.parts, axis=2)
+        rolled = self.roll(whole, draw.dW, X_WB, V_WB_B, bias)
+        return self.choose(draw, [rolled], X_WB, V_WB_B, bias)
+
+    def draw(self, state: MppiState, key: Array, F_bias_W: Float[Array, "6"]) -> Draw:
+        """Sequences about the last plan, and the process noise that they all meet."""
+        c = self.config
+        control_key, noise_key = jax.random.split(key)
+        last, bias = self._cast(state.F_Bo_B, F_bias_W)
+        nominal = jnp.concatenate([last[c.shift :], jnp.repeat(last[-1:], c.shift, 0)])[: c.horizon]
+        parts = jnp.array_split(self.sample(control_key, nominal, bias), c.threads, axis=2)
+        return Draw(nominal, tuple(parts), self._process_noise(noise_key))
+
+    def roll(
+        self,
+        F_Bo_B: Float[Array, "horizon 6 n"],
+        dW: Float[Array, "horizon substeps 6 r"] | None,
+        X_WB: Float[Array, "7"],
+        V_WB_B: Float[Array, "6"],
+        F_bias_W: Float[Array, "6"],
+    ) -> Rolled:
+        """Sequences from a state under all noise paths; of the states it keeps positions."""
+        X, V, bias = self._cast(X_WB, V_WB_B, F_bias_W)
+        n = F_Bo_B.shape[2]
+        return self._rollouts(X, V, F_Bo_B, bias, dW, lambda X, V: (X[4:, :n],))
+
+    def choose(
+        self,
+        draw: Draw,
+        rolled: Sequence[Rolled],
+        X_WB: Float[Array, "7"],
+        V_WB_B: Float[Array, "6"],
+        F_bias_W: Float[Array, "6"],
+    ) -> tuple[MppiState, MppiOutput]:
+        """The plan, from what became of each of the parts."""
+        c, dW = self.config, draw.dW
+        X, V, bias = self._cast(X_WB, V_WB_B, F_bias_W)
+        F = jnp.concatenate(draw.parts, axis=2)
+        whole = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-1), *rolled)
+        cost, _ = self.sequence_cost(F, whole, bias)
         weights, temperature = path_integral_weights(cost, c.effective_samples)
 
         mean = self._cut(jnp.sum(F * weights[None, None], axis=2))
         best = F[:, :, jnp.argmin(jnp.where(jnp.isfinite(cost), cost, jnp.inf))]
-        candidates = jnp.stack([mean, best, nominal], axis=2)
+        candidates = jnp.stack([mean, best, draw.nominal], axis=2)
         quiet = None if dW is None else jnp.concatenate([dW, jnp.zeros_like(dW[..., :1])], axis=3)
         tried = self._rollouts(X, V, candidates, bias, quiet, lambda X, V: (X[:, -3:], V[:, -3:]))
         if dW is not None:
-            tried = _Rollouts(tried.cost[:-1], tried.clearance[:-1], tried.kept)
+            tried = Rolled(tried.cost[:-1], tried.clearance[:-1], tried.states)
         candidate_cost, probability = self.sequence_cost(candidates, tried, bias)
         candidate_cost = jnp.where(jnp.isfinite(candidate_cost), candidate_cost, jnp.inf)
         chosen = jnp.argmin(candidate_cost)
         plan = candidates[:, :, chosen]
-        Xs = jnp.concatenate([X[:, None], tried.kept[0][:, :, chosen].T], axis=1)
-        Vs = jnp.concatenate([V[:, None], tried.kept[1][:, :, chosen].T], axis=1)
+        Xs = jnp.concatenate([X[:, None], tried.states[0][:, :, chosen].T], axis=1)
+        Vs = jnp.concatenate([V[:, None], tried.states[1][:, :, chosen].T], axis=1)
         valid = jnp.isfinite(candidate_cost[chosen]) & jnp.all(jnp.isfinite(plan))
         hold = jnp.broadcast_to(self.hold_wrench(jnp.zeros_like(bias))[None], plan.shape)
+        stride = max(1, c.sequences // c.shown_paths)
+        shown = slice(0, stride * min(c.shown_paths, c.sequences), stride)
         output = MppiOutput(
             X_WB=Xs,
             V_WB_B=Vs,
@@ -177,7 +228,7 @@ class MppiPlanner(eqx.Module):
             effective_samples=effective_count(weights),
             temperature=temperature,
             weights=weights,
-            paths=rolled.kept[0],
+            paths=whole.states[0][:, :, shown],
             path_weights=weights[shown],
         )
         return MppiState(jnp.where(valid, plan, hold)), output
@@ -206,7 +257,7 @@ class MppiPlanner(eqx.Module):
     def sequence_cost(
         self,
         F_Bo_B: Float[Array, "horizon 6 n"],
-        rolled: _Rollouts,
+        rolled: Rolled,
         F_bias_W: Float[Array, "6"],
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """Cost of sequences over all their realisations, and their collision probability."""
@@ -252,6 +303,10 @@ class MppiPlanner(eqx.Module):
         pull = K_p @ to_middle + K_d @ ((V[:, second] - V[:, first]) / 2)
         return jnp.concatenate([pull, -pull, jnp.zeros_like(V[:, 2 * half :])], axis=1)
 
+    def _cast(self, *arrays: Array) -> list[Array]:
+        """Arrays in the planner's precision."""
+        return [array.astype(self.V_goal.dtype) for array in arrays]
+
     def _cut(self, F: Array) -> Array:
         """Wrenches (horizon, 6, …) cut to the feasible set."""
         return jnp.moveaxis(self.limits.clip(jnp.moveaxis(F, 1, 0)), 0, 1)
@@ -296,7 +351,7 @@ class MppiPlanner(eqx.Module):
 
         start = (X, V, jnp.zeros_like(V[0]), jnp.full_like(V[0], jnp.inf))
         (_, _, cost, least), kept = jax.lax.scan(advance, start, (F, dW, last))
-        return _Rollouts(cost.reshape(r, n), least.reshape(r, n), kept)
+        return Rolled(cost.reshape(r, n), least.reshape(r, n), kept)
 
 
 def _in_body(X_WB: Array, F_W: Array) -> Array:

@@ -214,7 +214,7 @@ def test_a_tracked_vehicle_may_pass_closer_than_one_left_to_the_noise():
                 at(0.0).astype("f4"), zero, F, zero, dW, lambda X, V: (X[4:],)
             )
         )
-        spreads.append(jnp.var(roll(planner, dW).kept[0][60:, 0], axis=1).mean())
+        spreads.append(jnp.var(roll(planner, dW).states[0][60:, 0], axis=1).mean())
     h, drag = 0.1, 0.5  # x'' + (2w + drag) x' + w² x = (b/m) white noise, in the planner's steps
     A = np.array([[1.0, h], [-h * w**2, 1 - h * (2 * w + drag)]])
     expected = solve_discrete_lyapunov(A, np.diag([0.0, h * (b / 20.0) ** 2]))[0, 0]
@@ -257,6 +257,8 @@ def test_settings_are_checked():
         MppiConfig(sequences=10, effective_samples=10.0)
     with pytest.raises(UserError, match="collision_risk"):
         MppiConfig(collision_risk=1.0)
+    with pytest.raises(UserError, match="threads"):
+        MppiConfig(sequences=20, threads=21)
     with pytest.raises(UserError, match="noise"):
         MppiConfig(noise=(0.1, -0.1, 0.1, 0.1, 0.1, 0.1))
 
@@ -301,6 +303,31 @@ def test_the_system_plans_from_its_ports_and_repeats_itself():
     assert samples.p_WB.shape == (40, 3, 7)
     assert figures["valid"] == 1
     assert figures["effective_samples"] == pytest.approx(12, rel=0.02)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 7])
+def test_threads_change_nothing_but_the_time(threads):
+    """120 sequences in 1, 2 or 7 parts (of 18 and 17) give what one program gives for all."""
+    planner = among(1.5, config=replace(AMONG, threads=threads))
+    noise = np.array([0.3, -1.2, 0.0, 2.5])
+    nominal = planner.init()
+    X, V, bias = np.asarray(at(0.2, 0.1)), np.full(6, 0.05), np.array([3.0, -2.0, 1.0, 0, 0, 0])
+    state, whole = step(planner, nominal, key_from_gaussians(jnp.array(noise)), X, V, bias)
+    system = Mppi(planner)
+    values = system.plan(1.5, np.asarray(nominal.F_Bo_B, float).ravel(), X, V, bias, noise)
+    again = system.plan(1.5, np.asarray(nominal.F_Bo_B, float).ravel(), X, V, bias, noise)
+    for value, same in zip(values, again, strict=True):
+        np.testing.assert_array_equal(value, same)
+    plan = system.layout.unpack(jnp.asarray(values[1]))
+    samples = system.samples.unpack(jnp.asarray(values[2]))
+    assert plan.t0 == samples.t0 == 1.5
+    np.testing.assert_allclose(values[0].reshape(-1, 6), state.F_Bo_B, atol=2e-3)
+    np.testing.assert_allclose(plan.F_Bo_B, whole.F_Bo_B, atol=2e-3)
+    np.testing.assert_allclose(plan.X_WB, whole.X_WB, atol=1e-4)
+    np.testing.assert_allclose(samples.p_WB, whole.paths, atol=1e-4)
+    np.testing.assert_allclose(samples.weights, whole.path_weights, atol=1e-4)
+    figures = [getattr(whole, name) for name in FIGURES]
+    np.testing.assert_allclose(values[3], np.asarray(figures, float), rtol=1e-3, atol=1e-3)
 
 
 def test_config_is_replaceable():

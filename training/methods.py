@@ -101,14 +101,18 @@ METHODS: dict[str, Method] = {
         *_FDM,
         **_SLOW,
     ),
-    "fdm-geodesic+mse": _spinn("the same with a squared error", Fdm("geodesic"), *_FDM),
+    "fdm-geodesic+mse": _spinn(
+        "the same with a squared error", Fdm("geodesic"), *_FDM, **_SLOW
+    ),
     "fdm-chordal": _spinn(
         "finite dimensional matching, chordal kernel",
         Fdm("chordal", mse_weight=0.0),
         *_FDM,
         **_SLOW,
     ),
-    "fdm-chordal+mse": _spinn("the same with a squared error", Fdm("chordal"), *_FDM),
+    "fdm-chordal+mse": _spinn(
+        "the same with a squared error", Fdm("chordal"), *_FDM, **_SLOW
+    ),
     "moments": _spinn(
         "moment matching: group mean and covariance, velocity moments",
         Moments(),
@@ -117,7 +121,7 @@ METHODS: dict[str, Method] = {
         **_SLOW,
     ),
     "moments+mse": _spinn(
-        "the same with a squared error", Moments(mse_weight=0.1), "mse_weight", batch=64
+        "the same with a squared error", Moments(mse_weight=0.1), "mse_weight", batch=64, **_SLOW
     ),
     "pinn": Method(
         "the geometric network without diffusion, by squared error",

@@ -8,8 +8,8 @@ To add one, subclass `Effect`, state `name`, `family`, `parameters`, `places`, a
 hooks at the places of a simulation where it acts::
 
     command (n) → `actuate` (memory: lag, delay) → `thrust` (static, by thruster) → allocation
-    → `wrench` + `inertia` + `flow` (body and water) → `diffusion`, `advance` (noise laws)
-    → `measure` (sensors; `unmeasure` is its inverse)
+    → `together` (wrench of all thrusters) → `wrench` + `inertia` + `flow` (body and water)
+    → `diffusion`, `advance` (noise laws) → `measure` (sensors; `unmeasure` is its inverse)
 
 Arrays are component first as in `models.se3`. `values` may carry batch axes of their own that
 broadcast against the state's (one column a hypothesis), so that one compiled program runs every
@@ -48,6 +48,7 @@ class Parameter:
             For effects with places of unlike units, one tuple of sizes a place.
         low: least admissible value; an estimate below it vetoes the name.
         high: largest admissible value.
+        spread: standard deviation of what is known of it beforehand; 0 stands for very little.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Parameter:
     probes: tuple[float, ...]
     low: float = -math.inf
     high: float = math.inf
+    spread: float = 0.0
 
 
 class Plant(NamedTuple):
@@ -207,6 +209,10 @@ class Effect(eqx.Module):
         """Thruster forces (N) of those wanted; `voltage` relative to the nominal one."""
         del V_CB_B, voltage, plant
         return force
+
+    def together(self, F_Bo_B: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
+        """The wrench of all thrusters (N, N·m), of the one that their forces make."""
+        return F_Bo_B
 
     # ---------------------------------------------------------------------- body and water
 

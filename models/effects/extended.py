@@ -122,6 +122,7 @@ class Extended(Dynamics):
         if self._any("thrust"):
             level = self.thrust(jnp.tensordot(self.inverse, F_Bo_B, 1), V_WB_B)
             F_Bo_B = self.allocate(level)
+        F_Bo_B = self.together(F_Bo_B)
         V_own, turning = self._through_water(X_WB, V_WB_B)
         own = None if coefficients is None else coefficients._replace(mass=self._base_mass(V_own))
         mass, wrench = self.base.balance(X_WB, V_own, F_Bo_B, flow, own)
@@ -196,6 +197,13 @@ class Extended(Dynamics):
         lever = jnp.cross(self.positions, self.directions, axis=0)
         return jnp.tensordot(jnp.concatenate([self.directions, lever]), level, 1)
 
+    def together(self, F_Bo_B: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
+        """The wrench of all thrusters (N, N·m) with the effects on it, from that allocated."""
+        for effect in self.effects:
+            if effect.acts("together"):
+                F_Bo_B = effect.together(F_Bo_B)
+        return F_Bo_B
+
     def _through_water(self, X: Array, V: Array) -> tuple[Array, Array | None]:
         """Velocity relative to the effects' steady flow, and how B's turning changes that flow.
 
@@ -251,7 +259,7 @@ class Extended(Dynamics):
     ) -> Float[Array, "6 *#batch"]:
         """dV/dt under thruster forces that memory effects have passed, and a random push."""
         V_r, turning = self._through_water(X_WB, V_WB_B)
-        F = self.allocate(self.thrust(level, V_r, voltage))
+        F = self.together(self.allocate(self.thrust(level, V_r, voltage)))
         F = F if push is None else F + push
         _, wrench = self.base.balance(X_WB, V_r, F)
         wrench = wrench + self.extra_wrench(X_WB, V_r, self._extra_inertia())

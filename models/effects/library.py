@@ -18,7 +18,7 @@ from .dvl import DvlLeverArm, DvlMisalignment, DvlScale
 from .inflow import InflowThrustLoss
 from .lag import ThrusterLag
 from .lift import Lift
-from .load import CentreOfGravity, NetBuoyancy, Payload
+from .load import CentreOfBuoyancy, CentreOfGravity, NetBuoyancy, Payload
 from .noise import (
     DisturbanceColour,
     DisturbanceImpacts,
@@ -26,9 +26,18 @@ from .noise import (
     DisturbanceStateDependence,
 )
 from .proximity import Proximity
-from .supply import LoadDroop, VoltageSag
+from .supply import LoadDroop, VoltageExponent, VoltageSag
 from .tether import Tether
-from .thrust import ThrustAsymmetry, ThrustCurve, ThrusterDeadZone, ThrusterGain, ThrustScale
+from .thrust import (
+    AxisThrust,
+    ThrustAsymmetry,
+    ThrustCurve,
+    ThrusterDeadZone,
+    ThrusterGain,
+    ThrustLever,
+    ThrustScale,
+    ThrustTable,
+)
 from .unknown import Unknown
 from .water import CurrentSteady, CurrentVarying, Waves
 
@@ -75,6 +84,12 @@ KINDS: dict[str, type[Effect]] = {
 }
 """Every named cause; a new one is added here."""
 
+COEFFICIENTS: dict[str, type[Effect]] = {
+    kind.name: kind
+    for kind in (ThrustTable, VoltageExponent, AxisThrust, ThrustLever, CentreOfBuoyancy)
+}
+"""What is refitted with `--refit all` and never named as a cause."""
+
 
 def kind(name: str) -> type[Effect]:
     """The class of a cause; `unknown` is one for what has no name.
@@ -84,6 +99,8 @@ def kind(name: str) -> type[Effect]:
     """
     if name == Unknown.name:
         return Unknown
+    if name in COEFFICIENTS:
+        return COEFFICIENTS[name]
     if name not in KINDS:
         raise UserError(f"cause {name!r} is unknown: take one of {', '.join(sorted(KINDS))}")
     return KINDS[name]

@@ -51,6 +51,21 @@ class CentreOfGravity(Effect):
         return _hung(self.column(V_CB_B), -plant.weight * up_in_body(X_WB))
 
 
+class CentreOfBuoyancy(Effect):
+    """The centre of buoyancy moved by r along an axis of B: a moment r × weight, no inertia."""
+
+    name: ClassVar[str] = "centre_of_buoyancy"
+    family: ClassVar = "body"
+    parameters: ClassVar = (Parameter("shift", "m", (0.001,), -0.5, 0.5, 0.05),)
+    places: ClassVar = XYZ
+    source: ClassVar[str] = "0.01 to 0.1 m above Bo in published sets"
+
+    def wrench(
+        self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
+    ) -> Float[Array, "6 *#batch"]:
+        return _hung(self.column(V_CB_B), plant.weight * up_in_body(X_WB))
+
+
 class Payload(Effect):
     """A load at (x, y, z): mass m, weight in water w, and their moments about Bo.
 

@@ -30,6 +30,13 @@ class VoltageSag(Effect):
         return force * jnp.exp(self.part(0, force)[None] * jnp.log(voltage))
 
 
+class VoltageExponent(VoltageSag):
+    """The same with either sign: the believed curve may depend on the voltage too much."""
+
+    name: ClassVar[str] = "voltage_exponent"
+    parameters: ClassVar = (Parameter("exponent", "1", (0.3,), -4.0, 4.0, 1.0),)
+
+
 class LoadDroop(Effect):
     """f = u (1 - c Σ|u|^1.5 / L): all thrusters lose when many work; L is 8 thrusters at 40 N.
 

@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .base import ALL_OR_ONE, THRUSTERS, Effect, Parameter, Plant
+from .base import ALL_OR_ONE, AXES, THRUSTERS, Effect, Parameter, Plant
 
 REFERENCE = 10.0
 """Force (N) at which a changed exponent changes nothing."""
@@ -119,3 +119,86 @@ class ThrustScale(Effect):
         plant: Plant,
     ) -> Float[Array, "n *#batch"]:
         return force * (1 + self.part(0, force)[None])
+
+
+KNOTS = (2.0, 5.0, 10.0, 17.0, 28.0)
+"""Forces (N), each way, between which `ThrustTable` is linear."""
+
+
+class ThrustTable(Effect):
+    """f = u + c(u) with c = c_k F_k at the knots F_k, each way; in proportion to u beyond them.
+
+    It takes what exponent, dead zone and reverse gain leave of a curve that is another one.
+    """
+
+    name: ClassVar[str] = "thrust_table"
+    family: ClassVar = "actuation"
+    parameters: ClassVar = (Parameter("correction", "1", (0.05,), -0.9, 3.0, 0.1),)
+    places: ClassVar = tuple(f"{sign}{knot:g} N" for sign in "+-" for knot in KNOTS)
+    order: ClassVar[int] = 13
+    source: ClassVar[str] = "curves of one thruster differ with maker's rig, battery and software"
+
+    def thrust(
+        self,
+        force: Float[Array, "n *#batch"],
+        V_CB_B: Float[Array, "6 *#batch"],
+        voltage: Float[Array, "1 *#batch"],
+        plant: Plant,
+    ) -> Float[Array, "n *#batch"]:
+        count = len(KNOTS)
+        for first, sign in ((0, 1), (count, -1)):
+            size = sign * force
+            change = jnp.zeros_like(force)
+            before, reached = 0.0, jnp.zeros_like(force[:1])
+            for k, knot in enumerate(KNOTS):
+                here = knot * self.part(first + k, force)[None]
+                part = (jnp.clip(size, before, knot) - before) / (knot - before)
+                change = change + part * (here - reached)
+                before, reached = knot, here
+            force = force + sign * change * jnp.maximum(size / KNOTS[-1], 1)
+        return force
+
+
+class AxisThrust(Effect):
+    """F_i = (1 + s_i) F_i: all thrusters together push more along an axis than they should.
+
+    It stands for positions, angles and losses that the vehicle file has otherwise, and for a
+    command whose gains are unknown.
+    """
+
+    name: ClassVar[str] = "axis_thrust"
+    family: ClassVar = "actuation"
+    parameters: ClassVar = (Parameter("scale", "1", (0.05,), -0.95, 20.0, 0.3),)
+    places: ClassVar = AXES
+    order: ClassVar[int] = 15
+    source: ClassVar[str] = "thrusters 30 to 45° from the axis; moment arms differ by 10 to 100 %"
+
+    def together(self, F_Bo_B: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
+        return F_Bo_B * (1 + self.column(F_Bo_B))
+
+
+LEVERS = (
+    ("pitch_from_surge", 4, 0),
+    ("roll_from_sway", 3, 1),
+    ("yaw_from_surge", 5, 0),
+    ("yaw_from_sway", 5, 1),
+    ("roll_from_heave", 3, 2),
+    ("pitch_from_heave", 4, 2),
+)
+"""(place, axis of the moment, axis of the force)."""
+
+
+class ThrustLever(Effect):
+    """M_i += l F_j: the thrust along axis j has another lever about axis i than believed (m)."""
+
+    name: ClassVar[str] = "thrust_lever"
+    family: ClassVar = "actuation"
+    parameters: ClassVar = (Parameter("lever", "m", (0.005,), -1.0, 1.0, 0.05),)
+    places: ClassVar = tuple(name for name, _, _ in LEVERS)
+    order: ClassVar[int] = 16
+    source: ClassVar[str] = "positions of thrusters, and of Bo, are known to some cm"
+
+    def together(self, F_Bo_B: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
+        for k, (_, i, j) in enumerate(LEVERS):
+            F_Bo_B = F_Bo_B.at[i].add(self.part(k, F_Bo_B) * F_Bo_B[j])
+        return F_Bo_B

@@ -101,18 +101,14 @@ METHODS: dict[str, Method] = {
         *_FDM,
         **_SLOW,
     ),
-    "fdm-geodesic+mse": _spinn(
-        "the same with a squared error", Fdm("geodesic"), *_FDM, **_SLOW
-    ),
+    "fdm-geodesic+mse": _spinn("the same with a squared error", Fdm("geodesic"), *_FDM, **_SLOW),
     "fdm-chordal": _spinn(
         "finite dimensional matching, chordal kernel",
         Fdm("chordal", mse_weight=0.0),
         *_FDM,
         **_SLOW,
     ),
-    "fdm-chordal+mse": _spinn(
-        "the same with a squared error", Fdm("chordal"), *_FDM, **_SLOW
-    ),
+    "fdm-chordal+mse": _spinn("the same with a squared error", Fdm("chordal"), *_FDM, **_SLOW),
     "moments": _spinn(
         "moment matching: group mean and covariance, velocity moments",
         Moments(),

@@ -88,7 +88,7 @@ def unexcited(data: Data, wrench_of: np.ndarray) -> list[str]:
     return [a for a, f, s in zip(AXES, rms, scale, strict=True) if f <= _STILL * s]
 
 
-def limits(data: Data, quiet: list[str], resampled: bool) -> list[str]:
+def limits(data: Data, quiet: list[str], resampled: bool, estimated: bool = False) -> list[str]:
     """What these data can't tell, one sentence each."""
     found = [
         f"{axis} was not driven: its drag and inertia are not identifiable from these data"
@@ -102,6 +102,11 @@ def limits(data: Data, quiet: list[str], resampled: bool) -> list[str]:
         found.append(
             "time steps were uneven: effects of a tenth of a step in time, and rare blows, can't "
             "be told from the resampling"
+        )
+    if estimated:
+        found.append(
+            "the states are a filter's estimate, with slow errors of its own: laws of the "
+            "disturbance can't be told from them, and samples count for fewer than there are"
         )
     if data.left_out == "run":
         found.append(

@@ -21,14 +21,17 @@ from .checks import limits, problems, unexcited
 from .data import Data
 from .gain import Contender, judge, told
 from .hypotheses import Fit
+from .identify import identify, with_coefficients
 from .laws import Law
 from .looking import Bench, Look
 from .naming import Hypothesis
-from .search import RIVALS, Found, Search, laws_of, refitted
+from .ratios import ratios
+from .search import RIVALS, Found, Search, best_law, refitted
 from .unknowns import accept, seek, structure
 from .waves import all_laws, is_apart
 
 Progress = Callable[[float, str], None]
+Refit = Literal["none", "scales", "linear", "all"]
 _MOST_UNKNOWN = 2
 _RESAMPLED, _OF_A_STEP = 0.02, 0.1
 """Nats a sample that a law, and share of a step that a time must have, in resampled data."""
@@ -45,15 +48,16 @@ class DiagnoseConfig:
     Attributes:
         alpha: rate of false alarms over all names together.
         refit: what is fitted before and beside every cause: `none` (every difference from the
-            belief is a cause), `scales` (one factor on all thrust) or `linear` (added masses,
-            drag, buoyancy).
+            belief is a cause), `scales` (one factor on all thrust), `linear` (added masses,
+            drag, buoyancy) or `all` (these, the thrusters' curve, thrust by axis and its levers,
+            the centre of buoyancy: `identify`).
         most: causes at most.
         horizon: length of the simulations that the gain is told by (s).
         seed: of bootstraps and simulated noise.
     """
 
     alpha: float = 0.01
-    refit: Literal["none", "scales", "linear"] = "none"
+    refit: Refit = "none"
     most: int = 6
     horizon: float = 4.0
     seed: int = 0
@@ -111,11 +115,12 @@ class Diagnoser:
         started = time.monotonic()
         config, bench = self.config, self.bench
         self.progress(0.02, "one-step predictions")
+        if config.refit == "all":
+            bench = self.bench = with_coefficients(bench)
         base = first = bench.look(bench.believed)
         nuisance = refitted(bench, config.refit)
         if nuisance:
-            theta, _, _ = bench.polish(bench.believed, nuisance)
-            first = bench.look(theta)
+            first = self._refitted(bench)
         found = Found(base, first, first)
         bench, nuisance, structures = self._search(bench, nuisance, found)
         self.progress(0.72, "all causes together")
@@ -130,7 +135,7 @@ class Diagnoser:
             least += _RESAMPLED * bench.data.steps
         # what the names leave of their own is no law
         least = max(least, _OF_NAMES * sum(choice.fit.heldout_gain for choice, _ in found.accepted))
-        laws = all_laws(bench, final, least)
+        laws = [] if final.noise.estimated else all_laws(bench, final, least)
         passing = [law for law in laws if law.heldout_gain > least and is_apart(law, bench)]
         structured = [law for law in passing if law.name != "disturbance_level"]
         passing = structured or passing
@@ -143,14 +148,15 @@ class Diagnoser:
             ]
         more, stirring = telling.law_causes(passing, bench, final)
         causes += more
-        gain = self._gain(bench, base, final, rows, passing, bool(causes))
+        gain = self._gain(bench, found, final, rows, passing, bool(causes))
         d = bench.data
         diagnosis = result.Diagnosis(
             version=result.VERSION,
             verdict=telling.verdict(causes),
-            sentence=telling.sentence(causes, self.faults),
+            sentence=telling.sentence(causes, self.faults, bool(nuisance)),
             causes=causes,
             refitted=[] if joint is None else telling.refitted(bench, final, nuisance, joint),
+            ratios=self._ratios(bench, final, rows),
             residual=telling.residual(bench, final),
             gain=gain,
             left_out=d.left_out if len(np.unique(d.fold)) > 1 else "nothing",
@@ -161,7 +167,7 @@ class Diagnoser:
                 step=d.dt,
                 command=d.command,
                 problems=self.faults,
-                limits=limits(d, self.quiet, self.resampled),
+                limits=limits(d, self.quiet, self.resampled, final.noise.estimated),
                 noise=telling.noise_words(final),
             ),
             tested=tested,
@@ -178,6 +184,19 @@ class Diagnoser:
         return Finding(
             diagnosis, extended, bench.library, final.theta, d, base, final, found.fits, laws
         )
+
+    def _ratios(self, bench: Bench, final: Look, rows: list[int]) -> list[result.Ratio]:
+        if self.config.refit != "all":
+            return []
+        return ratios(bench, bench.look(final.theta, rows), rows)
+
+    def _refitted(self, bench: Bench) -> Look:
+        """The belief with the coefficients fitted that are asked for."""
+        if self.config.refit == "all":
+            remark = "all coefficients together"
+            return bench.look(identify(bench, lambda f: self.progress(0.03 + 0.07 * f, remark)))
+        rows = refitted(bench, self.config.refit)
+        return bench.look(bench.polish(bench.believed, rows)[0])
 
     def _within(self, low: float, high: float) -> Progress:
         return lambda fraction, remark: self.progress(low + (high - low) * fraction, remark)
@@ -201,7 +220,7 @@ class Diagnoser:
         choice, found.left = search.next(found)
         found.fits = found.left
         best = 0.0 if choice is None else choice.fit.heldout_gain
-        law = laws_of(bench, found.first)[0].heldout_gain
+        law = best_law(bench, found.first)
         if RIVALS * law < max(best, found.threshold + _LAW_MARGIN):
             search.run(found)
         for number in range(_MOST_UNKNOWN):
@@ -222,7 +241,7 @@ class Diagnoser:
     def _gain(
         self,
         bench: Bench,
-        base: Look,
+        found: Found,
         final: Look,
         rows: list[int],
         laws: list[Law],
@@ -234,8 +253,12 @@ class Diagnoser:
         R = len(bench.data.fold)
         still = np.repeat(bench.believed[:, None], R, axis=1)
         contenders = {"base": Contender(still)}
-        belief = refitted(bench, "linear")
-        _, look, _ = bench.polish(bench.believed, belief, rounds=3)
+        if self.config.refit == "all":
+            belief = refitted(bench, "all")
+            look = bench.look(bench.moved(found.first.theta, self.bench.library), belief)
+        else:
+            belief = refitted(bench, "linear")
+            _, look, _ = bench.polish(bench.believed, belief, rounds=3)
         contenders["refitted"] = Contender(bench.without_each(look, belief))
         if extended:
             won = np.zeros(R)
@@ -244,7 +267,9 @@ class Diagnoser:
                 won += law.heldout
             look = bench.look(final.theta, rows) if rows else final
             contenders["extended"] = Contender(bench.without_each(look, rows), won=won)
-        contenders["black_box"] = Contender(still, train(base.predictions, bench.data, self.rng))
+        contenders["black_box"] = Contender(
+            still, train(found.base.predictions, bench.data, self.rng)
+        )
         judged = {}
         for number, (name, contender) in enumerate(contenders.items()):
             self.progress(0.84 + 0.04 * number, f"gain: {name.replace('_', ' ')}")

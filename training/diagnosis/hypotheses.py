@@ -124,9 +124,9 @@ class Evidence:
         return bool(np.any(np.diag(self.total)[own] * self.design.size[own - 1] ** 2 > 1e-12))
 
     def prior(self, parameters: Sequence[int]) -> np.ndarray:
-        """Precision of the weak prior."""
-        sizes = [self.library.entries[i].parameter.probes[0] for i in parameters]
-        return 1 / (PRIOR * np.array(sizes)) ** 2
+        """Precision of the prior: weak, but where a parameter says how far it is known."""
+        known = [self.library.entries[i].parameter for i in parameters]
+        return 1 / np.array([p.spread or PRIOR * p.probes[0] for p in known]) ** 2
 
     def curve(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Values t of a curved parameter, and for each the weights of all columns."""
@@ -199,7 +199,8 @@ class Evidence:
             w0 = self._combine(rest, None, extra)[0]
             heldout[here] = loss(w0, self.runs[here]) - loss(w, self.runs[here])
         tangent = self._tangent(curved, t, [*parameters, *extra])
-        errors, p_value = self._wald(weights, base, tangent, len(parameters))
+        prior = self.prior([*parameters, *extra])
+        errors, p_value = self._wald(weights, base, tangent, prior, len(parameters))
         known = dict(zip(parameters, errors, strict=False))
         unknown = 1 / np.sqrt(self.prior(named))
         return Fit(
@@ -225,10 +226,15 @@ class Evidence:
         return rows
 
     def _wald(
-        self, weights: np.ndarray, base: np.ndarray, tangent: np.ndarray, count: int
+        self,
+        weights: np.ndarray,
+        base: np.ndarray,
+        tangent: np.ndarray,
+        prior: np.ndarray,
+        count: int,
     ) -> tuple[np.ndarray, float]:
         """Robust standard errors, and the p value of the scores at the base being zero in mean."""
-        H = tangent @ self.total @ tangent.T
+        H = tangent @ self.total @ tangent.T + np.diag(prior)
         H = H + 1e-10 * np.diag(np.maximum(np.diag(H), 1e-300))
         inverse = np.linalg.inv(H)
         scores = np.einsum("ki,rij,j->rk", tangent, self.runs, weights)

@@ -1,7 +1,7 @@
 """What one set of parameters shows: innovations, noise, responses; fits by exact predictions."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -10,10 +10,11 @@ import scipy.linalg
 from jaxtyping import Float
 
 from ...models.dynamics import Dynamics
-from ...models.effects.base import Effect
+from ...models.effects.base import AXES, XYZ, Effect
 from ...models.effects.extended import Extended
 from ...models.effects.library import KINDS, Library
 from ...models.recording import Recording
+from ...models.rigid_body import FossenDynamics
 from ...models.vehicle import Vehicle
 from .data import Data, make_data
 from .gram import gram
@@ -57,6 +58,7 @@ class Bench:
         model: the believed model without effects.
         library: every effect that may explain a difference.
         believed: θ of the belief: zero but for effects that it holds already (p,).
+        bounds: ranges of parameters that are narrower than those of their effects.
     """
 
     data: Data
@@ -64,6 +66,7 @@ class Bench:
     model: Extended
     library: Library
     believed: Float[np.ndarray, " p"]
+    bounds: Mapping[tuple[str, str, str], tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -87,7 +90,18 @@ class Bench:
         old = [library.index(*_key(e)) for e in self.library.entries]
         theta = np.zeros(library.size)
         theta[old] = self.believed
-        return Bench(self.data, self.vehicle, self.model, library, theta)
+        return replace(self, library=library, believed=theta)
+
+    def within(self, bounds: Mapping[int, tuple[float, float]]) -> "Bench":
+        """The same with narrower ranges of some parameters, by their place in θ."""
+        named = {_key(self.library.entries[i]): both for i, both in bounds.items()}
+        return replace(self, bounds={**self.bounds, **named})
+
+    def limits(self, rows: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest admissible values."""
+        entries = [self.library.entries[i] for i in rows]
+        both = [self.bounds.get(_key(e), (e.parameter.low, e.parameter.high)) for e in entries]
+        return np.array([b[0] for b in both]), np.array([b[1] for b in both])
 
     def moved(self, theta: Float[np.ndarray, " q"], library: Library) -> Float[np.ndarray, " p"]:
         """A θ of another library in this one's order."""
@@ -95,6 +109,24 @@ class Bench:
         for value, entry in zip(theta, library.entries, strict=True):
             found[self.library.index(*_key(entry))] = value
         return found
+
+    def believes(self, cause: str, where: str) -> float:
+        """The believed model's own coefficient that a cause changes; 0 where it has none."""
+        core = self.model.base
+        if not isinstance(core, FossenDynamics):
+            return 0.0
+        if cause == "net_buoyancy":
+            return float(core.buoyancy - core.weight)
+        if cause == "centre_of_buoyancy":
+            return float(core.p_BoCb_B[XYZ.index(where)])
+        if where not in AXES:
+            return 0.0
+        i = AXES.index(where)
+        if cause == "added_mass":
+            return float(core.mass.matrix()[i, i] - core.rigid_inertia[i, i])
+        if cause in ("linear_drag", "quadratic_drag"):
+            return float(getattr(core, cause).dense[i, i])
+        return 0.0
 
     def mass(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "6 6"]:
         """The mass matrix under θ (kg, kg·m, kg·m²)."""
@@ -113,7 +145,14 @@ class Bench:
         mass = self.mass(theta)
         noise = estimate(error, weight, A, mass, self.data.dt)
         kalman = make_filter(noise, A, np.linalg.inv(mass), self.data.dt, len(self.data.u))
-        return p, noise, kalman
+        # correlated innovations tell less than as many independent ones
+        less = kalman.whiten / np.sqrt(noise.memory)[:, None]
+        return p, noise, replace(kalman, whiten=less)
+
+    def errors(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "N 12 R"]:
+        """Errors of one-step predictions, zero where a piece has no sample."""
+        p = predict(self.model, self.library, theta, self.data)
+        return np.asarray(p.error) * self.data.weight[:, None]
 
     def look(
         self,
@@ -152,8 +191,7 @@ class Bench:
         clustered by run.
         """
         chosen = list(chosen)
-        low = np.array([self.library.entries[i].parameter.low for i in chosen])
-        high = np.array([self.library.entries[i].parameter.high for i in chosen])
+        low, high = self.limits(chosen)
         theta = theta.copy()
         theta[chosen] = np.clip(theta[chosen], low, high)
         best: tuple[np.ndarray, Look, Fit] | None = None
@@ -222,12 +260,12 @@ class Bench:
             return theta
         columns = [evidence.column(i) for i in chosen]
         prior = np.diag(evidence.prior(chosen))
+        low, high = self.limits(chosen)
         for number, label in enumerate(np.unique(data.fold)):
             T = evidence.total - evidence.folds[number]
             change = -np.linalg.solve(T[np.ix_(columns, columns)] + prior, T[columns, 0])
-            for i, c in zip(chosen, change, strict=True):
-                p = self.library.entries[i].parameter
-                theta[i, data.fold == label] = np.clip(look.theta[i] + c, p.low, p.high)
+            values = np.clip(look.theta[chosen] + change, low, high)
+            theta[np.ix_(chosen, data.fold == label)] = values[:, None]
         return theta
 
 

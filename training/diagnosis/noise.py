@@ -2,9 +2,14 @@
 
 With y = x + e, r_n = e_(n+1) - A e_n + w_n has the covariances C_0 = Q + R + A R Aᵀ, C_1 = -A R and
 none further on. A slow model error adds about the same to C_1 and C_2, so C_1 - C_2 is used.
+
+States that an autopilot has estimated have no errors of their own at each sample, but slow ones:
+then R comes out as none on most axes of the twist. All that steps show is taken for process noise
+there, poses that slip against the twist included, and the errors' correlation in time is kept:
+so many samples tell less.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg
@@ -12,14 +17,32 @@ from jaxtyping import Float
 
 FLOOR = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4] * 3 + [1e-5] * 3)
 """Least standard deviation of a record: m, rad, m/s, rad/s."""
+_SMOOTH = 4
+"""Axes of the twist without errors of their own from which states count as estimated."""
+_LONGEST = 0.98
+"""Largest correlation of neighbouring errors that is believed."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of the records (12,) and diffusion b (6,) in N√s, N·m√s."""
+    """Standard deviations of the records (12,) and diffusion b (6,) in N√s, N·m√s.
+
+    Attributes:
+        record: m, rad, m/s, rad/s.
+        diffusion: b.
+        slip: of the pose against the integrated twist, in m/√s and rad/√s.
+        memory: how many samples tell as much as one independent one (12,).
+    """
 
     record: Float[np.ndarray, "12"]
     diffusion: Float[np.ndarray, "6"]
+    slip: Float[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
+    memory: Float[np.ndarray, "12"] = field(default_factory=lambda: np.ones(12))
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the records are states that a filter has estimated."""
+        return bool(np.any(self.memory > 1))
 
 
 @dataclass(frozen=True)
@@ -47,14 +70,17 @@ def process_covariance(
     mass_inverse: Float[np.ndarray, "6 6"],
     diffusion: Float[np.ndarray, "6"],
     dt: float,
+    slip: Float[np.ndarray, "6"] | None = None,
 ) -> Float[np.ndarray, "12 12"]:
-    """Q = ∫ exp(J s) B Bᵀ exp(J s)ᵀ ds over a step, by three Gauss points."""
+    """Q = ∫ exp(J s) B Bᵀ exp(J s)ᵀ ds over a step, by three Gauss points, and the slip's."""
     J = np.real(scipy.linalg.logm(A)) / dt
     B = np.concatenate([np.zeros((6, 6)), mass_inverse * diffusion])
     Q = np.zeros((12, 12))
     for x, w in zip(*np.polynomial.legendre.leggauss(3), strict=True):
         E = scipy.linalg.expm(J * dt * (1 + x) / 2) @ B
         Q += w * dt / 2 * E @ E.T
+    if slip is not None:
+        Q[:6, :6] += np.diag(slip**2 * dt)
     return Q
 
 
@@ -73,12 +99,31 @@ def estimate(
         C.append(np.einsum("nir,njr->ij", a, b) / max(w.sum(), 1.0))
     R = np.diag(-np.linalg.solve(A, C[1] - C[2]))
     variance = np.maximum(R, FLOOR**2)
+    if np.sum(R[6:] <= FLOOR[6:] ** 2) >= _SMOOTH:
+        return _of_estimates(C[0], C[1], variance, A, mass, dt)
     C0 = C[0] - (C[2] + C[2].T) / 2
     Q = C0 - np.diag(variance) - A * variance @ A.T
     unit = process_covariance(A, np.linalg.inv(mass), np.ones(6), dt)
     wrench = np.diag(Q)[6:] / np.diag(unit)[6:]
     least = 1e-4 * np.diag(C[0])[6:] / np.diag(unit)[6:]
     return Noise(np.sqrt(variance), np.sqrt(np.maximum(wrench, least)))
+
+
+def _of_estimates(
+    C0: np.ndarray, C1: np.ndarray, variance: np.ndarray, A: np.ndarray, mass: np.ndarray, dt: float
+) -> Noise:
+    """Noise of states that were estimated: all in the process, with its correlation."""
+    unit = process_covariance(A, np.linalg.inv(mass), np.ones(6), dt)
+    square = np.maximum(np.diag(C0)[6:] / np.diag(unit)[6:], 1e-300)
+    own = process_covariance(A, np.linalg.inv(mass), np.sqrt(square), dt)
+    left = np.diag(C0 - np.diag(variance) - A * variance @ A.T - own)[:6]
+    correlation = np.clip(np.diag(C1) / np.maximum(np.diag(C0), 1e-300), 0.0, _LONGEST)
+    return Noise(
+        record=np.sqrt(variance),
+        diffusion=np.sqrt(square),
+        slip=np.sqrt(np.maximum(left, 0.0) / dt),
+        memory=(1 + correlation) / (1 - correlation),
+    )
 
 
 def make_filter(
@@ -89,7 +134,7 @@ def make_filter(
     steps: int,
 ) -> Filter:
     """The Kalman filter that starts from the first record: gains of every step."""
-    Q = process_covariance(A, mass_inverse, noise.diffusion, dt)
+    Q = process_covariance(A, mass_inverse, noise.diffusion, dt, noise.slip)
     R = np.diag(noise.record**2)
     keep = np.zeros((steps, 12, 12))
     whiten, log_det = np.zeros((steps, 12, 12)), np.zeros(steps)

@@ -11,7 +11,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from ...models.files import atomic_path
 
 Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -135,6 +135,16 @@ class Refitted:
 
 
 @dataclass(frozen=True)
+class Ratio:
+    """A coefficient over inertia, which data tell whatever the mass: believed and found."""
+
+    name: str
+    where: str
+    believed: float
+    found: Value
+
+
+@dataclass(frozen=True)
 class DataSummary:
     """What was there, what was missing, what could not be told."""
 
@@ -156,6 +166,7 @@ class Diagnosis:
         verdict: adequate (no cause), explained (all by names), partly_explained (names and
             `unknown`), unexplained (`unknown` alone).
         refitted: coefficients fitted before any cause was named.
+        ratios: what such a fit tells whatever the mass; with `--refit all` only.
         gain: of base, refitted, extended (where there are causes) and black_box.
         left_out: what was left out in turn, for gains here and in causes.
         tested, threshold, alpha: names tried; nats that noise alone wins of so many, and how often.
@@ -167,6 +178,7 @@ class Diagnosis:
     sentence: str
     causes: list[Cause]
     refitted: list[Refitted]
+    ratios: list[Ratio]
     residual: dict[str, AxisResidual]
     gain: dict[str, ModelGain]
     left_out: Literal["scenario", "run", "block", "nothing"]

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from ...models.effects.library import Library, kind
 from .hypotheses import Fit
+from .identify import coefficients
 from .laws import Law, find_laws, run_constants
 from .looking import Bench, Look
 from .naming import Choice, Hypothesis, admissible, choose, margin, parameters_of
@@ -33,6 +34,7 @@ class Found:
         accepted: causes in the order found, with the fit that named them.
         fits: every name alone, beside the belief refitted.
         left: every further name beside those accepted.
+        dropped: causes that others made needless; they are not tried again.
         threshold: of held-out nats in the last round.
     """
 
@@ -42,6 +44,7 @@ class Found:
     accepted: list[tuple[Choice, Fit]] = field(default_factory=list)
     fits: dict[Hypothesis, Fit] = field(default_factory=dict)
     left: dict[Hypothesis, Fit] = field(default_factory=dict)
+    dropped: set[Hypothesis] = field(default_factory=set)
     threshold: float = 0.0
 
     @property
@@ -52,11 +55,18 @@ class Found:
 
 def refitted(bench: Bench, refit: str) -> list[int]:
     """Parameters that are free beside every cause."""
+    if refit == "all":
+        return [c.row for c in coefficients(bench)]
     return [i for i, e in enumerate(bench.library.entries) if e.cause in REFITS[refit]]
 
 
 def laws_of(bench: Bench, look: Look) -> list[Law]:
-    """Laws of the disturbance in what is left, largest gain first."""
+    """Laws of the disturbance in what is left, largest gain first.
+
+    None where states were estimated: errors of an estimator are no disturbance.
+    """
+    if look.noise.estimated:
+        return []
     data = bench.data
     speed = np.linalg.norm(data.V[:-1, :3], axis=1)
     found = find_laws(look.z.astype(float), speed, data.weight, data.fold, data.dt)
@@ -68,6 +78,11 @@ def laws_of(bench: Bench, look: Look) -> list[Law]:
         gain, values, loss = run_constants(evidence.runs, columns, sizes, evidence.fold)
         found.append(Law("current_varying", "W", values, gain, loss))
     return sorted(found, key=lambda law: -law.heldout_gain)
+
+
+def best_law(bench: Bench, look: Look) -> float:
+    """What the best law of the disturbance wins on data left out (nats)."""
+    return max((law.heldout_gain for law in laws_of(bench, look)), default=0.0)
 
 
 class Search:
@@ -114,7 +129,7 @@ class Search:
         """The name that explains most of what is left, and the fits of all names."""
         bench, current, taken = self.bench, found.current, found.hypotheses
         beside = self.nuisance + parameters_of(bench.library, taken)
-        open_names = [h for h in self.names if h not in taken]
+        open_names = [h for h in self.names if h not in taken and h not in found.dropped]
         sets = [bench.library.at(*h) for h in open_names]
         found.threshold = current.evidence.null_quantile(sets, beside, self.alpha, self.rng)
         fits = {h: current.evidence.fit(s, beside) for h, s in zip(open_names, sets, strict=True)}
@@ -132,9 +147,9 @@ class Search:
 
         choice = chosen(False, 0.0)
         if choice is not None and self._about_thrust(choice):
-            fits |= self._single_thrusters(current, beside, taken)
+            fits |= self._single_thrusters(current, beside, [*taken, *found.dropped])
             choice = chosen(False, 0.0)
-        law = laws_of(bench, current)[0].heldout_gain
+        law = best_law(bench, current)
         if choice is not None and RIVALS * law > choice.fit.heldout_gain:
             # random structure is imitated by names: they must hold between runs by themselves
             choice = chosen(True, _OF_A_LAW * law)
@@ -212,6 +227,7 @@ class Search:
             if float(np.sum(ratio**2)) / 2 > found.threshold:
                 kept.append((choice, fit))
             else:
+                found.dropped.add(choice.hypothesis)
                 theta[own] = 0.0
         if len(kept) < len(found.accepted):
             found.accepted = kept

@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from ...models.effects.base import AXES, Effect
 from ...models.effects.library import kind
-from ...models.rigid_body import FossenDynamics
 from . import result
 from .experiments import next_experiment
 from .hypotheses import Fit
@@ -71,29 +70,12 @@ def refitted(bench: Bench, look: Look, rows: Sequence[int], joint: Fit) -> list[
     t = quantile(joint) if rows else 0.0
     for i in rows:
         e = bench.library.entries[i]
-        old = believed(bench, e.cause, e.where)
+        old = bench.believes(e.cause, e.where)
         new = old + float(look.theta[i] - bench.believed[i])
         error = t * float(joint.errors[joint.parameters.index(i)])
         value = result.Value(new, e.parameter.unit, (new - error, new + error))
         found.append(result.Refitted(e.cause, e.where, e.parameter.name, old, value))
     return found
-
-
-def believed(bench: Bench, name: str, where: str) -> float:
-    """The believed model's own coefficient that a cause changes; 0 where it has none."""
-    core = bench.model.base
-    if not isinstance(core, FossenDynamics):
-        return 0.0
-    if name == "net_buoyancy":
-        return float(core.buoyancy - core.weight)
-    if where not in AXES:
-        return 0.0
-    i = AXES.index(where)
-    if name == "added_mass":
-        return float(core.mass.matrix()[i, i] - core.rigid_inertia[i, i])
-    if name in ("linear_drag", "quadratic_drag"):
-        return float(getattr(core, name).dense[i, i])
-    return 0.0
 
 
 def residual(bench: Bench, look: Look) -> dict[str, result.AxisResidual]:
@@ -210,13 +192,18 @@ def verdict(causes: Sequence[result.Cause]) -> result.Verdict:
     return "unexplained" if all(unknown) else "partly_explained"
 
 
-def sentence(causes: Sequence[result.Cause], problems: Sequence[str]) -> str:
-    """The finding in a line or two."""
+def sentence(
+    causes: Sequence[result.Cause], problems: Sequence[str], refitted: bool = False
+) -> str:
+    """The finding in a line or two; `refitted` if coefficients were fitted first."""
     first = f"The data have faults ({len(problems)}), see there first. " if problems else ""
+    if not causes and refitted:
+        return first + "With its coefficients refitted, your model is adequate at this noise."
     if not causes:
         return first + "Your model is adequate at this noise."
     named = ", ".join(f"{c.name} ({c.where})" for c in causes if c.name != "unknown")
-    told = f"The data differ from your model by: {named}." if named else ""
+    subject = "your model, its coefficients refitted," if refitted else "your model"
+    told = f"The data differ from {subject} by: {named}." if named else ""
     for c in causes:
         if c.structure is not None:
             told += f" No name explains {c.structure.description}."

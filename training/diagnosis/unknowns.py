@@ -11,7 +11,7 @@ from .hypotheses import Design, Fit
 from .looking import Bench, Look
 from .naming import Choice, admissible, parameters_of
 from .responses import respond
-from .search import Found, laws_of
+from .search import Found, best_law
 from .structures import Matched, Screen, described, groups, refined
 
 BEATS = 1.5
@@ -76,7 +76,7 @@ def seek(
         return None
     screen, best, gain = left
     name = _best_name(bench, found.current, found.left)
-    law = laws_of(bench, found.current)[0].heldout_gain
+    law = best_law(bench, found.current)
     if gain < BEATS * name or gain < _OF_A_LAW * law:
         return None
     known = [h for h in found.hypotheses if h[0] != "unknown"]

@@ -1,0 +1,169 @@
+"""A belief that is wrong in most of its numbers, brought near the data before anything is named.
+
+Where every coefficient is off, names that are tried one by one explain each other's errors. With
+`--refit all` the coefficients of a grey box are fitted together first: added mass, drag, buoyancy
+and restoring moment, the thrusters' curve, what they push along each axis and their levers. Motion
+alone tells all of these in proportion to each other. The scale is that of the rigid body's mass and
+inertia, which one can weigh and compute; added mass and drag are not negative, and thrust lies as
+near to the belief as that allows.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize
+from jaxtyping import Float
+
+from ...models.effects.base import AXES
+from ...models.effects.library import COEFFICIENTS
+from .looking import Bench, Look
+from .noise import Filter
+
+COMMON = ("added_mass", "linear_drag", "quadratic_drag", "net_buoyancy")
+WRENCH = ("axis_thrust", "thrust_lever", "centre_of_buoyancy")
+CURVE = ("thrust_table", "voltage_exponent")
+OF_ALL = {
+    "thrust_curve": ("exponent", 0.3),
+    "thrust_asymmetry": ("reverse_gain", 0.5),
+    "thruster_dead_zone": ("width", 3.0),
+}
+"""Parameters of effects in all thrusters alike, and how far they are known beforehand."""
+_ROUNDS, _TRIES = 40, 8
+_ENOUGH = 1.0
+"""Nats a round from which a fit goes on."""
+_START = 0.3
+"""Dead zone (N) to start from: at none its response is one-sided."""
+_DRAG, _BUOYANCY = 3.0, 20.0
+"""How far drag (in multiples of itself) and net buoyancy (N) are known beforehand."""
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """A number of θ with what is known of it: standard deviation about the belief, and range."""
+
+    row: int
+    spread: float
+    low: float
+    high: float
+
+
+def with_coefficients(bench: Bench) -> Bench:
+    """The bench with the effects that only such a fit has, and bounds that physics sets."""
+    level = bench.data.command != "F_Bo_B"
+    for name, kind in COEFFICIENTS.items():
+        if name in CURVE and not level:
+            continue
+        if name == "voltage_exponent" and not bench.data.has_voltage:
+            continue
+        bench = bench.with_effect(kind.neutral())
+    return bench.within({c.row: (c.low, c.high) for c in coefficients(bench)})
+
+
+def coefficients(bench: Bench) -> list[Coefficient]:
+    """All that is fitted."""
+    library, found = bench.library, []
+    level = bench.data.command != "F_Bo_B"
+    rigid = np.diag(np.asarray(bench.model.rigid_inertia))
+    for i, (cause, where, p) in enumerate(library.entries):
+        old, start = bench.believes(cause, where), bench.believed[i]
+        spread, low, high = p.spread, p.low, p.high
+        if cause in ("linear_drag", "quadratic_drag"):
+            both = [bench.believes(name, where) for name in ("linear_drag", "quadratic_drag")]
+            spread, low = _DRAG * max(*both, 1e-3), -old
+        elif cause == "added_mass":
+            spread, low = max(old, 0.1 * float(rigid[AXES.index(where)])), -old
+        elif cause == "net_buoyancy":
+            spread = _BUOYANCY
+        elif cause in OF_ALL and level and where == "all" and p.name == OF_ALL[cause][0]:
+            spread = OF_ALL[cause][1]
+        elif cause not in (*WRENCH, *CURVE):
+            continue
+        found.append(Coefficient(i, spread, start + min(low, 0.0), start + high))
+    return found
+
+
+def identify(
+    bench: Bench, progress: Callable[[float], None] = lambda fraction: None
+) -> Float[np.ndarray, " p"]:
+    """θ with all coefficients where data and prior have them (Levenberg and Marquardt).
+
+    Every step is weighed by the covariance that the one-step errors of pose and of twist have at
+    it, which asks for no noise levels that a wrong model makes too large.
+    """
+    chosen = coefficients(bench)
+    rows = [c.row for c in chosen]
+    spread = np.array([c.spread for c in chosen])
+    low, high = np.array([c.low for c in chosen]), np.array([c.high for c in chosen])
+    centre = bench.believed[rows]
+    theta = bench.believed.copy()
+    for c in chosen:
+        if bench.library.entries[c.row].cause == "thruster_dead_zone":
+            theta[c.row] += _START
+
+    def loss(theta: np.ndarray) -> float:
+        away = (theta[rows] - centre) / spread
+        return _fit(bench, theta) + float(away @ away) / 2
+
+    best, damping = loss(theta), 0.0
+    for n in range(_ROUNDS):
+        progress(n / _ROUNDS)
+        seen = bench.look(theta, rows, one_step(bench, theta))
+        gradient, H = _quadratic(seen, rows)
+        gradient = (gradient + (theta[rows] - centre) / spread**2) * spread
+        H = H * np.outer(spread, spread) + np.eye(len(rows))
+        for _ in range(_TRIES):
+            L = np.linalg.cholesky(H + damping * np.diag(np.diag(H)))
+            step = scipy.optimize.lsq_linear(
+                L.T,
+                -scipy.linalg.solve_triangular(L, gradient, lower=True),
+                bounds=(
+                    (low - theta[rows]) / spread - 1e-12,
+                    (high - theta[rows]) / spread + 1e-12,
+                ),
+            ).x
+            moved = theta.copy()
+            moved[rows] = np.clip(theta[rows] + step * spread, low, high)
+            new = loss(moved)
+            if new < best:
+                break
+            damping = max(5 * damping, 1e-3)
+        else:
+            break
+        won, theta, best = best - new, moved, new
+        damping = damping / 5 if damping > 1e-5 else 0.0
+        if won < _ENOUGH:
+            break
+    return theta
+
+
+def one_step(bench: Bench, theta: Float[np.ndarray, " p"]) -> Filter:
+    """The filter that believes every record: innovations are one-step errors, whitened."""
+    C = _covariance(bench, theta)
+    N = len(bench.data.u)
+    whiten = np.linalg.inv(np.linalg.cholesky(C))
+    log_det = float(np.linalg.slogdet(C)[1]) / 2
+    return Filter(np.zeros((N, 12, 12)), np.repeat(whiten[None], N, 0), np.full(N, log_det))
+
+
+def _covariance(bench: Bench, theta: np.ndarray) -> Float[np.ndarray, "12 12"]:
+    """Of one-step errors, pose and twist apart: what poses lack is an instrument's."""
+    error = bench.errors(theta)
+    C = np.einsum("nir,njr->ij", error, error) / bench.data.weight.sum()
+    C[:6, 6:], C[6:, :6] = 0.0, 0.0
+    return C
+
+
+def _fit(bench: Bench, theta: np.ndarray) -> float:
+    """Minus the log likelihood of one-step errors under a covariance of their own."""
+    C = _covariance(bench, theta)
+    if not np.isfinite(C).all():
+        return np.inf
+    return float(bench.data.weight.sum() * np.linalg.slogdet(C)[1] / 2)
+
+
+def _quadratic(seen: Look, rows: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient and Gauss–Newton Hessian of ½ |z|² by the parameters."""
+    columns = [seen.evidence.column(i) for i in rows]
+    total = seen.evidence.total
+    return total[columns, 0], total[np.ix_(columns, columns)]

@@ -1,0 +1,109 @@
+"""What motion tells of a vehicle whatever its mass: coefficients over inertia.
+
+Forces and masses that are all larger by one factor move alike, so data tell coefficients in
+proportion to inertia only. Intervals are those of the likelihood (inverse of its curvature, the
+correlation of errors in time taken off) by the delta method; a coefficient at its physical limit
+is taken for known.
+"""
+
+from collections.abc import Callable, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ...models import se3
+from ...models.effects.base import AXES
+from ...models.rigid_body import FossenDynamics
+from . import result
+from .looking import Bench, Look
+
+_TILT = 1e-3
+_HALF = 200.0
+"""µs from neutral at half command."""
+_STEP = 0.1
+"""Standard errors by which parameters are moved for the derivative of a ratio."""
+_SMALL = 1e-9
+_UNITS = {
+    "inertia": "1",
+    "quadratic_drag": "1/m or 1",
+    "linear_drag": "1/s",
+    "half_thrust": "m/s² or rad/s²",
+    "restoring": "rad/s²",
+    "net_buoyancy": "m/s²",
+}
+
+
+def ratios(bench: Bench, look: Look, rows: Sequence[int]) -> list[result.Ratio]:
+    """Believed and found ratios by axis; `rows` are the parameters that were fitted.
+
+    `inertia` is in proportion to surge's (of rotations to roll's), everything else over the
+    axis' inertia; `half_thrust` is the acceleration when all thrusters push along the axis at
+    half command, for commands by PWM. Empty for a base without constant coefficients.
+    """
+    if not isinstance(bench.model.base, FossenDynamics) or not rows:
+        return []
+    numbers, theta = _numbers(bench), look.theta
+    mean, before = numbers(theta), numbers(bench.believed)
+    low, high = bench.limits(rows)
+    at = theta[list(rows)]
+    free = [
+        i for i, a, b, x in zip(rows, low, high, at, strict=True) if a < x - _SMALL < b - _SMALL
+    ]
+    columns = [look.evidence.column(i) for i in free]
+    H = look.evidence.total[np.ix_(columns, columns)] + np.diag(look.evidence.prior(free))
+    # principal directions, each moved by a share of its standard error
+    values, vectors = np.linalg.eigh(H)
+    variance = dict.fromkeys(mean, 0.0)
+    for value, direction in zip(values, vectors.T, strict=True):
+        moved = theta.copy()
+        moved[free] += _STEP * direction / np.sqrt(max(value, 1e-300))
+        for key, after in numbers(moved).items():
+            variance[key] += ((after - mean[key]) / _STEP) ** 2
+    found = []
+    for (name, where), value in mean.items():
+        error = 1.96 * float(np.sqrt(variance[name, where]))
+        told = result.Value(value, _UNITS[name], (value - error, value + error))
+        found.append(result.Ratio(name, where, before[name, where], told))
+    return found
+
+
+def _numbers(bench: Bench) -> Callable[[np.ndarray], dict[tuple[str, str], float]]:
+    """A function from θ to all ratios."""
+    data = bench.data
+    thrusters = bench.vehicle.thrusters()
+    volts = float((data.voltage * data.weight).sum() / data.weight.sum())
+    identity = se3.identity(jnp.float64)
+
+    def numbers(theta: Float[np.ndarray, " p"]) -> dict[tuple[str, str], float]:
+        model = bench.model.with_effects(bench.library.filled(jnp.asarray(theta)))
+        inertia = np.diag(bench.mass(theta))
+        still = jnp.zeros(6)
+
+        def static(X: jnp.ndarray) -> np.ndarray:
+            _, wrench = model.base.balance(X, still, jnp.zeros(6))
+            return np.asarray(wrench + model.extra_wrench(X, still))
+
+        level = static(identity)
+        found = {("inertia", a): inertia[i] / inertia[i // 3 * 3] for i, a in enumerate(AXES)}
+        for name in ("quadratic_drag", "linear_drag"):
+            for i, axis in enumerate(AXES):
+                change = theta[bench.library.index(name, axis, "change")]
+                value = bench.believes(name, axis) + change
+                found[name, axis] = float(value / inertia[i])
+        if data.command == "pwm":
+            B = np.asarray(model.allocate(jnp.eye(data.u.shape[1])))
+            nominal = float(thrusters.nominal_voltage)
+            for i, axis in enumerate(AXES):
+                pwm = jnp.asarray(1500.0 + _HALF * np.sign(np.round(B[i], 9)))
+                force = thrusters.force(pwm, jnp.full(len(pwm), volts * nominal))
+                given = model.thrust(force, still, jnp.array([volts]))
+                F = model.together(model.allocate(given))
+                found["half_thrust", axis] = float(F[i] / inertia[i])
+        for i, axis in ((3, "roll"), (4, "pitch")):
+            tilted = se3.retract(identity, jnp.zeros(6).at[i].set(_TILT))
+            found["restoring", axis] = float((level[i] - static(tilted)[i]) / _TILT / inertia[i])
+        found["net_buoyancy", "heave"] = float(level[2] / inertia[2])
+        return found
+
+    return numbers

@@ -63,6 +63,13 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
              for r in d.refitted],
             ("coefficient", "where", "believed", "fitted (95 %)"),
         )  # fmt: skip
+    if d.ratios:
+        page.text("What the motion tells whatever the mass, over the inertia of the axis:")
+        page.table(
+            [(r.name, r.where, f"{r.believed:.4g}", _told("", r.found).removeprefix(" "))
+             for r in d.ratios],
+            ("ratio", "where", "believed", "found (95 %)"),
+        )  # fmt: skip
     page.figure(names_figure(finding), "Each name alone, fitted on the other scenarios.")
     page.section(
         "Where the error lives",

@@ -1,7 +1,7 @@
 """What a study consists of: a true vehicle, a belief to start from, regimes of data, sizes."""
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from ...models.checks import Vector6, check_numbers, require
 from ...models.errors import UserError
@@ -10,6 +10,7 @@ from ...training.generate import GenerateConfig
 from ...training.law_metrics import GroundMetric
 from ...training.maneuvers import MANEUVERS
 
+T = TypeVar("T")
 Regime = Literal["rich", "sparse"]
 Scale = Literal["full", "small", "tiny"]
 REGIMES: tuple[Regime, ...] = ("rich", "sparse")
@@ -77,13 +78,16 @@ class SizeConfig:
     depth: int | None = None
     pretrain_steps: int | None = None
     drift_iterations: int | None = None
+    """0 starts from the belief, whose coefficients no data have touched yet."""
+    learning_rate: float | None = None
+    head_decay: float | None = None
     length_s: float | None = None
     """Seconds of each window."""
     stride_s: float | None = None
 
     def apply(self, config: TrainingConfig, seed: int) -> TrainingConfig:
         """A method's settings at this size."""
-        steps = config.steps if self.steps is None else self.steps
+        steps = _given(self.steps, config.steps)
         drift = config.drift
         if self.length_s is not None:
             drift = replace(drift, length_s=min(drift.length_s, self.length_s))
@@ -98,13 +102,20 @@ class SizeConfig:
             ),
             pretrain=_changed(config.pretrain, {"steps": self.pretrain_steps}),
             drift=_changed(drift, {"iterations": self.drift_iterations}),
+            learning_rate=_given(self.learning_rate, config.learning_rate),
+            head_decay=_given(self.head_decay, config.head_decay),
             steps=steps,
-            batch=config.batch if self.batch is None else self.batch,
+            batch=_given(self.batch, config.batch),
             warm_up=min(config.warm_up, steps // 4),
             validate_every=min(config.validate_every, max(1, steps // 4)),
             checkpoint_every=min(config.checkpoint_every, max(1, steps // 4)),
             seed=seed,
         )
+
+
+def _given(value: T | None, own: T) -> T:
+    """A study's value, or a method's own where it has none."""
+    return own if value is None else value
 
 
 def _changed(part: Any, values: dict[str, Any]) -> Any:

@@ -106,7 +106,8 @@ def limits(data: Data, quiet: list[str], resampled: bool, estimated: bool = Fals
     if estimated:
         found.append(
             "the states are a filter's estimate, with slow errors of its own: laws of the "
-            "disturbance can't be told from them, and samples count for fewer than there are"
+            "disturbance and structure without a name can't be told from them, and samples count "
+            "for fewer than there are"
         )
     if data.left_out == "run":
         found.append(

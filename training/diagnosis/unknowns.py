@@ -68,8 +68,11 @@ def seek(
 ) -> Seen | None:
     """Structure in what the names leave; where it wins more than they do, in place of them.
 
-    In the second case `found` is set back to the belief without names.
+    In the second case `found` is set back to the belief without names. Of estimated states none is
+    sought: what their estimator does has structure of its own.
     """
+    if found.current.noise.estimated:
+        return None
     rows = [*parameters_of(bench.library, found.hypotheses), *nuisance]
     left = screened(bench, found.current, rows, alpha, rng)
     if left is None:

@@ -67,6 +67,8 @@ class Plant(NamedTuple):
     rigid_mass: Float[Array, ""]
     drag: Callable[[Array], Array]
     """The drag wrench at a velocity relative to the water."""
+    inverse: Float[Array, "n 6"]
+    """Thruster forces of least effort for a wrench F_Bo_B."""
 
 
 class Effect(eqx.Module):

@@ -146,7 +146,9 @@ class Extended(Dynamics):
         weight = getattr(self.base, "weight", self.base.displaced_mass * 9.80665)
         rigid = self.base.rigid_inertia[0, 0]
         drag = self.base.drag_wrench
-        return Plant(self.positions, self.directions, mass, jnp.asarray(weight), rigid, drag)
+        return Plant(
+            self.positions, self.directions, mass, jnp.asarray(weight), rigid, drag, self.inverse
+        )
 
     def _any(self, hook: str) -> bool:
         return any(effect.acts(hook) for effect in self.effects)

@@ -12,6 +12,7 @@ from ..errors import UserError
 from .added_mass import AddedMass, AddedMassCoupling
 from .attitude import ClockOffset, GyroBias, HeadingError
 from .base import ALL_OR_ONE, Effect, Parameter
+from .command import CommandGain
 from .delay import ActuationDelay
 from .drag import CubicDrag, DragAsymmetry, DragCoupling, LinearDrag, QuadraticDrag
 from .dvl import DvlLeverArm, DvlMisalignment, DvlScale
@@ -37,6 +38,7 @@ KINDS: dict[str, type[Effect]] = {
     for kind in (
         ThrusterLag,
         ActuationDelay,
+        CommandGain,
         ThrusterDeadZone,
         ThrustAsymmetry,
         ThrustCurve,
@@ -115,6 +117,10 @@ class Library:
     def index(self, cause: str, where: str, parameter: str) -> int:
         """Where a number stands in θ."""
         return self._index[cause, where, parameter]
+
+    def has(self, cause: str) -> bool:
+        """Whether a cause is among the effects."""
+        return any(effect.name == cause for effect in self.effects)
 
     def at(self, cause: str, where: str) -> list[int]:
         """Where the numbers of one cause at one place stand in θ."""

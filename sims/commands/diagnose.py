@@ -29,8 +29,9 @@ class Diagnose:
     (N·m√s). Without it a level other than believed can't be told."""
     alpha: float = 0.01
     """Rate of false alarms over all names together."""
-    refit: Literal["none", "scales", "linear"] = "none"
-    """Coefficients that are fitted before any cause is named."""
+    refit: Literal["none", "scales", "linear", "command"] = "none"
+    """Coefficients that are fitted before any cause is named; `command`: the scale of the command on
+    each axis, and drag, where commands pass through gains that are not known."""
     out: Path = Path("diagnosis")
     """Folder to write."""
 

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from ...models.checks import check_numbers, require
 from ...models.dynamics import Dynamics
+from ...models.effects.command import CommandGain
 from ...models.effects.extended import Extended
 from ...models.effects.library import Library
 from ...models.recording import Recording
@@ -45,15 +46,16 @@ class DiagnoseConfig:
     Attributes:
         alpha: rate of false alarms over all names together.
         refit: what is fitted before and beside every cause: `none` (every difference from the
-            belief is a cause), `scales` (one factor on all thrust) or `linear` (added masses,
-            drag, buoyancy).
+            belief is a cause), `scales` (one factor on all thrust), `linear` (added masses,
+            drag, buoyancy) or `command` (a factor on the wrench of each axis, drag, buoyancy: for
+            commands of unknown scale; the inertia stays as believed).
         most: causes at most.
         horizon: length of the simulations that the gain is told by (s).
         seed: of bootstraps and simulated noise.
     """
 
     alpha: float = 0.01
-    refit: Literal["none", "scales", "linear"] = "none"
+    refit: Literal["none", "scales", "linear", "command"] = "none"
     most: int = 6
     horizon: float = 4.0
     seed: int = 0
@@ -96,6 +98,8 @@ class Diagnoser:
         self.tell = progress
         self.faults, faulty = problems(recording)
         self.bench = Bench.of(recording, vehicle, base, faulty)
+        if self.config.refit == "command" and not self.bench.library.has("command_gain"):
+            self.bench = self.bench.with_effect(CommandGain.neutral())
         self.resampled = any("resampled" in note for note in recording.notes)
         directions = np.asarray(self.bench.model.allocate(jnp.eye(self.bench.data.u.shape[1])))
         self.quiet = unexcited(self.bench.data, directions)
@@ -234,7 +238,7 @@ class Diagnoser:
         R = len(bench.data.fold)
         still = np.repeat(bench.believed[:, None], R, axis=1)
         contenders = {"base": Contender(still)}
-        belief = refitted(bench, "linear")
+        belief = refitted(bench, "command" if self.config.refit == "command" else "linear")
         _, look, _ = bench.polish(bench.believed, belief, rounds=3)
         contenders["refitted"] = Contender(bench.without_each(look, belief))
         if extended:

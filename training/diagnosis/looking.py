@@ -25,6 +25,8 @@ from .responses import respond
 
 _RANDOM = ("waves", "current_varying")
 """Causes that are sought as laws: their motion differs from run to run."""
+_ASKED = ("command_gain",)
+"""Causes that are there only where the user says so: they take the place of the mass."""
 
 
 _HALVINGS = 4
@@ -239,7 +241,7 @@ def _library(data: Data, effects: Sequence[Effect]) -> tuple[Library, np.ndarray
     low, high = data.X[:, 4:].min(axis=(0, 2)) - 0.3, data.X[:, 4:].max(axis=(0, 2)) + 0.3
     walls = (low[0], high[0], low[1], high[1])
     options = {"proximity": {"floor": float(low[2]), "walls": tuple(map(float, walls))}}
-    left_out = set(_RANDOM) | (set() if data.has_voltage else {"voltage_sag"})
+    left_out = {*_RANDOM, *_ASKED} | (set() if data.has_voltage else {"voltage_sag"})
     kinds = [k for k in KINDS.values() if k.family != "disturbance" and k.name not in left_out]
     own = [e for e in effects if e.name not in {k.name for k in kinds}]
     library = Library([*(k.neutral(**options.get(k.name, {})) for k in kinds), *own])

@@ -113,7 +113,9 @@ def lost_attitude(
         return moved.T - middle.apply(v.T), turned / dt[:, None] - w.T
 
     def residual(offset: np.ndarray) -> np.ndarray:
-        return np.concatenate([e.ravel() / s for e, s in zip(errors(offset), (0.1, 1), strict=True)])
+        return np.concatenate(
+            [e.ravel() / s for e, s in zip(errors(offset), (0.1, 1), strict=True)]
+        )
 
     best = scipy.optimize.least_squares(residual, np.zeros(3), loss="soft_l1", f_scale=0.1)
     return best.x, np.linalg.norm(errors(best.x)[1], axis=1)
@@ -191,7 +193,10 @@ def convert_folder(folder: Path, out: Path, mixed: bool = False) -> Recording:
             "(see docs/tank-runs.md)"
         )
     vehicle = load_vehicle("bluerov2_heavy")
-    made, notes = [], ["PWM is what MANUAL mode makes of the pilot's channels; it was not recorded."]
+    made, notes = (
+        [],
+        ["PWM is what MANUAL mode makes of the pilot's channels; it was not recorded."],
+    )
     for path in files:
         trajectories, note = convert(read_run(path), vehicle, mixed=mixed)
         made += trajectories

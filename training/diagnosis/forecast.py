@@ -25,7 +25,9 @@ def _forecast(model: Extended, arrays: Arrays, every: int, dt: float) -> tuple[A
         fresh = model.infer(X0, V0, rate)
         starts = n % every == 0
         x, v = (jnp.where(starts, a, b) for a, b in zip(fresh, (x, v), strict=True))
-        memory, x, v, a = advance(model, inertia, memory, x, v, command, dt, substeps(dt), volts[None])
+        memory, x, v, a = advance(
+            model, inertia, memory, x, v, command, dt, substeps(dt), volts[None]
+        )
         return (memory, x, v, a), model.observe(x, v, a)
 
     start = (settle(model, u[0], dt, substeps(dt)), X[0], V[0], (V[1] - V[0]) / dt)

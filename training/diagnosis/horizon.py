@@ -279,8 +279,10 @@ def bootstrap(
     for name, part in GROUPS.items():
         sums = []
         for e in (first, second if second is not None else np.ones_like(first)):
-            square = np.sum(e[step - 1, part] ** 2, axis=0) if e is first or second is not None else (
-                np.ones(e.shape[2])
+            square = (
+                np.sum(e[step - 1, part] ** 2, axis=0)
+                if e is first or second is not None
+                else (np.ones(e.shape[2]))
             )
             sums.append(np.bincount(index, square, len(labels)))
         value = np.sqrt(sums[0].sum() / sums[1].sum())

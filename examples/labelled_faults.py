@@ -200,7 +200,8 @@ def told(ratios: Float[np.ndarray, "n 3"]) -> np.ndarray:
 
 def beyond(runs: Runs, y: Float[np.ndarray, "n m"], reference: str) -> dict[str, int]:
     """How many runs of each class lie beyond the limit of a class taken as the reference."""
-    own, fold, hits = runs.label == reference, folds(runs), dict.fromkeys(CLASSES, 0)
+    own, fold = runs.label == reference, folds(runs)
+    hits: dict[str, int] = {label: 0 for label in CLASSES}  # noqa: C420
     one = runs.drive[:, :1]
     for k in range(FOLDS):
         model = Healthy.fit(one[own & (fold != k)], y[own & (fold != k)])
@@ -258,7 +259,7 @@ def draw(runs: Runs, path: Path) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Read, judge, print the tables, write the figure."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("file", type=Path, help="haizhe_train.npz")
     parser.add_argument("--out", type=Path, default=Path("runs/faults"), help="folder to write")
     given = parser.parse_args(arguments)

@@ -7,9 +7,10 @@ and models from the preset to one with named causes are judged on the run they w
 
 import argparse
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +20,25 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from spinndrift.models.csv_table import read_table
+from spinndrift.models.effects.command import CommandGain
+from spinndrift.models.effects.library import Library, kind
 from spinndrift.models.errors import UserError
+from spinndrift.models.frames import pose_to_enu, twist_frd_to_flu
 from spinndrift.models.recording import Recording
 from spinndrift.models.recording_build import Trajectory
 from spinndrift.models.recording_csv import read_csv, write_csv
-from spinndrift.models.frames import pose_to_enu, twist_frd_to_flu
 from spinndrift.models.resample import continuous, geodesic, grid, hold, linear
 from spinndrift.models.vehicle import Vehicle, load_vehicle
+from spinndrift.training.diagnosis.horizon import (
+    HorizonFit,
+    Windows,
+    fit_forecasts,
+    forecast_errors,
+    rmse,
+    windows,
+)
+from spinndrift.training.diagnosis.looking import Bench
+from spinndrift.training.diagnosis.telling import believed
 
 RATE = 10.0  # Hz
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
@@ -49,6 +62,24 @@ MIXER = np.array(
     ],
     float,
 )
+HORIZON, EVERY = 2.0, 2.0  # s: length of the forecasts that are fitted and judged, and their starts
+LEVERS = (
+    "yaw_from_sway",
+    "yaw_from_surge",
+    "pitch_from_surge",
+    "pitch_from_heave",
+    "roll_from_sway",
+)
+LADDER: tuple[tuple[str, tuple[tuple[str, tuple[str, ...] | None], ...]], ...] = (
+    ("preset", ()),
+    ("gain of the command, by axis", (("command_gain", None),)),
+    ("and drag, net buoyancy", (("linear_drag", None), ("quadratic_drag", None),
+                                ("net_buoyancy", None))),
+    ("and centre of gravity", (("centre_of_gravity", None),)),
+    ("and thruster lag", (("thruster_lag", ("all",)),)),
+    ("and drag coupling", (("drag_coupling", LEVERS),)),
+)  # fmt: skip
+"""Causes and their places (all without any), each line beside those before."""
 FLICKER = 0.5  # rad/s between the pose's turning and the recorded rate
 SHORTEST = 5.0  # s
 
@@ -160,7 +191,7 @@ def convert(
         part = slice(a, b + 1)
         if t[b] - t[a] < SHORTEST:
             continue
-        even = grid(t[a], t[b], dt)
+        even = grid(float(t[a]), float(t[b]), dt)
         command = hold(even, run.start[part], run.command[:, part], dt)
         trajectories.append(
             Trajectory(
@@ -206,3 +237,166 @@ def convert_folder(folder: Path, out: Path, mixed: bool = False) -> Recording:
     )
     write_csv(recording, out)
     return read_csv(out)
+
+
+# ------------------------------------------------------------------------------------ judging
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One line of the ladder: errors on runs left out, in the order of `block`, and fits by run."""
+
+    name: str
+    errors: Float[np.ndarray, "M 12 K"]
+    fits: dict[str, HorizonFit]
+
+
+def rows_of(library: Library, lines: int) -> list[int]:
+    """Parameters that are free on a line of the ladder."""
+    found = []
+    for _, causes in LADDER[: lines + 1]:
+        for cause, places in causes:
+            for where in kind(cause).places if places is None else places:
+                found += library.at(cause, where)
+    return found
+
+
+def climb(
+    recording: Recording, lines: int = len(LADDER), tell: Callable[[str], None] = print
+) -> tuple[Bench, Windows, list[Judged]]:
+    """Fit every line of the ladder without each run in turn, and forecast that run."""
+    bench = Bench.of(recording, load_vehicle("bluerov2_heavy"))
+    bench = bench.with_effect(CommandGain.neutral())
+    w = windows(bench.data, HORIZON, EVERY)
+    judged = []
+    for number, (name, _) in enumerate(LADDER[:lines]):
+        errors, fits = np.zeros((w.u.shape[0], 12, len(w.block))), {}
+        rows = rows_of(bench.library, number)
+        for s, run in enumerate(bench.data.names):
+            fit = fit_forecasts(bench, w, rows, kept=w.scenario != s)
+            own = w.scenario == s
+            errors[..., own] = forecast_errors(bench, fit.theta, w)[..., own]
+            fits[run] = fit
+        tell(f"fitted: {name}")
+        judged.append(Judged(name, errors, fits))
+    return bench, w, judged
+
+
+def tables(bench: Bench, w: Windows, judged: list[Judged]) -> str:
+    """What is gained on runs left out, and the values found, in Markdown."""
+    rule = "|---" * 5 + "|"
+    lines = [f"Errors after {HORIZON:g} s on the run left out, 95 % intervals, blocks of 10 s:", ""]
+    lines += ["| model | position (m) | rotation (rad) | velocity (m/s) | rate (rad/s) |", rule]
+    for j in judged:
+        cells = rmse(j.errors, w.block, np.random.default_rng(0)).values()
+        lines.append(f"| {j.name} | " + " | ".join(_cell(*c) for c in cells) + " |")
+    lines += ["", "Ratio to the line before:", ""]
+    lines += ["| model | position | rotation | velocity | rate |", "|---" * 5 + "|"]
+    for before, j in pairwise(judged):
+        cells = rmse(j.errors, w.block, np.random.default_rng(0), before.errors).values()
+        lines.append(f"| {j.name} | " + " | ".join(_cell(*c, digits=2) for c in cells) + " |")
+    lines += ["", "Position (m) and rotation (rad) by the run left out:", ""]
+    lines += ["| model | " + " | ".join(bench.data.names) + " |", "|---" * 4 + "|"]
+    for j in judged:
+        cells = []
+        for s in range(len(bench.data.names)):
+            own = w.scenario == s
+            found = rmse(j.errors[..., own], w.block[own], np.random.default_rng(0))
+            cells.append(f"{found['position'][0]:.3f}, {found['rotation'][0]:.3f}")
+        lines.append(f"| {j.name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def values(bench: Bench, fit: HorizonFit) -> str:
+    """Coefficients by axis, for the inertia believed, with standard errors."""
+    error = dict(zip(fit.rows, fit.errors, strict=True))
+
+    def of(cause: str, where: str, parameter: str = "") -> tuple[float, float]:
+        rows = [i for i in bench.library.at(cause, where)
+                if parameter in ("", bench.library.entries[i].parameter.name)]  # fmt: skip
+        return float(fit.theta[rows[0]]), float(error.get(rows[0], 0.0))
+
+    M = np.diag(bench.mass(bench.believed))
+    lines = ["| axis | thrust of the preset's | linear drag (believed) | quadratic drag (believed) "
+             "| quadratic drag / inertia | drag / thrust, of the preset's |",
+             "|---" * 6 + "|"]  # fmt: skip
+    for i, axis in enumerate(AXES):
+        (g, ge), (l, le), (d, de) = (of(c, axis) for c in
+                                    ("command_gain", "linear_drag", "quadratic_drag"))  # fmt: skip
+        l0, d0 = (believed(bench, c, axis) for c in ("linear_drag", "quadratic_drag"))
+        lines.append(
+            f"| {axis} | {1 + g:.2f} ± {ge:.2f} | {l0 + l:.2f} ± {le:.2f} ({l0:.2f}) "
+            f"| {d0 + d:.2f} ± {de:.2f} ({d0:.2f}) | {(d0 + d) / M[i]:.2f} "
+            f"| {(d0 + d) / d0 / (1 + g):.2f} |"
+        )
+    others = [i for i in fit.rows if bench.library.entries[i].cause not in
+              ("command_gain", "linear_drag", "quadratic_drag")]  # fmt: skip
+    for i in others:
+        e = bench.library.entries[i]
+        lines.append(
+            f"- {e.cause} {e.where} {e.parameter.name}: {fit.theta[i]:.4g} ± {error[i]:.2g} "
+            f"{e.parameter.unit}"
+        )
+    return "\n".join([*lines[:8], "", *lines[8:]])
+
+
+def _cell(value: float, low: float, high: float, digits: int = 3) -> str:
+    return f"{value:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def draw(w: Windows, judged: list[Judged], dt: float, path: Path) -> None:
+    """Growth of errors with time, and where they end, run by run."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
+    t = dt * (1 + np.arange(w.u.shape[0]))
+    for j in judged:
+        for axis, part in zip(axes[:2], (slice(0, 3), slice(3, 6)), strict=True):
+            axis.plot(t, np.sqrt((j.errors[:, part] ** 2).sum(axis=1).mean(axis=1)), label=j.name)
+    axes[0].set(xlabel="time ahead (s)", ylabel="position error (m, RMS)", ylim=(0, None))
+    axes[1].set(xlabel="time ahead (s)", ylabel="rotation error (rad, RMS)", ylim=(0, None))
+    for j, style in ((judged[0], "o"), (judged[-1], ".")):
+        for s, colour in enumerate(("tab:blue", "tab:orange", "tab:green")):
+            own = w.scenario == s
+            e = np.linalg.norm(j.errors[-1, :3][:, own], axis=0)
+            axes[2].plot(np.sort(e), np.linspace(0, 1, e.size), style, color=colour, markersize=3,
+                         markerfacecolor="none" if style == "o" else colour)  # fmt: skip
+    axes[2].set(xlabel="position error at the end (m)", ylabel="share of windows", xscale="log",
+                title="rings: preset, dots: last line; a colour a run")  # fmt: skip
+    axes[2].title.set_fontsize("small")
+    axes[0].legend(fontsize="x-small", frameon=False)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Convert, climb the ladder, print the tables, write the figure."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path, help="folder of the runs as CSV files")
+    parser.add_argument("--out", type=Path, default=Path("runs/tank"), help="folder to write")
+    parser.add_argument("--lines", type=int, default=len(LADDER), help="lines of the ladder")
+    parser.add_argument("--convert", action="store_true", help="only convert")
+    parser.add_argument("--mixed", action="store_true",
+                        help="convert to PWM of thrusters as MANUAL mode mixes them")  # fmt: skip
+    given = parser.parse_args(arguments)
+    jax.config.update("jax_enable_x64", True)
+    recording = convert_folder(given.folder, given.out / "recording", given.mixed)
+    print("\n".join(recording.notes))
+    print(f"wrote {given.out / 'recording'}\n")
+    if given.convert:
+        return
+    bench, w, judged = climb(recording, given.lines, lambda text: print(text, file=sys.stderr))
+    print(tables(bench, w, judged))
+    fit = fit_forecasts(bench, w, rows_of(bench.library, given.lines - 1))
+    print(f"\n{judged[-1].name}, fitted to all runs, inertia as believed:\n")
+    print(values(bench, fit))
+    draw(w, judged, recording.dt, given.out / "tank-runs.png")
+    print(f"\nwrote {given.out / 'tank-runs.png'}")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

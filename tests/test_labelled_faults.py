@@ -1,9 +1,9 @@
-"""The example on labelled faults: what it tells of made-up runs with known faults, and of real ones."""
+"""The example on labelled faults: what it tells of made-up runs, and of real ones."""
 
 import numpy as np
 import pytest
-from helpers import ROOT, load_example, run_script, shared_data
 
+from helpers import ROOT, load_example, run_script, shared_data
 from spinndrift.models.errors import UserError
 
 example = load_example("labelled_faults")
@@ -20,8 +20,11 @@ def made(rng, weight=0.0, offset=0.0, moment=(0.0, 0.0, 0.0), rows=190):
     shown = offset + 0.01 * rng.normal() + np.where(on, w * (t - 0.15), 0)
     press = 600 + (shown - offset) / 0.0094
     trim = [5 + rng.normal(), rng.normal()]
-    roll, pitch = (a + np.where(on, m + 0.5 * rng.normal(), 0) for a, m in zip(trim, moment[:2]))
-    yaw = np.where(on, -20 + moment[2] + 3 * rng.normal(), 0)
+    turned = [
+        np.where(on, m + s * rng.normal(), 0) for m, s in zip(moment, (0.5, 0.5, 3), strict=True)
+    ]
+    roll, pitch = trim[0] + turned[0], trim[1] + turned[1]
+    yaw = np.where(on, -20 + turned[2], 0)
     volts = np.full(rows, 12.0 + 0.1 * rng.normal())
     pwm = np.where(on, level, 1100)
     return np.stack([t // 1, pwm, shown, press, volts, roll, pitch, yaw], axis=1)

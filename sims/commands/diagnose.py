@@ -30,8 +30,8 @@ class Diagnose:
     alpha: float = 0.01
     """Rate of false alarms over all names together."""
     refit: Literal["none", "scales", "linear", "command"] = "none"
-    """Coefficients that are fitted before any cause is named; `command`: the scale of the command on
-    each axis, and drag, where commands pass through gains that are not known."""
+    """Coefficients that are fitted before any cause is named; `command`: the scale of each axis'
+    command, and drag, where commands pass through gains that are not known."""
     out: Path = Path("diagnosis")
     """Folder to write."""
 

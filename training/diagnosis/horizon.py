@@ -15,6 +15,7 @@ a few steps are told less sharply.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -27,12 +28,11 @@ from ...models.effects.extended import Extended
 from ...models.effects.library import Library
 from ...models.effects.predict import advance
 from .data import Data
-from .innovations import as_arrays, settle, substeps
+from .innovations import settle, substeps
 from .looking import Bench
 from .telling import believed
 
-_DAMPING = (1e-6, 1e-4, 1e-2, 1.0, 1e2)
-_ENOUGH = 1e-4
+_ENOUGH = 1e-3
 """Relative gain of a step below which a fit has ended."""
 
 
@@ -61,7 +61,7 @@ class Windows:
 
 @dataclass(frozen=True)
 class HorizonFit:
-    """Values of the parameters chosen, their standard errors, and the loss on the windows."""
+    """Values of all parameters, standard errors of those fitted (`rows`), loss on the windows."""
 
     theta: Float[np.ndarray, " p"]
     rows: tuple[int, ...]
@@ -94,7 +94,7 @@ def _errors(model: Extended, arrays: tuple, dt: float) -> Float[Array, "M 12 K"]
     inertia = model.inertia()
     count = substeps(dt)
 
-    def body(carry, given):
+    def body(carry: Any, given: Any) -> Any:
         memory, x, v = carry
         X1, V1, command, volts = given
         memory, x, v, a = advance(model, inertia, memory, x, v, command, dt, count, volts[None])
@@ -180,6 +180,10 @@ def fit_forecasts(
     flat = np.array([len(p.probes) > 2 and min(p.probes) > 0 for p in entries]) & (start == 0)
     best[own] = np.clip(np.where(flat, probe, start), low, high)
 
+    def tried(values: np.ndarray) -> float:
+        e = _apart(bench.model, library.filled(jnp.asarray(values)), arrays, w.dt)
+        return _loss(np.asarray(e)[..., kept], size)
+
     def seen(values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         e, J = _slopes(library=library, model=bench.model, theta=jnp.asarray(values),
                        rows=jnp.asarray(own), arrays=arrays, dt=w.dt)  # fmt: skip
@@ -190,22 +194,17 @@ def fit_forecasts(
     damping = 1e-3
     for _ in range(rounds):
         H, g = _normal(e, J, size, probe)
-        moved = None
+        before = loss
         for _ in range(6):
             step = -np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-9), g) * probe
             trial = best.copy()
             trial[own] = np.clip(best[own] + step, low, high)
-            found = seen(trial)
-            if np.isfinite(found[0]) and found[0] < loss and _is_body(bench, library, trial):
-                moved = trial, found
-                damping = max(damping / 5, 1e-7)
+            if _is_body(bench, library, trial) and tried(trial) < loss:
+                best, damping = trial, max(damping / 5, 1e-7)
+                loss, e, J = seen(best)
                 break
             damping *= 6
-        if moved is None:
-            break
-        gained, best = loss - moved[1][0], moved[0]
-        loss, e, J = moved[1]
-        if gained < _ENOUGH * loss:
+        if before - loss < _ENOUGH * before:
             break
     theta[at] = best
     return HorizonFit(theta, tuple(rows), _spread(e, J, size, probe, w.block[kept]), loss)
@@ -217,7 +216,8 @@ def _is_body(bench: Bench, library: Library, values: np.ndarray) -> bool:
 
 
 def _loss(e: np.ndarray, size: np.ndarray) -> float:
-    x = np.sum((e / size[:, None]) ** 2, axis=1) / e.shape[1]
+    with np.errstate(over="ignore", invalid="ignore"):  # a step too far diverges
+        x = np.sum((e / size[:, None]) ** 2, axis=1) / e.shape[1]
     return float(np.mean(2 * (np.sqrt(1 + x) - 1))) if np.isfinite(x).all() else np.inf
 
 
@@ -251,41 +251,31 @@ def _spread(
     return np.sqrt(np.maximum(np.diag(inverse @ (total.T @ total) @ inverse), 0)) * probe
 
 
-def rmse(e: Float[np.ndarray, "M 12 K"], step: int) -> dict[str, float]:
-    """Root mean square of position (m), rotation (rad), velocity (m/s) and rate (rad/s)."""
-    return {
-        name: float(np.sqrt(np.mean(np.sum(e[step - 1, part] ** 2, axis=0))))
-        for name, part in GROUPS.items()
-    }
-
-
 GROUPS = {
     "position": slice(0, 3), "rotation": slice(3, 6), "velocity": slice(6, 9), "rate": slice(9, 12),
 }  # fmt: skip
+"""Position (m), rotation (rad), velocity (m/s) and rate (rad/s) of errors."""
 
 
-def bootstrap(
-    first: Float[np.ndarray, "M 12 K"],
-    second: Float[np.ndarray, "M 12 K"] | None,
+def rmse(
+    e: Float[np.ndarray, "M 12 K"],
     block: Int[np.ndarray, " K"],
-    step: int,
     rng: np.random.Generator,
+    than: Float[np.ndarray, "M 12 K"] | None = None,
     draws: int = 2000,
 ) -> dict[str, tuple[float, float, float]]:
-    """RMSE, or its ratio first / second, with a 95 % interval by drawing blocks again."""
+    """RMSE at the windows' end, or its ratio to that of `than`, with 95 % intervals.
+
+    Intervals come from drawing whole blocks again (Künsch 1989), the same ones for both.
+    """
     labels, index = np.unique(block, return_inverse=True)
     drawn = rng.integers(len(labels), size=(draws, len(labels)))
     found = {}
     for name, part in GROUPS.items():
-        sums = []
-        for e in (first, second if second is not None else np.ones_like(first)):
-            square = (
-                np.sum(e[step - 1, part] ** 2, axis=0)
-                if e is first or second is not None
-                else (np.ones(e.shape[2]))
-            )
-            sums.append(np.bincount(index, square, len(labels)))
-        value = np.sqrt(sums[0].sum() / sums[1].sum())
-        draws_ = np.sqrt(sums[0][drawn].sum(axis=1) / sums[1][drawn].sum(axis=1))
-        found[name] = (float(value), *map(float, np.percentile(draws_, (2.5, 97.5))))
+        top = np.sum(e[-1, part] ** 2, axis=0)
+        bottom = np.ones_like(top) if than is None else np.sum(than[-1, part] ** 2, axis=0)
+        a, b = (np.bincount(index, x, len(labels)) for x in (top, bottom))
+        sampled = np.sqrt(a[drawn].sum(axis=1) / b[drawn].sum(axis=1))
+        low, high = np.percentile(sampled, (2.5, 97.5))
+        found[name] = float(np.sqrt(a.sum() / b.sum())), float(low), float(high)
     return found

@@ -16,7 +16,7 @@ from ...models.effects.predict import advance
 from .data import Data
 
 SUBSTEPS, LONGEST = 2, 0.025
-"""Substeps of a step at least, and their length (s) at most: a hull's drag is stiff in fast turns."""
+"""Substeps of a step at least, and their length (s) at most: drag is stiff in fast turns."""
 
 
 def substeps(dt: float) -> int:

@@ -206,7 +206,9 @@ def convert(
     roll, pitch, yaw = offset
     note = (
         f"{run.name}: attitude at the start put back: roll {roll:.3f}, pitch {pitch:.3f}, "
-        f"yaw {yaw:.3f} rad; {int(bad.sum())} flickers cut."
+        f"yaw {yaw:.3f} rad; {int(bad.sum())} flickers cut; poses turn off the rates by "
+        f"{np.median(off):.3f} rad/s (median), with bins stamped at their start by "
+        f"{np.median(lost_attitude(run.start, run)[1]):.3f}."
     )
     return trajectories, note
 
@@ -304,6 +306,16 @@ def tables(bench: Bench, w: Windows, judged: list[Judged]) -> str:
             found = rmse(j.errors[..., own], w.block[own], np.random.default_rng(0))
             cells.append(f"{found['position'][0]:.3f}, {found['rotation'][0]:.3f}")
         lines.append(f"| {j.name} | " + " | ".join(cells) + " |")
+    if len(judged) > 1:
+        lines += [
+            "",
+            "Gain of surge, sway, heave, fitted without one run (alone, inertia and drag",
+            "of the preset):",
+            "",
+        ]
+        for run, fit in judged[1].fits.items():
+            rows = [bench.library.index("command_gain", axis, "gain") for axis in AXES[:3]]
+            lines.append(f"- without {run}: " + ", ".join(f"{1 + fit.theta[i]:.2f}" for i in rows))
     return "\n".join(lines)
 
 

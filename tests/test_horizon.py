@@ -51,6 +51,11 @@ def test_a_gain_scales_one_axis_of_the_wrench_alone():
     np.testing.assert_allclose(model.allocate(scaled), expected, atol=1e-12)
 
 
+def rows_of(bench, *names):
+    """As many rows of the same effects in every test: one compiled program."""
+    return [i for name in names for i in bench.library.at(*name)]
+
+
 def test_gains_and_drag_come_back_from_forecasts():
     """Noise-free data, the integrator's step that of the truth: to the end of Gauss–Newton."""
     truth = (
@@ -59,25 +64,19 @@ def test_gains_and_drag_come_back_from_forecasts():
         KINDS["linear_drag"].of("yaw", change=0.8),
     )
     bench = bench_of(recording(truth))
-    w = windows(bench.data, 2.0, 2.0)
-    rows = [
-        i
-        for cause, where in (
-            ("command_gain", "surge"), ("command_gain", "heave"), ("quadratic_drag", "surge"),
-            ("linear_drag", "yaw"),
-        )
-        for i in bench.library.at(cause, where)
-    ]  # fmt: skip
+    w = windows(bench.data, 1.0, 2.0)
+    surge, heave = ("command_gain", "surge"), ("command_gain", "heave")
+    drag, yaw = ("quadratic_drag", "surge"), ("linear_drag", "yaw")
+    rows = rows_of(bench, surge, heave, drag, yaw)
     fit = fit_forecasts(bench, w, rows)
     found = {bench.library.entries[i][:2]: fit.theta[i] for i in rows}
-    assert found["command_gain", "surge"] == pytest.approx(-0.5, abs=0.01)
-    assert found["quadratic_drag", "surge"] == pytest.approx(-25.0, rel=0.05)
-    assert found["linear_drag", "yaw"] == pytest.approx(0.8, rel=0.1)
-    assert found["command_gain", "heave"] == pytest.approx(0.0, abs=0.01)
-    block = w.block
+    assert found[surge] == pytest.approx(-0.5, abs=0.01)
+    assert found[drag] == pytest.approx(-25.0, rel=0.05)
+    assert found[yaw] == pytest.approx(0.8, rel=0.1)
+    assert found[heave] == pytest.approx(0.0, abs=0.01)
     before = forecast_errors(bench, bench.believed, w)
     after = forecast_errors(bench, fit.theta, w)
-    ratio = rmse(after, block, np.random.default_rng(0), before)
+    ratio = rmse(after, w.block, np.random.default_rng(0), before)
     assert max(high for _, _, high in ratio.values()) < 0.1
 
 
@@ -88,7 +87,10 @@ def test_drag_stays_passive_and_left_out_windows_are_not_used():
     )
     bench = bench_of(recording(truth))
     w = windows(bench.data, 1.0, 2.0)
-    rows = [*bench.library.at("quadratic_drag", "surge"), *bench.library.at("linear_drag", "surge")]
+    drag = ("quadratic_drag", "surge")
+    rows = rows_of(
+        bench, drag, ("linear_drag", "surge"), ("command_gain", "heave"), ("linear_drag", "yaw")
+    )
     kept = w.scenario == 0
     fit = fit_forecasts(bench, w, rows, kept=kept)
     assert fit.theta[rows[0]] == pytest.approx(-58.42, abs=1e-6)  # all of the preset's

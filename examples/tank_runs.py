@@ -81,6 +81,7 @@ LADDER: tuple[tuple[str, tuple[tuple[str, tuple[str, ...] | None], ...]], ...] =
 )  # fmt: skip
 """Causes and their places (all without any), each line beside those before."""
 FLICKER = 0.5  # rad/s between the pose's turning and the recorded rate
+GAP = 0.25  # s between bins: longer ones would be filled with straight lines
 SHORTEST = 5.0  # s
 
 
@@ -174,7 +175,7 @@ def wrench_of(command: Float[np.ndarray, "6 n"], vehicle: Vehicle) -> Float[np.n
 def convert(
     run: Run, vehicle: Vehicle, rate: float = RATE, mixed: bool = False
 ) -> tuple[list[Trajectory], str]:
-    """Even steps, the lost attitude put back, cut where markers flicker; and a note on it.
+    """Even steps, the lost attitude put back, cut at flickers and gaps; and a note on it.
 
     Bins are averages, so they hold at their middle; a command acts as long as its bin.
     """
@@ -184,7 +185,7 @@ def convert(
     X = pose_to_enu(np.concatenate([continuous(q), run.position]))
     X[:4] = continuous(X[:4])
     V = twist_frd_to_flu(run.twist)
-    bad = off > FLICKER
+    bad = (off > FLICKER) | (np.diff(t) > GAP)
     edges = np.flatnonzero(np.diff(np.concatenate([[True], bad, [True]]).astype(int)))
     trajectories = []
     for a, b in zip(edges[::2], edges[1::2], strict=True):  # steps a … b-1 are good
@@ -206,7 +207,7 @@ def convert(
     roll, pitch, yaw = offset
     note = (
         f"{run.name}: attitude at the start put back: roll {roll:.3f}, pitch {pitch:.3f}, "
-        f"yaw {yaw:.3f} rad; {int(bad.sum())} flickers cut; poses turn off the rates by "
+        f"yaw {yaw:.3f} rad; {int(bad.sum())} flickers and gaps cut; poses turn off the rates by "
         f"{np.median(off):.3f} rad/s (median), with bins stamped at their start by "
         f"{np.median(lost_attitude(run.start, run)[1]):.3f}."
     )

@@ -143,7 +143,8 @@ def innovations_figure(finding: Finding) -> Figure:
     """Mean innovation over time in the scenario that the belief explains worst."""
     d = finding.data
     score = (finding.base.z**2).sum(axis=(0, 1))
-    worst = int(np.argmax([score[d.scenario == s].mean() for s in range(len(d.names))]))
+    there = np.unique(d.scenario)  # faulty runs are left out, and with them whole scenarios
+    worst = int(there[np.argmax([score[d.scenario == s].mean() for s in there])])
     own = d.scenario == worst
     figure, axes = panels(2, 3, 3.9, sharex=True, sharey=True)
     t = np.arange(len(d.u)) * d.dt

@@ -1,9 +1,11 @@
 """What several test files need: where data lies, how to run code in a fresh interpreter."""
 
+import importlib.util
 import os
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -41,3 +43,20 @@ def run_python(code: str, *arguments: str, timeout: float = 300) -> str:
     if done.returncode != 0:
         pytest.fail(f"exit code {done.returncode}:\n{done.stdout}\n{done.stderr}", pytrace=False)
     return done.stdout
+
+
+def load_example(name: str) -> ModuleType:
+    """Return the module of `examples/<name>.py`."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def run_script(path: Path, *arguments: str, timeout: float = 300) -> tuple[int, str, str]:
+    """Run a script in a fresh interpreter; return exit code, standard output and errors."""
+    command = [sys.executable, str(path), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+    return done.returncode, done.stdout, done.stderr

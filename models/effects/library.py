@@ -88,7 +88,7 @@ COEFFICIENTS: dict[str, type[Effect]] = {
     kind.name: kind
     for kind in (ThrustTable, VoltageExponent, AxisThrust, ThrustLever, CentreOfBuoyancy)
 }
-"""What is refitted with `--refit all` and never named as a cause."""
+"""What is refitted where `--refit` asks for it, and never named as a cause."""
 
 
 def kind(name: str) -> type[Effect]:
@@ -132,6 +132,10 @@ class Library:
     def index(self, cause: str, where: str, parameter: str) -> int:
         """Where a number stands in θ."""
         return self._index[cause, where, parameter]
+
+    def has(self, cause: str) -> bool:
+        """Whether a cause is among the effects."""
+        return any(effect.name == cause for effect in self.effects)
 
     def at(self, cause: str, where: str) -> list[int]:
         """Where the numbers of one cause at one place stand in θ."""

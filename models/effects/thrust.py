@@ -168,7 +168,7 @@ class AxisThrust(Effect):
 
     name: ClassVar[str] = "axis_thrust"
     family: ClassVar = "actuation"
-    parameters: ClassVar = (Parameter("scale", "1", (0.05,), -0.95, 20.0, 0.3),)
+    parameters: ClassVar = (Parameter("scale", "1", (0.05,), -3.0, 20.0, 0.3),)
     places: ClassVar = AXES
     order: ClassVar[int] = 15
     source: ClassVar[str] = "thrusters 30 to 45° from the axis; moment arms differ by 10 to 100 %"

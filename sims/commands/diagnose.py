@@ -29,10 +29,12 @@ class Diagnose:
     (N·m√s). Without it a level other than believed can't be told."""
     alpha: float = 0.01
     """Rate of false alarms over all names together."""
-    refit: Literal["none", "scales", "linear", "all"] = "none"
-    """Coefficients that are fitted before any cause is named: none, one factor on all thrust, added
-    mass, drag and buoyancy, or all of a grey box (these, thrust by axis, its curve and levers,
-    restoring moment), for a belief that is wrong in most of them."""
+    refit: Literal["none", "scales", "linear", "command", "all"] = "none"
+    """Coefficients that are fitted before any cause is named: none, one factor on all thrust
+    (`scales`), added mass, drag and buoyancy (`linear`), drag, buoyancy and the scale of each axis'
+    command, where commands pass through gains that are not known (`command`), or all of a grey box
+    (these, the thrusters' curve and levers, restoring moment), for a belief that is wrong in most
+    of them."""
     out: Path = Path("diagnosis")
     """Folder to write."""
 

@@ -17,6 +17,7 @@ The way of a diagnosis, one module a step:
 `checks`      data at fault: stuck sensors, jumps, axes never excited
 `gain`        what a model is worth on data left out: scores, simulations, bands
 `blackbox`    a rival that names nothing: ridge regression on random features
+`horizon`     fits to forecasts, for states that were smoothed, binned or resampled
 `telling`     causes with intervals, in words
 `diagnose`    all of it, to a `result.Diagnosis` (`result.schema()` is its JSON Schema)
 

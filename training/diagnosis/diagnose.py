@@ -13,6 +13,7 @@ from ...models.checks import check_numbers, require
 from ...models.dynamics import Dynamics
 from ...models.effects.extended import Extended
 from ...models.effects.library import Library
+from ...models.effects.thrust import AxisThrust
 from ...models.recording import Recording
 from ...models.vehicle import Vehicle
 from . import result, telling
@@ -31,7 +32,7 @@ from .unknowns import accept, seek, structure
 from .waves import all_laws, is_apart
 
 Progress = Callable[[float, str], None]
-Refit = Literal["none", "scales", "linear", "all"]
+Refit = Literal["none", "scales", "linear", "command", "all"]
 _MOST_UNKNOWN = 2
 _RESAMPLED, _OF_A_STEP = 0.02, 0.1
 """Nats a sample that a law, and share of a step that a time must have, in resampled data."""
@@ -49,8 +50,9 @@ class DiagnoseConfig:
         alpha: rate of false alarms over all names together.
         refit: what is fitted before and beside every cause: `none` (every difference from the
             belief is a cause), `scales` (one factor on all thrust), `linear` (added masses,
-            drag, buoyancy) or `all` (these, the thrusters' curve, thrust by axis and its levers,
-            the centre of buoyancy: `identify`).
+            drag, buoyancy), `command` (a factor on the wrench of each axis, drag, buoyancy: for
+            commands of unknown scale; the inertia stays as believed) or `all` (these, the
+            thrusters' curve and levers, the centre of buoyancy: `identify`).
         most: causes at most.
         horizon: length of the simulations that the gain is told by (s).
         seed: of bootstraps and simulated noise.
@@ -100,6 +102,8 @@ class Diagnoser:
         self.tell = progress
         self.faults, faulty = problems(recording)
         self.bench = Bench.of(recording, vehicle, base, faulty)
+        if self.config.refit == "command" and not self.bench.library.has("axis_thrust"):
+            self.bench = self.bench.with_effect(AxisThrust.neutral())
         self.resampled = any("resampled" in note for note in recording.notes)
         directions = np.asarray(self.bench.model.allocate(jnp.eye(self.bench.data.u.shape[1])))
         self.quiet = unexcited(self.bench.data, directions)
@@ -257,7 +261,7 @@ class Diagnoser:
             belief = refitted(bench, "all")
             look = bench.look(bench.moved(found.first.theta, self.bench.library), belief)
         else:
-            belief = refitted(bench, "linear")
+            belief = refitted(bench, "command" if self.config.refit == "command" else "linear")
             _, look, _ = bench.polish(bench.believed, belief, rounds=3)
         contenders["refitted"] = Contender(bench.without_each(look, belief))
         if extended:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ...models.effects.extended import Extended
 from ...models.effects.predict import advance
 from .data import Data
-from .innovations import SUBSTEPS, Arrays, as_arrays, settle
+from .innovations import Arrays, as_arrays, settle, substeps
 
 
 @eqx.filter_jit
@@ -25,10 +25,12 @@ def _forecast(model: Extended, arrays: Arrays, every: int, dt: float) -> tuple[A
         fresh = model.infer(X0, V0, rate)
         starts = n % every == 0
         x, v = (jnp.where(starts, a, b) for a, b in zip(fresh, (x, v), strict=True))
-        memory, x, v, a = advance(model, inertia, memory, x, v, command, dt, SUBSTEPS, volts[None])
+        memory, x, v, a = advance(
+            model, inertia, memory, x, v, command, dt, substeps(dt), volts[None]
+        )
         return (memory, x, v, a), model.observe(x, v, a)
 
-    start = (settle(model, u[0], dt, SUBSTEPS), X[0], V[0], (V[1] - V[0]) / dt)
+    start = (settle(model, u[0], dt, substeps(dt)), X[0], V[0], (V[1] - V[0]) / dt)
     xs = (jnp.arange(len(u)), X[:-1], V[:-1], u, voltage)
     return jax.lax.scan(body, start, xs)[1]
 

@@ -21,7 +21,7 @@ from ...models.effects.predict import advance
 from ..metrics import BANDS, order_statistics
 from . import result
 from .blackbox import BlackBox
-from .innovations import Arrays, as_arrays, difference, predict, settle
+from .innovations import Arrays, as_arrays, difference, predict, settle, substeps
 from .looking import Bench
 from .noise import estimate, filtered, make_filter, mean_jacobian
 
@@ -184,6 +184,7 @@ def _errors(
     model = model.with_effects(effects)
     inertia = model.inertia()
     R, S = V.shape[2], 1 + SAMPLES
+    coarse = substeps(dt) // 2
     noisy = (jnp.arange(S)[None, :, None] > 0).astype(V.dtype)
     record = record[:, None] * noisy
     b = diffusion[:, None] * noisy * jnp.sqrt(jnp.asarray(dt, V.dtype))
@@ -214,7 +215,7 @@ def _errors(
             push = jnp.sum(inertia.matrix.reshape(6, 6, *(inertia.matrix.shape[2:] or (1, 1)))
                            * a[None], axis=1)  # fmt: skip
         memory, x, v, a = advance(
-            model, inertia, memory, x, v, command[:, None], dt, 1, volts[None, None], push
+            model, inertia, memory, x, v, command[:, None], dt, coarse, volts[None, None], push
         )
         v = kicked(v, draw[12:18])
         seen = model.observe(x, v, a)
@@ -223,7 +224,7 @@ def _errors(
 
     zero = jnp.zeros((1, S, R), V.dtype)
     rate = ((V[1] - V[0]) / dt)[:, None] + zero
-    memory = settle(model, u[0][:, None] + zero, dt, 1)
+    memory = settle(model, u[0][:, None] + zero, dt, coarse)
     start = (memory, X[0][:, None] + zero, V[0][:, None] + zero, rate)
     before = jnp.concatenate([u[:1], u[:-1]])
     xs = (jnp.arange(len(u)), X[:-1], V[:-1], X[1:], V[1:], u, before, voltage)

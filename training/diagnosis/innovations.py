@@ -1,5 +1,6 @@
 """Errors of one-step predictions from every sample, and how they propagate."""
 
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,7 +15,13 @@ from ...models.effects.library import Library
 from ...models.effects.predict import advance
 from .data import Data
 
-SUBSTEPS = 2
+SUBSTEPS, LONGEST = 2, 0.025
+"""Substeps of a step at least, and their length (s) at most: drag is stiff in fast turns."""
+
+
+def substeps(dt: float) -> int:
+    """Substeps of a prediction over `dt` s."""
+    return max(SUBSTEPS, math.ceil(dt / LONGEST - 1e-6))
 
 
 Arrays = tuple[Array, Array, Array, Array]
@@ -72,13 +79,13 @@ def _predict(model: Extended, effects: Any, arrays: Arrays, dt: float) -> Predic
         # what late instruments missed happened under the command before
         x, v = model.infer(X0, V0, rate)
         memory, Xp, Vp, a = advance(
-            model, inertia, memory, x, v, command, dt, SUBSTEPS, volts[None]
+            model, inertia, memory, x, v, command, dt, substeps(dt), volts[None]
         )
         error = difference(*model.observe(Xp, Vp, a), X1, V1)
         jacobian = _jacobian(plain, rest, x, (v + Vp) / 2, command, dt)
         return (memory, a), Predictions(error, Xp, Vp, jacobian, a)
 
-    start = settle(model, u[0], dt, SUBSTEPS), (V[1] - V[0]) / dt
+    start = settle(model, u[0], dt, substeps(dt)), (V[1] - V[0]) / dt
     return jax.lax.scan(body, start, (X[:-1], V[:-1], X[1:], V[1:], u, voltage))[1]
 
 

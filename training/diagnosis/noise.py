@@ -149,8 +149,8 @@ def make_filter(
         log_det[n] = np.log(np.diag(L)).sum()
         K = np.linalg.solve(S, prior).T
         gap = np.eye(12) - K
-        P = gap @ prior
-        P = (P + P.T) / 2
+        # Joseph's form stays positive where exact records meet a long step (Bucy and Joseph 1968)
+        P = gap @ prior @ gap.T + K @ R @ K.T
     return Filter(keep, whiten, log_det)
 
 

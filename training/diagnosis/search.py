@@ -16,7 +16,9 @@ from .noise import Filter
 
 BELIEFS = ("added_mass", "linear_drag", "quadratic_drag", "net_buoyancy")
 """Coefficients that a user would expect fitted."""
-REFITS = {"none": (), "scales": ("thrust_scale",), "linear": BELIEFS}
+UNSCALED = ("axis_thrust", "linear_drag", "quadratic_drag", "net_buoyancy")
+"""Those that a command of unknown scale leaves, with the inertia as it is believed."""
+REFITS = {"none": (), "scales": ("thrust_scale",), "linear": BELIEFS, "command": UNSCALED}
 _TIMES = ("thruster_lag", "actuation_delay", "clock_offset")
 _CLOSE = 0.7
 RIVALS = 0.25

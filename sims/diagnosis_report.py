@@ -56,19 +56,19 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
                 f"**Unknown:** {s.description} wins {s.heldout_gain:.0f} nats; the best name would "
                 f"win {s.best_name_gain:.0f} of them."
             )
+    if d.ratios:
+        page.text("What the motion tells whatever the mass, over the inertia of the axis:")
+        page.table(
+            [(r.name, r.where, f"{r.believed:.4g}", _interval(r.found))
+             for r in d.ratios],
+            ("ratio", "where", "believed", "found (95 %)"),
+        )  # fmt: skip
     if d.refitted:
         page.text("Coefficients that were fitted before any cause was named:")
         page.table(
             [(r.name, r.where, f"{r.believed:.4g}", _told(r.parameter, r.fitted))
              for r in d.refitted],
             ("coefficient", "where", "believed", "fitted (95 %)"),
-        )  # fmt: skip
-    if d.ratios:
-        page.text("What the motion tells whatever the mass, over the inertia of the axis:")
-        page.table(
-            [(r.name, r.where, f"{r.believed:.4g}", _told("", r.found).removeprefix(" "))
-             for r in d.ratios],
-            ("ratio", "where", "believed", "found (95 %)"),
         )  # fmt: skip
     page.figure(names_figure(finding), "Each name alone, fitted on the other scenarios.")
     page.section(
@@ -105,8 +105,12 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
 
 
 def _told(name: str, v: Value) -> str:
+    return f"{name} = {_interval(v)}"
+
+
+def _interval(v: Value) -> str:
     low, high = v.interval95
-    return f"{name} = {v.value:.4g} ({low:.4g} … {high:.4g}) {v.unit}"
+    return f"{v.value:.4g} ({low:.4g} … {high:.4g}) {v.unit}"
 
 
 def _gains(d: Diagnosis) -> list[tuple[str, ...]]:

@@ -21,6 +21,7 @@ from spinndrift.models.recording_build import Trajectory, assemble
 from spinndrift.models.vehicle import load_vehicle
 from spinndrift.training.diagnosis.identify import coefficients, identify, with_coefficients
 from spinndrift.training.diagnosis.looking import Bench
+from spinndrift.training.diagnosis.noise import estimate
 from spinndrift.training.diagnosis.ratios import ratios
 
 MASS, INERTIA, FULL, ARM = 10.5, 0.2681, 51.48, 0.25
@@ -164,3 +165,22 @@ def test_a_moved_centre_of_buoyancy_is_that_of_another_vehicle():
     model = Extended.create(level.dynamics(), (effect,), belief.thrusters())
     got, want = model.balance(X, zero, zero)[1], moved.dynamics().balance(X, zero, zero)[1]
     np.testing.assert_allclose(got, want, atol=1e-9)
+
+
+def test_slow_errors_of_an_estimator_are_told_from_those_of_instruments():
+    """AR(1) errors of one step, against differences of independent ones (same variance)."""
+    rng, N, rho = np.random.default_rng(0), 20000, 0.8
+    white = 0.01 * rng.standard_normal((N + 1, 12, 1))
+    slow = np.empty((N, 12, 1))
+    slow[0] = white[0]
+    for n in range(1, N):
+        slow[n] = rho * slow[n - 1] + (1 - rho**2) ** 0.5 * white[n]
+    A, mass, weight = np.eye(12), 10 * np.eye(6), np.ones((N, 1))
+    estimated = estimate(slow, weight, A, mass, DT)
+    assert estimated.estimated
+    np.testing.assert_allclose(estimated.memory, (1 + rho) / (1 - rho), rtol=0.1)
+    np.testing.assert_allclose(estimated.diffusion, 0.01 * 10 / DT**0.5, rtol=0.05)
+    measured = estimate(white[1:] - white[:-1], weight, A, mass, DT)
+    assert not measured.estimated
+    np.testing.assert_allclose(measured.record, 0.01, rtol=0.06)  # four standard errors
+    np.testing.assert_array_equal(measured.slip, 0)

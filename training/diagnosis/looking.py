@@ -37,7 +37,7 @@ _LIGHTEST = 0.1
 
 
 class Look(NamedTuple):
-    """All that one set of parameters shows."""
+    """All that one set of parameters shows; `z` are the whitened innovations as they are."""
 
     theta: Float[np.ndarray, " p"]
     predictions: Predictions
@@ -147,7 +147,7 @@ class Bench:
         kalman = make_filter(noise, A, np.linalg.inv(mass), self.data.dt, len(self.data.u))
         # correlated innovations tell less than as many independent ones
         less = kalman.whiten / np.sqrt(noise.memory)[:, None]
-        return p, noise, replace(kalman, whiten=less)
+        return p, noise, replace(kalman, whiten=less, memory=noise.memory)
 
     def errors(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "N 12 R"]:
         """Errors of one-step predictions, zero where a piece has no sample."""
@@ -173,7 +173,7 @@ class Bench:
         z = respond(self.model, self.library, theta, design.probes, self.data, p, kalman)
         data = self.data
         evidence = Evidence(self.library, theta, design, gram(z), data.cluster, data.fold)
-        own_z = z[0].reshape(len(data.u), 12, -1)
+        own_z = z[0].reshape(len(data.u), 12, -1) * np.sqrt(kalman.memory)[:, None]
         return Look(theta, p, noise, kalman, evidence, own_z, float(evidence.total[0, 0]) / 2)
 
     def polish(

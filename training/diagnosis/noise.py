@@ -53,11 +53,13 @@ class Filter:
         keep: I - K_n before step n (N, 12, 12).
         whiten: L_n⁻¹ with L Lᵀ the innovations' covariance after step n (N, 12, 12).
         log_det: ½ log det of that covariance (N,).
+        memory: by which the whitened squares are divided already (`Noise.memory`) (12,).
     """
 
     keep: Float[np.ndarray, "N 12 12"]
     whiten: Float[np.ndarray, "N 12 12"]
     log_det: Float[np.ndarray, " N"]
+    memory: Float[np.ndarray, "12"] = field(default_factory=lambda: np.ones(12))
 
 
 def mean_jacobian(jacobian: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, "12 12"]:

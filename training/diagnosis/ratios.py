@@ -25,13 +25,14 @@ _STEP = 0.1
 """Standard errors by which parameters are moved for the derivative of a ratio."""
 _SMALL = 1e-9
 _UNITS = {
-    "inertia": "1",
-    "quadratic_drag": "1/m or 1",
-    "linear_drag": "1/s",
-    "half_thrust": "m/s² or rad/s²",
-    "restoring": "rad/s²",
-    "net_buoyancy": "m/s²",
+    "inertia": ("1", "1"),
+    "quadratic_drag": ("1/m", "1"),
+    "linear_drag": ("1/s", "1/s"),
+    "half_thrust": ("m/s²", "rad/s²"),
+    "restoring": ("", "rad/s²"),
+    "net_buoyancy": ("m/s²", ""),
 }
+"""Of translations and of rotations."""
 
 
 def ratios(bench: Bench, look: Look, rows: Sequence[int]) -> list[result.Ratio]:
@@ -63,7 +64,8 @@ def ratios(bench: Bench, look: Look, rows: Sequence[int]) -> list[result.Ratio]:
     found = []
     for (name, where), value in mean.items():
         error = 1.96 * float(np.sqrt(variance[name, where]))
-        told = result.Value(value, _UNITS[name], (value - error, value + error))
+        unit = _UNITS[name][where in AXES[3:]]
+        told = result.Value(value, unit, (value - error, value + error))
         found.append(result.Ratio(name, where, before[name, where], told))
     return found
 

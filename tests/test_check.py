@@ -114,7 +114,7 @@ def test_folders_without_a_case_and_wrong_answers_are_refused(tmp_path):
 def diagnosis(*causes, problems=()):
     data = result.DataSummary([], 1, 1.0, 0.05, "pwm", list(problems), ["sway was not driven"], {})
     return result.Diagnosis(
-        result.VERSION, "explained" if causes else "adequate", "", list(causes), [], {}, {},
+        result.VERSION, "explained" if causes else "adequate", "", list(causes), [], [], {}, {},
         "scenario", data, 1, 8.0, 0.01,
     )  # fmt: skip
 

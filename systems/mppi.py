@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, UInt32
 from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from .jit import Program, compiled, together, value_or_zeros
+from .jit import Program, compiled, require_double, together, value_or_zeros
 from .mppi_core import Draw, MppiPlanner, MppiState, Rolled
 from .plan import Plan
 from .plan_samples import SampleLayout
@@ -59,8 +59,13 @@ class Mppi(LeafSystem):
     """
 
     def __init__(self, planner: MppiPlanner):
-        """The planner brings model, limits, obstacles, goal and settings."""
+        """The planner brings model, limits, obstacles, goal and settings.
+
+        Raises:
+            ValueError: if JAX runs in single precision.
+        """
         super().__init__()
+        require_double()
         config = planner.config
         self.planner = planner
         self.layout = config.layout

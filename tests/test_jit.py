@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import LeafSystem
 
-from spinndrift.systems.jit import VectorFunction, value_or_zeros
+from spinndrift.systems.jit import VectorFunction, compiled, together, value_or_zeros
 
 
 def test_arguments_and_results_keep_their_order_and_sizes():
@@ -50,6 +50,20 @@ def test_equal_functions_share_one_program_and_others_don_t():
     first, twin, near, long, long_near = (f._program for f in functions)
     assert first is twin
     assert len({id(p) for p in (first, near, long, long_near)}) == 4
+
+
+def test_programs_of_one_text_but_other_trees_are_two():
+    like = jax.ShapeDtypeStruct((2,), np.float64)
+    pair, named = compiled(lambda a: (a, a), like), compiled(lambda a: {"x": a, "y": a}, like)
+    assert pair is compiled(lambda b: (b, b), like)
+    assert set(named.call(np.ones(2))) == {"x", "y"}
+
+
+def test_programs_run_together_give_each_its_own():
+    like = jax.ShapeDtypeStruct((2,), np.float64)
+    programs = [compiled(lambda a, k=k: k * a, like) for k in (1.0, 2.0, 3.0)]
+    results = together(programs, [(np.full(2, x),) for x in (1.0, 10.0, 100.0)])
+    np.testing.assert_array_equal(results, [[1, 1], [20, 20], [300, 300]])
 
 
 def test_single_precision_is_refused_with_a_remedy():

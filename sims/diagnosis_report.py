@@ -59,7 +59,7 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
     if d.ratios:
         page.text("What the motion tells whatever the mass, over the inertia of the axis:")
         page.table(
-            [(r.name, r.where, f"{r.believed:.4g}", _interval(r.found))
+            [(r.name, r.where, f"{r.believed:.4g}", _valued(r.found))
              for r in d.ratios],
             ("ratio", "where", "believed", "found (95 %)"),
         )  # fmt: skip
@@ -105,10 +105,10 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
 
 
 def _told(name: str, v: Value) -> str:
-    return f"{name} = {_interval(v)}"
+    return f"{name} = {_valued(v)}"
 
 
-def _interval(v: Value) -> str:
+def _valued(v: Value) -> str:
     low, high = v.interval95
     return f"{v.value:.4g} ({low:.4g} … {high:.4g}) {v.unit}"
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Bool, Float
 
 from spinndrift.models.errors import UserError
+from spinndrift.sims.check.tables import interval
 
 STEP = 0.05  # s between rows; the file's own time counts whole seconds
 COLUMNS = ("pwm1", "depth", "press", "voltage", "roll", "pitch", "w_yaw")
@@ -209,13 +209,6 @@ def beyond(runs: Runs, y: Float[np.ndarray, "n m"], reference: str) -> dict[str,
         for label in CLASSES:
             hits[label] += int(far[runs.label == label].sum())
     return hits
-
-
-def interval(hits: int, of: int) -> tuple[float, float]:
-    """95 % interval of a share (Clopper and Pearson 1934)."""
-    low = 0.0 if hits == 0 else float(scipy.stats.beta.ppf(0.025, hits, of - hits + 1))
-    high = 1.0 if hits == of else float(scipy.stats.beta.ppf(0.975, hits + 1, of - hits))
-    return low, high
 
 
 def table(runs: Runs, said: np.ndarray, kept: Bool[np.ndarray, " n"]) -> str:

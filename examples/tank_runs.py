@@ -20,6 +20,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from spinndrift.models.csv_table import read_table
+from spinndrift.models.effects.base import AXES
 from spinndrift.models.effects.library import Library, kind
 from spinndrift.models.effects.thrust import AxisThrust
 from spinndrift.models.errors import UserError
@@ -40,7 +41,6 @@ from spinndrift.training.diagnosis.horizon import (
 from spinndrift.training.diagnosis.looking import Bench
 
 RATE = 10.0  # Hz
-AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 POSITION, EULER = ("x_m", "y_m", "z_m"), ("roll_rad", "pitch_rad", "yaw_rad")
 TWIST = ("u_mps", "v_mps", "w_mps", "p_radps", "q_radps", "r_radps")
 COMMAND = tuple(f"cmd_{axis}" for axis in AXES)

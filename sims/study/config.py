@@ -81,6 +81,7 @@ class SizeConfig:
     """0 starts from the belief, whose coefficients no data have touched yet."""
     learning_rate: float | None = None
     head_decay: float | None = None
+    refit_at: tuple[float, ...] | None = None
     length_s: float | None = None
     """Seconds of each window."""
     stride_s: float | None = None
@@ -104,6 +105,7 @@ class SizeConfig:
             drift=_changed(drift, {"iterations": self.drift_iterations}),
             learning_rate=_given(self.learning_rate, config.learning_rate),
             head_decay=_given(self.head_decay, config.head_decay),
+            refit_at=_given(self.refit_at, config.refit_at),
             steps=steps,
             batch=_given(self.batch, config.batch),
             warm_up=min(config.warm_up, steps // 4),

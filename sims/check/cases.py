@@ -61,6 +61,7 @@ class Truth:
         kind: which table a case belongs to.
         label: what is counted together; by default the hidden names.
         size: times a realistic size.
+        data: how they were recorded, where not as usual; such cases are counted apart.
         verdict: what a diagnosis should say.
         causes: what is hidden.
         vehicle: the belief; empty for what the data name.
@@ -74,6 +75,7 @@ class Truth:
     verdict: Verdict
     label: str = ""
     size: float = 1.0
+    data: str = "usual"
     causes: tuple[HiddenCause, ...] = ()
     vehicle: str = ""
     diffusion: tuple[float, ...] = ()

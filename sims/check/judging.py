@@ -27,7 +27,7 @@ class Judgement:
     """How a diagnosis compares with the truth.
 
     Attributes:
-        case, kind, label, size: which.
+        case, kind, label, size, data: which.
         verdict, verdict_right: what was said, and whether it is so.
         hidden, named: names, as drawn and as told.
         first_right: the first name is hidden, or the twin of one that is.
@@ -45,6 +45,7 @@ class Judgement:
     kind: str
     label: str
     size: float
+    data: str
     verdict: str
     verdict_right: bool
     hidden: list[str]
@@ -169,4 +170,4 @@ def judge(case: Case, alpha: float, progress: Update) -> tuple[Judgement, Findin
         gain = gain_of(case, finding.extended.with_effects(()), finding.extended, vehicle)
     told = compare(truth, d)
     about = {"case": case.name, "kind": truth.kind, "label": truth.called, "size": truth.size}
-    return Judgement(**about, **told, gain=gain, seconds=d.seconds), finding
+    return Judgement(**about, data=truth.data, **told, gain=gain, seconds=d.seconds), finding

@@ -10,6 +10,7 @@ import scipy.stats
 from .judging import CLOSE
 
 Row = dict[str, Any]
+USUAL = "usual"
 ENOUGH = 0.9
 """Share of the true model's gain that an extended model should reach."""
 
@@ -50,7 +51,9 @@ def share(hits: int, total: int) -> str:
 
 def tables(rows: Sequence[Row]) -> list[Table]:
     """All tables for which there are cases."""
-    found = [_summary(rows), _confusion(rows), _sizes(rows), _mixed(rows), _faults(rows)]
+    usual = [r for r in rows if r["data"] == USUAL]
+    found = [_summary(usual), _confusion(usual), _sizes(usual), _mixed(usual), _faults(usual)]
+    found += [_varied(rows), _misses(rows)]
     return [table for table in found if table.rows]
 
 
@@ -171,6 +174,43 @@ def _sizes(rows: Sequence[Row]) -> Table:
         ("size", "something named", "first name right"),
         lines,
     )
+
+
+def _varied(rows: Sequence[Row]) -> Table:
+    """Single causes of realistic size by how they were recorded."""
+    chosen = [r for r in _of(rows, "single") if r["size"] == 1]
+    kinds = list(dict.fromkeys(r["data"] for r in chosen))
+    if kinds in ([], [USUAL]):
+        return Table("", (), [])
+    lines = []
+    for kind in sorted(kinds, key=lambda k: (k != USUAL, k)):
+        own = [r for r in chosen if r["data"] == kind]
+        z = np.abs([z for r in own for z in r["z"].values() if z == z])
+        gains = [g for r in own if (g := gain_share(r)) is not None]
+        lines.append(
+            (
+                kind,
+                share(sum(r["first_right"] for r in own), len(own)),
+                str(sum(r["first_right"] and len(r["named"]) == 1 for r in own)),
+                str(sum(not r["named"] for r in own)),
+                share(int(np.sum(z <= CLOSE)), len(z)),
+                share(sum(g >= ENOUGH for g in gains), len(gains)),
+                f"{np.median([r['seconds'] for r in own]):.0f}",
+            )
+        )
+    header = (
+        "data", "first name right", "alone", "nothing named", f"parameters within {CLOSE:g} SE",
+        "gain ≥ 90 %", "s",
+    )  # fmt: skip
+    return Table("Single causes of realistic size by how they were recorded.", header, lines)
+
+
+def _misses(rows: Sequence[Row]) -> Table:
+    """What was said where the first name of data recorded in another way is wrong."""
+    wrong = [r for r in _of(rows, "single") if r["data"] != USUAL and not r["first_right"]]
+    lines = [(r["data"], r["label"], ", ".join(r["named"]) or "adequate") for r in wrong]
+    caption = "Where the first name is wrong in other data than the usual."
+    return Table(caption, ("data", "hidden", "named, in order"), lines)
 
 
 def _mixed(rows: Sequence[Row]) -> Table:

@@ -5,7 +5,7 @@ import shutil
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from .blind import SCALES, table
+from .blind import DATA, SCALES, table
 
 
 def main() -> None:
@@ -17,11 +17,12 @@ def main() -> None:
     parser.add_argument("--sizes", type=float, nargs="+", default=[1.0], help="of realistic ones")
     parser.add_argument("--nulls", type=int, help="by default as the scale says")
     parser.add_argument("--mixed", type=int, default=4, help="pairs, and triples")
+    parser.add_argument("--data", choices=sorted(DATA), nargs="+", default=["usual"])
     parser.add_argument("--only", nargs="+", default=["*"], help="patterns of names of cases")
     given = parser.parse_args()
     plan, nulls = SCALES[given.scale]
     nulls = nulls if given.nulls is None else given.nulls
-    for blind in table(plan, nulls, given.seeds, tuple(given.sizes), given.mixed):
+    for blind in table(plan, nulls, given.seeds, given.sizes, given.mixed, given.data):
         folder = given.folder / blind.name
         if not any(fnmatchcase(blind.name, only) for only in given.only):
             continue

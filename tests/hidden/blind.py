@@ -6,7 +6,7 @@ change of variables, nothing is said of a parameter, or a tolerance is given.
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,13 @@ SCALES = {
     "full": (Plan(scenarios=10, runs=20, seconds=10.0), 20),
 }
 """Amount of data, and number of nulls."""
+DATA: dict[str, Callable[[Plan], Plan]] = {
+    "usual": lambda plan: plan,
+    "closed": lambda plan: replace(plan, loop="closed"),
+    "uneven": lambda plan: replace(plan, even=False),
+    "minute": Plan.short,
+}
+"""How a cause is recorded: commands played, by a pilot in closed loop, at uneven time steps, 60 s."""
 NOMINAL = (*(float(b) for b in disturbance.NOMINAL_DIFFUSION),)
 
 
@@ -49,6 +56,7 @@ class Blind:
     case: Case
     size: float = 1.0
     fault: str = ""
+    data: str = "usual"
 
     def write(self, folder: Path) -> None:
         """Write data/, truth.yaml last, and, where means differ, fresh/ and oracle/."""
@@ -74,6 +82,7 @@ class Blind:
             "verdict": answer["verdict"],
             "label": self.fault or " + ".join(label(e) for e in case.effects) or self.kind,
             "size": self.size,
+            "data": self.data,
             "causes": [told(e) for e in case.effects],
             "diffusion": list(NOMINAL),
             "every": EVERY,
@@ -207,9 +216,24 @@ def told(effect: Effect) -> dict[str, Any]:
 
 
 def table(
-    plan: Plan, nulls: int, seeds: int = 1, sizes: tuple[float, ...] = (1.0,), mixed: int = 4
+    plan: Plan,
+    nulls: int,
+    seeds: int = 1,
+    sizes: Sequence[float] = (1.0,),
+    mixed: int = 4,
+    data: Sequence[str] = ("usual",),
 ) -> Iterator[Blind]:
-    """Singles of every cause at each size, effects without a name, nulls, mixtures, faulty data."""
+    """Singles of every cause at each size, effects without a name, nulls, mixtures, faulty data.
+
+    Other `data` than the usual are there for singles of realistic size alone.
+    """
+    for variety in (d for d in data if d != "usual"):
+        for k, name in enumerate(CAUSES):
+            for i in range(seeds):
+                case = draw(1000 * (i + 1) + k, names=(name,), plan=DATA[variety](plan))
+                yield Blind(f"{name}-{variety}-{i}", "single", case, data=variety)
+    if "usual" not in data:
+        return
     for size in sizes:
         for k, name in enumerate(CAUSES):
             for i in range(seeds):

@@ -171,7 +171,7 @@ def test_cases_are_judged_once_and_the_page_keeps_its_own_words(tmp_path, monkey
         progress(0.5, "half")
         single = case.truth.kind == "single"
         return Judgement(
-            case.name, case.truth.kind, case.truth.called, 1.0, "adequate", not single,
+            case.name, case.truth.kind, case.truth.called, 1.0, "usual", "adequate", not single,
             ["thruster_lag"] * single, [], not single, None, 0, 0, seconds=2.0,
         ), Finding()  # fmt: skip
 

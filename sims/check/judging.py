@@ -8,12 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ...models import se3
+from ...models.dynamics import Dynamics
 from ...models.effects.extended import Extended
+from ...models.recording import Recording
 from ...models.recording_csv import read_csv
 from ...models.vehicle import Vehicle, load_vehicle
 from ...training.diagnosis.data import make_data
 from ...training.diagnosis.diagnose import DiagnoseConfig, Finding, diagnose
-from ...training.diagnosis.forecast import forecast
+from ...training.diagnosis.forecast import Learned, forecast
 from ...training.diagnosis.result import Cause, Diagnosis
 from ..progress import Update
 from .cases import Case, HiddenCause, Truth, read_oracle
@@ -126,13 +128,31 @@ def gain_of(case: Case, base: Extended, extended: Extended, vehicle: Vehicle) ->
     The recorded noise cancels: forecasts are compared with those of the true model, and all three
     start from the same records.
     """
+    return share_of_gain(case, vehicle, (base, None), (extended, None))
+
+
+def share_of_gain(
+    case: Case,
+    vehicle: Vehicle,
+    base: tuple[Extended, Learned | None],
+    better: tuple[Extended, Learned | None],
+) -> dict[str, float]:
+    """The same of models with a learned rest beside them."""
     data = make_data(read_csv(case.folder / "fresh"), vehicle, segment=10**9)
     truths = read_oracle(case.folder / "oracle")
     every = case.truth.every
-    off = [_off(forecast(model, data, every), truths) for model in (base, extended)]
+    off = [_off(forecast(model, data, every, rest), truths) for model, rest in (base, better)]
     for one in off:
         one["all"] = sum(one.values())
     return {part: 1 - off[1][part] / max(off[0][part], 1e-300) for part in off[0]}
+
+
+def believed(truth: Truth, recording: Recording) -> tuple[Vehicle, Dynamics | None]:
+    """The vehicle that a case believes in, and its law where the case states one."""
+    vehicle = load_vehicle(truth.vehicle or recording.vehicle or "bluerov2_heavy")
+    if not truth.diffusion:
+        return vehicle, None
+    return vehicle, vehicle.dynamics(np.array(truth.diffusion, float))
 
 
 def _off(
@@ -159,10 +179,7 @@ def judge(case: Case, alpha: float, progress: Update) -> tuple[Judgement, Findin
     """
     recording = read_csv(case.folder / "data")
     truth = case.truth
-    vehicle = load_vehicle(truth.vehicle or recording.vehicle or "bluerov2_heavy")
-    base = None
-    if truth.diffusion:
-        base = vehicle.dynamics(np.array(truth.diffusion, float))
+    vehicle, base = believed(truth, recording)
     finding = diagnose(recording, vehicle, base, DiagnoseConfig(alpha=alpha), progress)
     d = finding.diagnosis
     gain = {}

@@ -53,7 +53,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
     """All tables for which there are cases."""
     usual = [r for r in rows if r["data"] == USUAL]
     found = [_summary(usual), _confusion(usual), _sizes(usual), _mixed(usual), _faults(usual)]
-    found += [_varied(rows), _misses(rows)]
+    found += [_varied(rows), _misses(rows), _rivals(usual)]
     return [table for table in found if table.rows]
 
 
@@ -211,6 +211,32 @@ def _misses(rows: Sequence[Row]) -> Table:
     lines = [(r["data"], r["label"], ", ".join(r["named"]) or "adequate") for r in wrong]
     caption = "Where the first name is wrong in other data than the usual."
     return Table(caption, ("data", "hidden", "named, in order"), lines)
+
+
+def _rivals(rows: Sequence[Row]) -> Table:
+    """Gains of other methods on the same files, with the terms that sparse ones took."""
+    chosen = [r for r in rows if r.get("rivals") and r["size"] == 1]
+    chosen.sort(key=lambda r: (r["kind"] == "null", r["kind"] != "single", r["label"]))
+    lines = []
+    for label in dict.fromkeys(r["label"] for r in chosen):
+        own = [r for r in chosen if r["label"] == label]
+        if not any(r["gain"] or r["kind"] == "null" for r in own):
+            continue
+        gains = [g for r in own if (g := gain_share(r)) is not None]
+        cells = [_middle(gains)]
+        for name in own[0]["rivals"]:
+            others = [r["rivals"][name] for r in own if name in r["rivals"]]
+            cell = _middle([o["gain"]["all"] for o in others if o["gain"]])
+            counts = [o["count"] for o in others if o["count"] is not None]
+            cells.append(f"{cell} ({np.median(counts):.0f})" if counts else cell)
+        named = ", ".join(dict.fromkeys(n for r in own for n in r["named"])) or "adequate"
+        lines.append((label, named, *cells))
+    names = tuple(chosen[0]["rivals"]) if chosen else ()
+    caption = (
+        "Rivals on the same files: the share of the true model's gain (in brackets the terms of "
+        "sparse regressions, in all six axes; median over cases)."
+    )
+    return Table(caption, ("hidden", "named by spinndrift", "its gain", *names), lines)
 
 
 def _mixed(rows: Sequence[Row]) -> Table:

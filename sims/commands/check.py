@@ -26,6 +26,9 @@ class Check:
     """Patterns of the names of cases or of causes to take (`'lag-*' net_buoyancy`)."""
     alpha: float = 0.01
     """Rate of false alarms that is promised."""
+    rivals: bool = False
+    """Judge sparse regression (pysindy: STLSQ and weak form) and random features on the same files
+    too."""
     out: Path = Path("runs/check")
     """Folder for what was found in each case."""
     docs: Path | None = None
@@ -44,7 +47,7 @@ class Check:
             raise UserError(f"--docs {self.docs}: end the name in .md")
         cases = find_cases(self.cases, self.only)
         with progress_bar(f"{len(cases)} cases") as update:
-            rows = run_cases(cases, self.out, self.alpha, update)
+            rows = run_cases(cases, self.out, self.alpha, update, self.rivals)
         shown = console()
         for table in tables(rows):
             grid = Shown(*table.header, title=table.caption, title_justify="left")

@@ -43,7 +43,7 @@ DATA: dict[str, Callable[[Plan], Plan]] = {
     "uneven": lambda plan: replace(plan, even=False),
     "minute": Plan.short,
 }
-"""How a cause is recorded: commands played, by a pilot in closed loop, at uneven time steps, 60 s."""
+"""How it is recorded: commands played, a pilot in closed loop, uneven time steps, 60 s in all."""
 NOMINAL = (*(float(b) for b in disturbance.NOMINAL_DIFFUSION),)
 
 

@@ -20,13 +20,13 @@ _RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 
 
 class BlackBox(eqx.Module):
-    """Acceleration that a model lacks, by piece: weights (D, 6, R) on D features."""
+    """Acceleration that a model lacks: weights on D features by piece, or one set for all."""
 
     centre: Float[Array, " s"]
     scale: Float[Array, " s"]
     frequencies: Float[Array, "d s"]
     phases: Float[Array, " d"]
-    weights: Float[Array, "D 6 R"]
+    weights: Float[Array, "D 6 #R"]
 
     def features(
         self, X: Float[Array, "7 *b"], V: Float[Array, "6 *b"], u: Array, before: Array
@@ -42,7 +42,9 @@ class BlackBox(eqx.Module):
         self, X: Float[Array, "7 S R"], V: Float[Array, "6 S R"], u: Array, before: Array
     ) -> Float[Array, "6 S R"]:
         """What is added to dV/dt (m/s², rad/s²)."""
-        return jnp.einsum("dsr,dir->isr", self.features(X, V, u, before), self.weights)
+        phi = self.features(X, V, u, before)
+        weights = jnp.broadcast_to(self.weights, (*self.weights.shape[:2], phi.shape[-1]))
+        return jnp.einsum("dsr,dir->isr", phi, weights)
 
 
 def inputs(
@@ -57,17 +59,26 @@ def inputs(
     return jnp.concatenate([jnp.broadcast_to(p, (p.shape[0], *batch)) for p in parts])
 
 
+def arguments(data: Data) -> tuple[Array, Array, Array, Array]:
+    """Poses, twists, commands and the commands a step before, at every step: (·, N, R)."""
+    u = data.u.swapaxes(0, 1)
+    before = np.concatenate([u[:, :1], u[:, :-1]], axis=1)
+    X, V = data.X[:-1].swapaxes(0, 1), data.V[:-1].swapaxes(0, 1)
+    return jnp.asarray(X), jnp.asarray(V), jnp.asarray(u), jnp.asarray(before)
+
+
 def train(
-    predictions: Predictions, data: Data, rng: np.random.Generator, count: int = 240
+    predictions: Predictions,
+    data: Data,
+    rng: np.random.Generator,
+    count: int = 240,
+    whole: bool = False,
 ) -> BlackBox:
     """Fit to the errors of one-step predictions, for every piece without those it is left out with.
 
-    With a single fold it is fitted to all.
+    With a single fold, or `whole`, it is fitted to all.
     """
-    arrays = [jnp.asarray(a) for a in (data.X[:-1].swapaxes(0, 1), data.V[:-1].swapaxes(0, 1))]
-    u = data.u.swapaxes(0, 1)
-    before = np.concatenate([u[:, :1], u[:, :-1]], axis=1)
-    arrays += [jnp.asarray(u), jnp.asarray(before)]
+    arrays = arguments(data)
     s = np.asarray(inputs(*arrays))  # (s, N, R)
     exists = data.weight > 0
     centre, scale = s[:, exists].mean(axis=1), s[:, exists].std(axis=1) + 1e-6
@@ -89,6 +100,9 @@ def train(
         H.append(P @ P.T)
         g.append(P @ y.T)
         square.append((y**2).sum(axis=1))
+    if whole:
+        weights = _ridge(H, g, list(range(len(labels))))[..., None]
+        return eqx.tree_at(lambda b: b.weights, box, jnp.asarray(weights))
     weights = np.zeros((len(phi), 6, len(data.fold)))
     for k, label in enumerate(labels):
         rest = [i for i in range(len(labels)) if i != k] or [k]

@@ -1,6 +1,6 @@
 """What a model forecasts of recorded runs, window by window, without noise."""
 
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -8,40 +8,58 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...models.effects.extended import Extended
+from ...models.effects.extended import Extended, times
 from ...models.effects.predict import advance
 from .data import Data
 from .innovations import Arrays, as_arrays, settle, substeps
 
 
+@runtime_checkable
+class Learned(Protocol):
+    """Acceleration that a model lacks, learned by whatever method; a pytree of arrays."""
+
+    def acceleration(
+        self, X: Float[Array, "7 S R"], V: Float[Array, "6 S R"], u: Array, before: Array
+    ) -> Float[Array, "6 S R"]:
+        """What is added to dV/dt (m/s², rad/s²), by commands and those a step before."""
+        ...
+
+
 @eqx.filter_jit
-def _forecast(model: Extended, arrays: Arrays, every: int, dt: float) -> tuple[Array, Array]:
+def _forecast(
+    model: Extended, arrays: Arrays, every: int, dt: float, rest: Learned | None
+) -> tuple[Array, Array]:
     X, V, u, voltage = arrays
     inertia = model.inertia()
 
     def body(carry: Any, given: Any) -> Any:
         memory, x, v, rate = carry
-        n, X0, V0, command, volts = given
+        n, X0, V0, command, before, volts = given
         fresh = model.infer(X0, V0, rate)
         starts = n % every == 0
         x, v = (jnp.where(starts, a, b) for a, b in zip(fresh, (x, v), strict=True))
+        push = None
+        if rest is not None:
+            lacking = rest.acceleration(*(k[:, None] for k in (x, v, command, before)))
+            push = times(inertia.matrix, lacking[:, 0])
         memory, x, v, a = advance(
-            model, inertia, memory, x, v, command, dt, substeps(dt), volts[None]
+            model, inertia, memory, x, v, command, dt, substeps(dt), volts[None], push
         )
         return (memory, x, v, a), model.observe(x, v, a)
 
     start = (settle(model, u[0], dt, substeps(dt)), X[0], V[0], (V[1] - V[0]) / dt)
-    xs = (jnp.arange(len(u)), X[:-1], V[:-1], u, voltage)
+    before = jnp.concatenate([u[:1], u[:-1]])
+    xs = (jnp.arange(len(u)), X[:-1], V[:-1], u, before, voltage)
     return jax.lax.scan(body, start, xs)[1]
 
 
 def forecast(
-    model: Extended, data: Data, every: int
+    model: Extended, data: Data, every: int, rest: Learned | None = None
 ) -> tuple[Float[np.ndarray, "N 7 R"], Float[np.ndarray, "N 6 R"]]:
     """Poses and twists as they would be recorded at steps 1 … N.
 
     Windows start at steps 0, `every`, 2 `every`, … from the record there; what the actuators
-    remember goes on from window to window.
+    remember goes on from window to window. `rest` is added to what the model says.
     """
-    X, V = _forecast(model, as_arrays(data), every, data.dt)
+    X, V = _forecast(model, as_arrays(data), every, data.dt, rest)
     return np.asarray(X), np.asarray(V)

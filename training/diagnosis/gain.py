@@ -16,11 +16,11 @@ from jaxtyping import Array, Float
 
 from ...models import se3
 from ...models.effects.base import Effect
-from ...models.effects.extended import Extended
+from ...models.effects.extended import Extended, times
 from ...models.effects.predict import advance
 from ..metrics import BANDS, order_statistics
 from . import result
-from .blackbox import BlackBox
+from .blackbox import BlackBox, arguments
 from .innovations import Arrays, as_arrays, difference, predict, settle, substeps
 from .looking import Bench
 from .noise import estimate, filtered, make_filter, mean_jacobian
@@ -70,9 +70,7 @@ def judge(
     p = predict(bench.model, bench.library, theta, data)
     error, jacobian = np.asarray(p.error), np.asarray(p.jacobian)
     if contender.box is not None:
-        X, V, u = (jnp.asarray(a.swapaxes(0, 1)) for a in (data.X[:-1], data.V[:-1], data.u))
-        before = jnp.concatenate([u[:, :1], u[:, :-1]], axis=1)
-        a = np.asarray(contender.box.acceleration(X, V, u, before)).swapaxes(0, 1) * data.dt
+        a = np.asarray(contender.box.acceleration(*arguments(data))).swapaxes(0, 1) * data.dt
         error = error - np.concatenate([a * data.dt / 2, a], axis=1)
     mass = bench.mass(theta.mean(axis=1))
     score = np.zeros(len(data.fold))
@@ -211,9 +209,7 @@ def _errors(
         if box is not None:
             wide = jnp.broadcast_to(command[:, None], (len(command), S, R))
             late = jnp.broadcast_to(before[:, None], wide.shape)
-            a = box.acceleration(x, v, wide, late)
-            push = jnp.sum(inertia.matrix.reshape(6, 6, *(inertia.matrix.shape[2:] or (1, 1)))
-                           * a[None], axis=1)  # fmt: skip
+            push = times(inertia.matrix, box.acceleration(x, v, wide, late))
         memory, x, v, a = advance(
             model, inertia, memory, x, v, command[:, None], dt, coarse, volts[None, None], push
         )

@@ -24,6 +24,7 @@ from .recording_schema import (
     LEADING,
     SENSORS,
     STATES,
+    UNEVEN,
     WRENCH,
     check,
     observed,
@@ -143,6 +144,20 @@ class Recording:
                     sensors,
                     0.0 if start is None else float(start.to_numpy()[j, k]),
                 )
+
+    @property
+    def uneven(self) -> bool:
+        """Whether samples stand at times of their own (`elapsed`) and not on a grid."""
+        return UNEVEN in self.dataset
+
+    def elapsed(self, scenario: int, trajectory: int) -> np.ndarray:
+        """Times of a trajectory's samples since its first one (s), (N,)."""
+        length = int(self.lengths[scenario, trajectory])
+        if self.uneven:
+            times = self.dataset[UNEVEN].to_numpy()[scenario, trajectory, :length]
+            if np.isfinite(times).all():
+                return times - times[:1]
+        return self.dt * np.arange(length)
 
     # inputs
 

@@ -24,7 +24,7 @@ from .frames import pose_to_enu, twist_frd_to_flu
 from .kinematics import contradictions
 from .recording import Recording
 from .recording_build import Trajectory
-from .recording_schema import COMMANDS, MAY_LACK, TWIST, WRENCH
+from .recording_schema import COMMANDS, MAY_LACK, TWIST, UNEVEN, WRENCH
 from .resample import continuous, geodesic, grid, hold, linear, slerp
 
 METADATA = "recording.yaml"
@@ -33,7 +33,7 @@ Frames = Literal["ENU/FLU", "NED/FRD"]
 _POSITION, _QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 _STATE = ("t", *_POSITION, *_QUATERNION, *TWIST)
 _LACKABLE = MAY_LACK["X_WB"] + MAY_LACK["V_WB_B"]
-_UNIFORM, _GAP_STEPS, _GAP_S = 1e-3, 10.0, 1.0
+_UNIFORM, _GAP_STEPS, _GAP_S, _FEW_STEPS = 1e-3, 10.0, 1.0, 4.5
 _NORM = 0.02
 _RANGES = {"pwm": (500.0, 2500.0, "µs (1500 is stopped)"), "voltage": (1.0, 100.0, "V")}
 
@@ -78,11 +78,15 @@ class _Run:
     voltage: np.ndarray | None
 
 
-def read_csv(path: str | os.PathLike[str], *, rate: float | None = None) -> Recording:
+def read_csv(
+    path: str | os.PathLike[str], *, rate: float | None = None, resample: bool = True
+) -> Recording:
     """Read a folder of CSV files with its `recording.yaml` (or the path of that file).
 
     Uneven time steps are resampled to `rate` (Hz; by default that of the YAML, else of the files):
     commands held, poses along the geodesic, twists linearly. At long gaps a run is cut in two.
+    With `resample` off samples stay where they are (`Recording.elapsed`), and a run is cut wherever
+    a step is longer than a few usual ones, because commands are not known there.
 
     Raises:
         UserError: one sentence naming file, line, column and remedy.
@@ -103,9 +107,9 @@ def read_csv(path: str | os.PathLike[str], *, rate: float | None = None) -> Reco
     runs: list[_Run] = []
     for name, scenario in files.items():
         table = read_table(folder / name)
-        runs.extend(_cut(_run(table, scenario, meta, notes), table, notes))
-    dt = _step([run.t for run in runs], rate or meta.rate, notes)
-    trajectories = [_on_grid(run, dt) for run in runs]
+        runs.extend(_cut(_run(table, scenario, meta, notes), table, notes, resample))
+    dt = _step([run.t for run in runs], rate or meta.rate, notes, resample)
+    trajectories = [_on_grid(run, dt) if resample else _as_recorded(run, dt) for run in runs]
     try:
         return Recording.from_trajectories(
             trajectories, dt, vehicle=meta.vehicle, source=meta.source or folder.name, notes=notes
@@ -237,10 +241,13 @@ def _unit(table: Table) -> np.ndarray:
 # time
 
 
-def _cut(run: _Run, table: Table, notes: list[str]) -> list[_Run]:
+def _cut(run: _Run, table: Table, notes: list[str], resample: bool) -> list[_Run]:
     """Cut a run where samples are missing for long."""
     step = np.diff(run.t)
-    edges = np.flatnonzero(step > max(_GAP_STEPS * np.median(step), _GAP_S)) + 1
+    limit = max(_GAP_STEPS * np.median(step), _GAP_S)
+    if not resample:
+        limit = min(limit, _FEW_STEPS * float(np.median(step)))
+    edges = np.flatnonzero(step > limit) + 1
     if not edges.size:
         return [run]
     notes.append(
@@ -262,12 +269,14 @@ def _cut(run: _Run, table: Table, notes: list[str]) -> list[_Run]:
     ]
 
 
-def _step(times: Sequence[np.ndarray], rate: float | None, notes: list[str]) -> float:
+def _step(
+    times: Sequence[np.ndarray], rate: float | None, notes: list[str], resample: bool
+) -> float:
     if rate is not None:
         return 1.0 / rate
     dt = float(np.median(np.concatenate([np.diff(t) for t in times])))
     dt = 1.0 / round(1.0 / dt) if abs(1.0 / dt - round(1.0 / dt)) < 1e-2 else dt
-    if not all(_even(t, dt) for t in times):
+    if resample and not all(_even(t, dt) for t in times):
         notes.append(f"Uneven time steps were resampled to {1 / dt:.4g} Hz.")
     return dt
 
@@ -289,12 +298,23 @@ def _on_grid(run: _Run, dt: float) -> Trajectory:
         V = linear(t, run.t, run.V)
         commands = {name: hold(t, run.t, values, dt) for name, values in run.commands.items()}
         voltage = None if run.voltage is None else linear(t, run.t, run.voltage)
+    return _trajectory(_Run(run.scenario, run.t, X, V, commands, voltage), {})
+
+
+def _as_recorded(run: _Run, dt: float) -> Trajectory:
+    """The samples themselves, with their times where these are not on a grid."""
+    return _trajectory(run, {} if _even(run.t, dt) else {UNEVEN: run.t - run.t[0]})
+
+
+def _trajectory(run: _Run, sensors: dict[str, np.ndarray]) -> Trajectory:
+    if run.voltage is not None:
+        sensors = {"voltage": run.voltage, **sensors}
     return Trajectory(
         run.scenario,
-        X.T,
-        V.T,
-        {name: values.T for name, values in commands.items()},
-        {} if voltage is None else {"voltage": voltage},
+        run.X.T,
+        run.V.T,
+        {name: values.T for name, values in run.commands.items()},
+        sensors,
         float(run.t[0]),
     )
 
@@ -347,7 +367,11 @@ def _write_file(path: Path, trajectory: Trajectory, dt: float, frames: Frames) -
         if "F_Bo_B" in commands:
             commands["F_Bo_B"] = twist_frd_to_flu(commands["F_Bo_B"])
     start = trajectory.start if np.isfinite(trajectory.start) else 0.0
-    names, rows = list(_STATE), [start + dt * np.arange(len(trajectory)), *X[4:], *X[:4], *V]
+    elapsed = trajectory.sensors.get(UNEVEN)
+    if elapsed is None or not np.isfinite(elapsed).all():
+        elapsed = dt * np.arange(len(trajectory))
+    elapsed = elapsed - elapsed[:1]
+    names, rows = list(_STATE), [start + elapsed, *X[4:], *X[:4], *V]
     for name, values in commands.items():
         stem = {"thruster_force": "f", "pwm": "pwm"}.get(name)
         names += [f"{stem}{i + 1}" for i in range(len(values))] if stem else list(WRENCH)

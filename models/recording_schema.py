@@ -35,6 +35,7 @@ SENSORS: dict[str, tuple[str | None, str]] = {
     "pressure_depth": (None, "m"),
     "vertical_velocity": (None, "m/s"),
     "rc": ("channel", "us"),
+    "elapsed": (None, "s"),
 }
 LABELS: dict[str, tuple[str, ...]] = {
     "pose_component": POSE,
@@ -42,6 +43,8 @@ LABELS: dict[str, tuple[str, ...]] = {
     "wrench_component": WRENCH,
     "axis": AXES,
 }
+UNEVEN = "elapsed"
+"""Time since a trajectory's index 0, where its steps differ from dt; dt is then a nominal step."""
 # Channels that a log may simply not have; they are then NaN throughout a trajectory.
 MAY_LACK = {"X_WB": ("x", "y", "z"), "V_WB_B": TWIST}
 _NORM_TOLERANCE = 1e-4
@@ -88,6 +91,21 @@ def check(dataset: xr.Dataset) -> None:
     for name in present(dataset, STATES) + present(dataset, COMMANDS):
         _check_values(dataset, name, mask)
     _check_quaternions(dataset, mask)
+    if UNEVEN in dataset:
+        _check_elapsed(dataset, mask)
+
+
+def _check_elapsed(dataset: xr.Dataset, mask: np.ndarray) -> None:
+    times = dataset[UNEVEN].to_numpy()
+    rises = (np.diff(times, axis=2) > 0) | ~mask[..., 1:]
+    some = np.isfinite(times) & mask
+    bad = some.any(axis=2) & ~(np.all(some | ~mask, axis=2) & rises.all(axis=2))
+    if bad.any():
+        j, k = np.argwhere(bad)[0]
+        raise ValueError(
+            f"{UNEVEN}: times of scenario '{dataset['scenario'].to_numpy()[j]}', trajectory {k} "
+            "lack or don't rise; give one for each sample, in order"
+        )
 
 
 def _check_layout(dataset: xr.Dataset) -> None:

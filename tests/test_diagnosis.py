@@ -5,18 +5,25 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 from hidden.draw import draw
 from hidden.scenarios import Plan
 
-from spinndrift.models.effects import KINDS, Library
+from spinndrift.models.effects import KINDS, Extended, Library
 from spinndrift.models.recording_csv import read_csv
 from spinndrift.models.vehicle import load_vehicle
+from spinndrift.training.diagnosis.data import Data
 from spinndrift.training.diagnosis.diagnose import DiagnoseConfig, Diagnoser
 from spinndrift.training.diagnosis.hypotheses import Fit
 from spinndrift.training.diagnosis.innovations import predict
 from spinndrift.training.diagnosis.laws import find_laws
 from spinndrift.training.diagnosis.naming import admissible, choose
-from spinndrift.training.diagnosis.noise import Noise, filtered, make_filter
+from spinndrift.training.diagnosis.noise import (
+    Noise,
+    filtered,
+    make_filter,
+    process_covariance,
+)
 from spinndrift.training.diagnosis.responses import respond
 from spinndrift.training.diagnosis.result import Diagnosis, schema
 from spinndrift.training.diagnosis.search import Found, Search
@@ -31,36 +38,43 @@ def recorded(tmp_path, seed, kind="single", **options):
     return case, read_csv(tmp_path / "data")
 
 
-def test_the_filter_whitens_a_linear_system():
+@pytest.mark.parametrize("even", [True, False])
+def test_the_filter_whitens_a_linear_system(even):
     """Innovations from gain-one errors are those of the Kalman filter: unit, white Gaussians."""
     rng = np.random.default_rng(0)
     J = np.zeros((12, 12))
     J[:6, 6:] = np.eye(6)
     J[6:, 6:] = -1.5 * np.eye(6)
-    dt, N, R = 0.05, 60, 2000
-    import scipy.linalg
-
-    A = scipy.linalg.expm(J * dt)
+    dt, N, R = 0.05, 60, 300
+    step = np.full((N, R), dt) if even else dt * rng.choice([0.4, 0.8, 1.1, 1.6], (N, R))
     noise = Noise(np.full(12, 0.02), np.full(6, 1.0))
-    kalman = make_filter(noise, A, np.eye(6) / 10, dt, N)
-    from spinndrift.training.diagnosis.noise import process_covariance
-
-    root = np.linalg.cholesky(process_covariance(A, np.eye(6) / 10, noise.diffusion, dt))
+    kalman = make_filter(noise, scipy.linalg.expm(J * dt), np.eye(6) / 10, dt, step)
+    assert kalman.keep.shape[-1] == (1 if even else R)
+    moves = {}
+    for h in np.unique(step):
+        A = scipy.linalg.expm(J * h)
+        Q = process_covariance(A, np.eye(6) / 10, noise.diffusion, h)
+        moves[h] = A, np.linalg.cholesky(Q)
     x = np.zeros((12, R))
     y = [x + 0.02 * rng.standard_normal((12, R))]
-    for _ in range(N):
-        x = A @ x + root @ rng.standard_normal((12, R))
-        y.append(x + 0.02 * rng.standard_normal((12, R)))
-    nu, z = np.zeros((12, R)), []
+    error, jacobian = np.zeros((N, 12, R)), np.zeros((N, 12, 12, R))
     for n in range(N):
-        nu = y[n + 1] - A @ y[n] + A @ (kalman.keep[n] @ nu)
-        z.append(kalman.whiten[n] @ nu)
-    z = np.array(z)
-    error = 1 / np.sqrt(z.size)
-    assert np.mean(z**2) == pytest.approx(1, abs=6 * error)
+        A, root = (np.stack([moves[h][i] for h in step[n]], axis=-1) for i in (0, 1))
+        x = np.einsum("ijr,jr->ir", A, x)
+        x = x + np.einsum("ijr,jr->ir", root, rng.standard_normal((12, R)))
+        y.append(x + 0.02 * rng.standard_normal((12, R)))
+        error[n] = y[n + 1] - np.einsum("ijr,jr->ir", A, y[n])
+        jacobian[n] = A
+    z = filtered(error, jacobian, kalman)
+    off = 1 / np.sqrt(z.size)
+    assert np.mean(z**2) == pytest.approx(1, abs=6 * off)
+    if not even:  # whatever the step
+        for h in np.unique(step):
+            own = z.swapaxes(0, 1)[:, step == h]
+            assert np.mean(own**2) == pytest.approx(1, abs=6 / np.sqrt(own.size))
     for lag in (1, 2, 5):
-        assert np.mean(z[lag:] * z[:-lag]) == pytest.approx(0, abs=6 * error)
-    assert np.mean(z[1:, :6] * z[:-1, 6:]) == pytest.approx(0, abs=8 * error)
+        assert np.mean(z[lag:] * z[:-lag]) == pytest.approx(0, abs=6 * off)
+    assert np.mean(z[1:, :6] * z[:-1, 6:]) == pytest.approx(0, abs=8 * off)
 
 
 @pytest.fixture(scope="module")
@@ -272,9 +286,6 @@ def test_laws_of_what_is_left():
 
 def test_predictions_without_noise_have_no_error():
     """Data of the model itself: one-step errors are those of the integrator alone."""
-    from spinndrift.models.effects import Extended
-    from spinndrift.training.diagnosis.data import Data
-
     rng = np.random.default_rng(7)
     model = Extended.create(VEHICLE.dynamics(), (), VEHICLE.thrusters())
     N, R, fine = 120, 20, 8
@@ -286,8 +297,8 @@ def test_predictions_without_noise_have_no_error():
     X = np.concatenate([X0[None], np.asarray(X)[fine - 1 :: fine]])
     V = np.concatenate([np.zeros((1, 6, R)), np.asarray(V)[fine - 1 :: fine]])
     data = Data(
-        X, V, u, np.ones((N, R)), np.ones((N, R)), np.zeros(R, int), np.arange(R), ("one",),
-        0.05, "thruster_force", True,
+        X, V, u, np.ones((N, R)), np.full((N, R), 0.05), np.ones((N, R)), np.zeros(R, int),
+        np.arange(R), ("one",), 0.05, "thruster_force", True,
     )  # fmt: skip
     library = Library([KINDS["net_buoyancy"].neutral()])
     p = predict(model, library, np.zeros(library.size), data)
@@ -296,6 +307,41 @@ def test_predictions_without_noise_have_no_error():
     error = np.abs(np.asarray(p.error)).max(axis=(0, 2))
     assert np.all(error[6:] < 0.01 * step)
     assert np.all(error[:6] < 0.01 * step * 0.05)
+
+
+def test_steps_of_any_length_are_predicted_with_what_thrusters_remember():
+    """Commands that begin with each uneven step, late and lagged: as a fine rollout has it."""
+    rng = np.random.default_rng(8)
+    fine, N, R = 0.005, 60, 6
+    counts = rng.choice([4, 8, 11, 16], (N, R))  # 20 to 80 ms
+    total = int(counts.sum(axis=0).max())
+    level = rng.normal(0, 3, (N, 8, R))
+    u = np.zeros((total, 8, R))
+    for r in range(R):
+        own = np.repeat(level[:, :, r], counts[:, r], axis=0)
+        u[:, :, r] = np.concatenate([own, np.repeat(own[-1:], total - len(own), axis=0)])
+    late = KINDS["actuation_delay"].of(delay=0.07, options={"steps": 30})
+    lag = KINDS["thruster_lag"].of(time_constant=0.1)
+    model = Extended.create(VEHICLE.dynamics(), (late, lag), VEHICLE.thrusters())
+    X0 = np.zeros((7, R))
+    X0[0] = 1
+    X, V = model.rollout(jnp.asarray(X0), jnp.zeros((6, R)), jnp.asarray(u), fine)
+    X = np.concatenate([X0[None], np.asarray(X)])
+    V = np.concatenate([np.zeros((1, 6, R)), np.asarray(V)])
+    at = np.concatenate([np.zeros((1, R), int), np.cumsum(counts, axis=0)])
+    X, V = (np.stack([a[at[:, r], :, r] for r in range(R)], axis=-1) for a in (X, V))
+    data = Data(
+        X, V, level, np.ones((N, R)), fine * counts, np.ones((N, R)), np.zeros(R, int),
+        np.arange(R), ("one",), float(fine * counts.mean()), "thruster_force", True,
+    )  # fmt: skip
+    library = Library([KINDS["actuation_delay"].neutral(), KINDS["thruster_lag"].neutral()])
+    theta = np.zeros(library.size)
+    before = predict(model.with_effects(()), library, theta, data)
+    theta[library.index("actuation_delay", "all", "delay")] = 0.07
+    theta[library.index("thruster_lag", "all", "time_constant")] = 0.1
+    p = predict(model.with_effects(()), library, theta, data)
+    wrong, right = (np.abs(np.asarray(a.error))[5:, 6:].max(axis=(0, 2)) for a in (before, p))
+    assert np.all(right < 0.02 * wrong), (right, wrong)
 
 
 def test_structure_without_a_name_is_found_where_it_is(tmp_path):

@@ -141,6 +141,11 @@ def make_windows(
     Raises:
         UserError: no trajectory is long enough, or a channel of pose or twist is missing.
     """
+    if recording.uneven:
+        raise UserError(
+            "recording: its samples stand at times of their own; windows need one step, so read "
+            "the CSV files with resampling"
+        )
     steps = round(length_s / recording.dt)
     stride = round((length_s / 4 if stride_s is None else stride_s) / recording.dt)
     if steps < 1 or stride < 1:

@@ -183,9 +183,12 @@ class Effect(eqx.Module):
         self,
         memory: Float[Array, "m *#batch"],
         level: Float[Array, "n *#batch S"],
-        dt: Float[Array, ""],
+        dt: Float[Array, "..."],
     ) -> tuple[Float[Array, "m *#batch"], Float[Array, "n *#batch S"]]:
-        """Memory after a step of `dt` s and thruster forces (N), means over its S substeps."""
+        """Memory after a step of `dt` s and thruster forces (N), means over its S substeps.
+
+        `dt` is one number, or (1, *batch) where columns take steps of their own.
+        """
         del dt
         return memory, level
 

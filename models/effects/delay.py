@@ -12,8 +12,9 @@ from .base import ALL_OR_ONE, Effect, Parameter
 class ActuationDelay(Effect):
     """f(t) = u(t - δ): transport and processing time between the recorded command and the thrust.
 
-    The memory holds the last `steps` commands, so delays up to `steps` × dt are told apart; the
-    means over substeps of the shifted piecewise constant command are exact.
+    The memory holds the last `steps` commands and how long each was held, so delays up to as many
+    steps are told apart, equal or not; the means over substeps of the shifted piecewise constant
+    command are exact.
     """
 
     name: ClassVar[str] = "actuation_delay"
@@ -28,33 +29,42 @@ class ActuationDelay(Effect):
 
     @property
     def memory_size(self) -> int:
-        """The last commands, newest first."""
-        return self.thrusters * self.steps
+        """The last commands, newest first, then the times that they were held."""
+        return (self.thrusters + 1) * self.steps
 
     def initial(self, command: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
-        return jnp.concatenate([command] * self.steps)
+        held = jnp.ones((self.steps, *command.shape[1:]), command.dtype)
+        return jnp.concatenate([command] * self.steps + [held])
 
     def actuate(
         self,
         memory: Float[Array, "m *#batch"],
         level: Float[Array, "n *#batch S"],
-        dt: Float[Array, ""],
+        dt: Float[Array, "..."],
     ) -> tuple[Float[Array, "m *#batch"], Float[Array, "n *#batch S"]]:
-        n, S = level.shape[0], level.shape[-1]
-        past = [level[..., 0], *jnp.split(memory, self.steps)]  # command k steps ago
-        behind = self.each(0, memory) / dt  # delay in steps
+        n, S, K = level.shape[0], level.shape[-1], self.steps
+        commands = jnp.split(memory[: n * K], K)
+        held = memory[n * K :]
+        delay = self.each(0, memory)
+        h = dt / S
         means = []
         for s in range(S):
-            start, end = s / S - behind, (s + 1) / S - behind
-            total = jnp.zeros_like(level[..., s])
-            for k, command in enumerate(past):
-                # overlap of the shifted substep with the time at which command k held
-                low, high = -float(k), 1.0 - float(k)
-                low = -jnp.inf if k == self.steps else low
-                share = jnp.clip(jnp.minimum(end, high) - jnp.maximum(start, low), 0, None) * S
-                total = total + share * command
-            means.append(total)
-        batch = jnp.broadcast_shapes(level.shape[1:-1], memory.shape[1:])
-        kept = [level[..., 0], memory[: n * (self.steps - 1)]]
+            # the shifted substep, from the step's start
+            start, end = s * h - delay, (s + 1) * h - delay
+            total = _overlap(start, end, jnp.zeros_like(dt), dt) * level[..., s]
+            high = jnp.zeros_like(held[:1])
+            for k, command in enumerate(commands):
+                low = high - held[k : k + 1] if k < K - 1 else -jnp.inf * jnp.ones_like(high)
+                total = total + _overlap(start, end, low, high) * command
+                high = low
+            means.append(total / h)
+        batch = jnp.broadcast_shapes(level.shape[1:-1], memory.shape[1:], jnp.shape(dt)[1:])
+        now = jnp.broadcast_to(dt, (1, *batch)) if jnp.ndim(dt) else jnp.full((1, *batch), dt)
+        kept = [level[..., 0], *commands[:-1], now, held[:-1]]
         kept = [jnp.broadcast_to(part, (part.shape[0], *batch)) for part in kept]
         return jnp.concatenate(kept), jnp.stack(jnp.broadcast_arrays(*means), axis=-1)
+
+
+def _overlap(start: Array, end: Array, low: Array, high: Array) -> Array:
+    """Length of what two intervals have in common."""
+    return jnp.clip(jnp.minimum(end, high) - jnp.maximum(start, low), 0, None)

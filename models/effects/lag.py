@@ -37,7 +37,7 @@ class ThrusterLag(Effect):
         self,
         memory: Float[Array, "n *#batch"],
         level: Float[Array, "n *#batch S"],
-        dt: Float[Array, ""],
+        dt: Float[Array, "..."],
     ) -> tuple[Float[Array, "n *#batch"], Float[Array, "n *#batch S"]]:
         tau = self.each(0, memory)
         h = dt / level.shape[-1]

@@ -28,6 +28,8 @@ def advance(
 ) -> tuple[Memory, Float[Array, "7 *#batch"], Float[Array, "6 *#batch"], Float[Array, "6 *#batch"]]:
     """Memory, pose and twist after `dt` s, and the twist's rate at the end of the last substep.
 
+    `dt` is one number, or (1, *batch) where columns take steps of their own.
+
     Runge–Kutta–Munthe-Kaas of order 4 for X' = X V (Munthe-Kaas 1999; Owren and Marthinsen 1999),
     thruster forces constant over a substep at their mean. `inertia` is `model.inertia()`. The four
     stages are one loop, so that a model of many effects compiles once.

@@ -163,7 +163,8 @@ class Unknown(Effect):
     ) -> tuple[Float[Array, "2 *#batch"], Float[Array, "6 *#batch"]]:
         """The memory after a step at this velocity, and the wrench during it."""
         i = AXES.index(self.acts_on)
-        after = remembered(memory, V_WB_B[i], self.numbers[0], self.numbers[1], dt)
+        h = dt[0] if jnp.ndim(dt) else dt
+        after = remembered(memory, V_WB_B[i], self.numbers[0], self.numbers[1], h)
         mean = (memory + after) / 2
         w = self.column(V_WB_B)
         total = w[0] * V_WB_B[i] + w[1] * mean[0] + w[2] * mean[1]

@@ -138,7 +138,7 @@ def share_of_gain(
     better: tuple[Extended, Learned | None],
 ) -> dict[str, float]:
     """The same of models with a learned rest beside them."""
-    data = make_data(read_csv(case.folder / "fresh"), vehicle, segment=10**9)
+    data = make_data(read_csv(case.folder / "fresh", resample=False), vehicle, segment=10**9)
     truths = read_oracle(case.folder / "oracle")
     every = case.truth.every
     off = [_off(forecast(model, data, every, rest), truths) for model, rest in (base, better)]
@@ -177,7 +177,7 @@ def judge(case: Case, alpha: float, progress: Update) -> tuple[Judgement, Findin
     Raises:
         UserError: the data can't be read.
     """
-    recording = read_csv(case.folder / "data")
+    recording = read_csv(case.folder / "data", resample=False)
     truth = case.truth
     vehicle, base = believed(truth, recording)
     finding = diagnose(recording, vehicle, base, DiagnoseConfig(alpha=alpha), progress)

@@ -55,7 +55,7 @@ class Diagnose:
             raise UserError(f"--out {self.out}: is a file; name a folder")
         config = DiagnoseConfig(alpha=self.alpha, refit=self.refit)
         with progress_bar(f"reading {self.data.name}") as update:
-            recording = load_data(self.data, vehicle=self.vehicle, progress=update)
+            recording = load_data(self.data, vehicle=self.vehicle, resample=False, progress=update)
         base = None if self.model is None else load_model(self.model, dtype=float)[0]
         vehicle = load_vehicle(self.vehicle or recording.vehicle or "bluerov2_heavy")
         if self.diffusion is not None:

@@ -106,6 +106,7 @@ def load_data(
     rate: float | None = None,
     vehicle: str | None = None,
     options: LogOptions | None = None,
+    resample: bool = True,
     progress: Progress = no_progress,
 ) -> Recording:
     """Read any data there is: a recording (.nc), a CSV folder, or a vehicle's log.
@@ -115,6 +116,7 @@ def load_data(
         rate: Hz; None keeps that of the data (20 for logs).
         vehicle: preset or file; None keeps what the data name (bluerov2_heavy for logs).
         options: what is taken from a log.
+        resample: False keeps the samples of CSV files at uneven times where they are.
         progress: called with the fraction done, 0 to 1.
 
     Raises:
@@ -126,7 +128,7 @@ def load_data(
     if path.suffix.lower() == ".csv" and path.is_file():
         raise UserError(f"{path}: give its folder, with a {METADATA} in it (see docs/recording.md)")
     if path.is_dir() or path.suffix.lower() in (".yaml", ".yml"):
-        recording = read_csv(path, rate=rate)
+        recording = read_csv(path, rate=rate, resample=resample)
     elif path.suffix.lower() in (".nc", ".nc4", ".h5"):
         recording = Recording.load(path)
         if rate is not None and abs(recording.dt * rate - 1) > 1e-6:

@@ -91,7 +91,7 @@ def train(
         jnp.zeros((1 + len(s) + len(widths), 6, 1)),
     )
     phi = np.asarray(box.features(*arrays)) * data.weight  # (D, N, R)
-    target = np.asarray(predictions.error)[:, 6:].swapaxes(0, 1) / data.dt * data.weight
+    target = np.asarray(predictions.error)[:, 6:].swapaxes(0, 1) / data.step * data.weight
     labels = np.unique(data.fold)
     H, g, square = [], [], []
     for label in labels:

@@ -19,6 +19,8 @@ _BLOCKS, _LEAST = 8, 16
 """Pieces that a single run is cut into at least, and samples of a piece at least."""
 _MOST_FOLDS = 10
 _FEW_RUNS = 6
+_EVEN = 1e-6
+"""Share of a step by which equal steps may differ."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +32,12 @@ class Data:
         V: recorded twists (N + 1, 6, R).
         u: commanded thruster forces (N), held from n to n + 1 (N, 8, R).
         voltage: relative to the vehicle's nominal one (N, R).
+        step: from sample n to n + 1 (s) (N, R).
         weight: 1 for steps that exist, else 0 (N, R).
         scenario: index into `names` (R,).
         run: which run a piece was cut from (R,).
         names: scenarios.
-        dt: step (s).
+        dt: mean step (s).
         command: what the commands were made of: thruster_force, pwm or F_Bo_B.
         has_voltage: whether the voltage was recorded.
     """
@@ -43,6 +46,7 @@ class Data:
     V: Float[np.ndarray, "M 6 R"]
     u: Float[np.ndarray, "N n R"]
     voltage: Float[np.ndarray, "N R"]
+    step: Float[np.ndarray, "N R"]
     weight: Float[np.ndarray, "N R"]
     scenario: Int[np.ndarray, " R"]
     run: Int[np.ndarray, " R"]
@@ -76,6 +80,21 @@ class Data:
         return np.arange(len(self.run)) if few else self.run
 
     @property
+    def even(self) -> bool:
+        """Whether all steps are equal."""
+        return bool(np.ptp(self.step) <= _EVEN * self.dt)
+
+    @property
+    def longest(self) -> float:
+        """The longest step (s)."""
+        return float(self.step.max())
+
+    @property
+    def times(self) -> Float[np.ndarray, "M R"]:
+        """Times of the samples since each piece's first (s), M = N + 1."""
+        return np.concatenate([np.zeros((1, self.step.shape[1])), np.cumsum(self.step, axis=0)])
+
+    @property
     def steps(self) -> int:
         """Steps that exist."""
         return int(self.weight.sum())
@@ -101,7 +120,7 @@ def make_data(
     name = next(c for c in ("thruster_force", "pwm", "F_Bo_B") if c in recording.commands)
     nominal = float(thrusters.nominal_voltage)
     lengths = recording.lengths
-    pieces: dict[str, list[Any]] = {"X": [], "V": [], "u": [], "voltage": []}
+    pieces: dict[str, list[Any]] = {"X": [], "V": [], "u": [], "voltage": [], "step": []}
     scenario, run, sizes = [], [], []
     has_voltage = "voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any())
     kept = lengths >= 3
@@ -110,8 +129,9 @@ def make_data(
     kept = kept if kept.any() else lengths >= 3
     if kept.sum() == 1:
         segment = min(segment, max(int(lengths.max()) // _BLOCKS, _LEAST))
-    for number, (j, k) in enumerate(np.argwhere(kept)):
+    for number, (j, k) in enumerate(np.argwhere(kept).tolist()):
         length = int(lengths[j, k])
+        times = recording.elapsed(j, k)
         values = {
             "X": data["X_WB"].to_numpy()[j, k, :length],
             "V": data["V_WB_B"].to_numpy()[j, k, :length],
@@ -129,6 +149,7 @@ def make_data(
             pieces["V"].append(values["V"][a : b + 1])
             pieces["u"].append(u[a:b])
             pieces["voltage"].append(volts[a:b] / nominal)
+            pieces["step"].append(times[a + 1 : b + 1] - times[a:b])
             sizes.append(b - a)
             scenario.append(j)
             run.append(number)
@@ -136,16 +157,19 @@ def make_data(
         raise UserError("recording: no run is long enough for a diagnosis")
     N = int(max(sizes))
     weight = (np.arange(N)[:, None] < np.array(sizes)).astype(float)
+    step = _stack(pieces["step"], N)
+    mean = float((step * weight).sum() / weight.sum()) if recording.uneven else recording.dt
     return Data(
         X=_stack(pieces["X"], N + 1),
         V=_stack(pieces["V"], N + 1),
         u=_stack(pieces["u"], N),
         voltage=_stack(pieces["voltage"], N),
+        step=step if recording.uneven else np.full(weight.shape, mean),
         weight=weight,
         scenario=np.array(scenario, int),
         run=np.array(run, int),
         names=recording.scenarios,
-        dt=recording.dt,
+        dt=mean,
         command=name,
         has_voltage=has_voltage,
     )

@@ -27,14 +27,14 @@ class Learned(Protocol):
 
 @eqx.filter_jit
 def _forecast(
-    model: Extended, arrays: Arrays, every: int, dt: float, rest: Learned | None
+    model: Extended, arrays: Arrays, every: int, count: int, rest: Learned | None
 ) -> tuple[Array, Array]:
-    X, V, u, voltage = arrays
+    X, V, u, voltage, step = arrays
     inertia = model.inertia()
 
     def body(carry: Any, given: Any) -> Any:
         memory, x, v, rate = carry
-        n, X0, V0, command, before, volts = given
+        n, X0, V0, command, before, volts, h = given
         fresh = model.infer(X0, V0, rate)
         starts = n % every == 0
         x, v = (jnp.where(starts, a, b) for a, b in zip(fresh, (x, v), strict=True))
@@ -43,13 +43,13 @@ def _forecast(
             lacking = rest.acceleration(*(k[:, None] for k in (x, v, command, before)))
             push = times(inertia.matrix, lacking[:, 0])
         memory, x, v, a = advance(
-            model, inertia, memory, x, v, command, dt, substeps(dt), volts[None], push
+            model, inertia, memory, x, v, command, h[None], count, volts[None], push
         )
         return (memory, x, v, a), model.observe(x, v, a)
 
-    start = (settle(model, u[0], dt, substeps(dt)), X[0], V[0], (V[1] - V[0]) / dt)
+    start = (settle(model, u[0], step[:1], count), X[0], V[0], (V[1] - V[0]) / step[:1])
     before = jnp.concatenate([u[:1], u[:-1]])
-    xs = (jnp.arange(len(u)), X[:-1], V[:-1], u, before, voltage)
+    xs = (jnp.arange(len(u)), X[:-1], V[:-1], u, before, voltage, step)
     return jax.lax.scan(body, start, xs)[1]
 
 
@@ -61,5 +61,5 @@ def forecast(
     Windows start at steps 0, `every`, 2 `every`, … from the record there; what the actuators
     remember goes on from window to window. `rest` is added to what the model says.
     """
-    X, V = _forecast(model, as_arrays(data), every, data.dt, rest)
+    X, V = _forecast(model, as_arrays(data), every, substeps(data.longest), rest)
     return np.asarray(X), np.asarray(V)

@@ -70,8 +70,9 @@ def judge(
     p = predict(bench.model, bench.library, theta, data)
     error, jacobian = np.asarray(p.error), np.asarray(p.jacobian)
     if contender.box is not None:
-        a = np.asarray(contender.box.acceleration(*arguments(data))).swapaxes(0, 1) * data.dt
-        error = error - np.concatenate([a * data.dt / 2, a], axis=1)
+        h = data.step[:, None]
+        a = np.asarray(contender.box.acceleration(*arguments(data))).swapaxes(0, 1) * h
+        error = error - np.concatenate([a * h / 2, a], axis=1)
     mass = bench.mass(theta.mean(axis=1))
     score = np.zeros(len(data.fold))
     record, diffusion = np.zeros((12, len(score))), np.zeros((6, len(score)))
@@ -81,10 +82,10 @@ def judge(
         A = mean_jacobian(jacobian, rest)
         noise = estimate(error, rest, A, mass, data.dt)
         record[:, own], diffusion[:, own] = noise.record[:, None], noise.diffusion[:, None]
-        kalman = make_filter(noise, A, np.linalg.inv(mass), data.dt, len(data.u))
+        kalman = make_filter(noise, A, np.linalg.inv(mass), data.dt, data.step[:, own])
         weight = data.weight[:, own]
         z = filtered(error[:, :, own], jacobian[..., own], kalman) * weight[:, None]
-        score[own] = -(z**2).sum(axis=(0, 1)) / 2 - kalman.log_det @ weight
+        score[own] = -(z**2).sum(axis=(0, 1)) / 2 - (kalman.log_det * weight).sum(axis=0)
         score[own] -= 6 * np.log(2 * np.pi) * weight.sum(axis=0)
     kept = _spread(data.fold, _PIECES)
     levels = record[:, kept], diffusion[:, kept]
@@ -115,8 +116,8 @@ def _simulated(
     kinds: set[tuple[str, str]],
 ) -> Judged:
     data = bench.data
-    X, V, u, voltage = as_arrays(data)
-    arrays = (X[..., kept], V[..., kept], u[..., kept], voltage[..., kept])
+    *arrays, step = as_arrays(data)
+    arrays = (*(a[..., kept] for a in arrays), step if data.even else step[:, kept])
     theta = contender.theta[:, kept]
     every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))
     effects = bench.library.filled(jnp.asarray(theta)[:, None])
@@ -127,7 +128,7 @@ def _simulated(
     e = np.asarray(
         _errors(
             bench.model, used, arrays, box, jnp.asarray(levels[1]),
-            jnp.asarray(levels[0]), jax.random.key(seed), every, data.dt,
+            jnp.asarray(levels[0]), jax.random.key(seed), every, substeps(data.longest) // 2,
         ),
         np.float64,
     )  # fmt: skip
@@ -175,17 +176,16 @@ def _errors(
     record: Float[Array, "12 R"],
     key: Array,
     every: int,
-    dt: float,
+    coarse: int,
 ) -> Float[Array, "N 12 S R"]:
     """Recorded less simulated: lane 0 without noise, the others with it and that of the records."""
-    X, V, u, voltage = arrays
+    X, V, u, voltage, step = arrays
     model = model.with_effects(effects)
     inertia = model.inertia()
     R, S = V.shape[2], 1 + SAMPLES
-    coarse = substeps(dt) // 2
     noisy = (jnp.arange(S)[None, :, None] > 0).astype(V.dtype)
     record = record[:, None] * noisy
-    b = diffusion[:, None] * noisy * jnp.sqrt(jnp.asarray(dt, V.dtype))
+    b = diffusion[:, None] * noisy
 
     def kicked(V: Array, w: Array) -> Array:
         M = inertia.inverse
@@ -199,7 +199,8 @@ def _errors(
 
     def body(carry: Any, given: Any) -> Any:
         memory, x, v, rate = carry
-        n, X0, V0, X1, V1, command, before, volts = given
+        n, X0, V0, X1, V1, command, before, volts, h = given
+        dt = h[None, None]
         draw = jax.random.normal(jax.random.fold_in(key, n), (30, S, R), V.dtype)
         start = read(X0[:, None], V0[:, None], draw[:12])
         fresh = model.infer(*start, rate)
@@ -213,17 +214,17 @@ def _errors(
         memory, x, v, a = advance(
             model, inertia, memory, x, v, command[:, None], dt, coarse, volts[None, None], push
         )
-        v = kicked(v, draw[12:18])
+        v = kicked(v, jnp.sqrt(dt) * draw[12:18])
         seen = model.observe(x, v, a)
         e = difference(*read(*seen, draw[18:]), X1[:, None], V1[:, None])
         return (memory, x, v, a), e.astype(jnp.float32)
 
     zero = jnp.zeros((1, S, R), V.dtype)
-    rate = ((V[1] - V[0]) / dt)[:, None] + zero
-    memory = settle(model, u[0][:, None] + zero, dt, coarse)
+    rate = ((V[1] - V[0]) / step[:1])[:, None] + zero
+    memory = settle(model, u[0][:, None] + zero, step[:1, None], coarse)
     start = (memory, X[0][:, None] + zero, V[0][:, None] + zero, rate)
     before = jnp.concatenate([u[:1], u[:-1]])
-    xs = (jnp.arange(len(u)), X[:-1], V[:-1], X[1:], V[1:], u, before, voltage)
+    xs = (jnp.arange(len(u)), X[:-1], V[:-1], X[1:], V[1:], u, before, voltage, step)
     return jax.lax.scan(body, start, xs)[1]
 
 

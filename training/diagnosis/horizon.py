@@ -44,6 +44,7 @@ class Windows:
         u: thruster forces (M, n, K).
         before: commands of the step before (n, K), for what remembers.
         voltage: relative (M, K).
+        step: from record k to k + 1 (s) (M, K).
         block: which windows depend on each other (K,): those of one stretch of time.
         scenario: index of the scenario (K,).
     """
@@ -53,9 +54,14 @@ class Windows:
     u: Float[np.ndarray, "M n K"]
     before: Float[np.ndarray, "n K"]
     voltage: Float[np.ndarray, "M K"]
+    step: Float[np.ndarray, "M K"]
     block: Int[np.ndarray, " K"]
     scenario: Int[np.ndarray, " K"]
-    dt: float
+
+    @property
+    def count(self) -> int:
+        """Substeps of a step."""
+        return substeps(float(self.step.max()))
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,9 @@ class HorizonFit:
 def windows(data: Data, horizon: float, every: float, block: float = 10.0) -> Windows:
     """Windows of `horizon` s that start `every` s; those within `block` s hang together."""
     M, step = max(1, round(horizon / data.dt)), max(1, round(every / data.dt))
-    parts: dict[str, list[np.ndarray]] = {k: [] for k in ("X", "V", "u", "before", "voltage")}
+    parts: dict[str, list[np.ndarray]] = {
+        k: [] for k in ("X", "V", "u", "before", "voltage", "step")
+    }
     blocks, scenarios = [], []
     for r in range(len(data.run)):
         length = int(data.weight[:, r].sum())
@@ -81,42 +89,44 @@ def windows(data: Data, horizon: float, every: float, block: float = 10.0) -> Wi
             parts["u"].append(data.u[n : n + M, :, r])
             parts["before"].append(data.u[max(n - 1, 0), :, r])
             parts["voltage"].append(data.voltage[n : n + M, r])
+            parts["step"].append(data.step[n : n + M, r])
             blocks.append((r, int(n * data.dt / block)))
             scenarios.append(int(data.scenario[r]))
     labels = np.unique(np.array(blocks, int).reshape(-1, 2), axis=0, return_inverse=True)[1]
     stacked = {k: np.stack(v, axis=-1) for k, v in parts.items()}
-    return Windows(**stacked, block=labels.ravel(), scenario=np.array(scenarios), dt=data.dt)
+    return Windows(**stacked, block=labels.ravel(), scenario=np.array(scenarios))
 
 
-def _errors(model: Extended, arrays: tuple, dt: float) -> Float[Array, "M 12 K"]:
-    X, V, u, before, voltage = arrays
+def _errors(model: Extended, arrays: tuple, count: int) -> Float[Array, "M 12 K"]:
+    X, V, u, before, voltage, step = arrays
     inertia = model.inertia()
-    count = substeps(dt)
 
     def body(carry: Any, given: Any) -> Any:
         memory, x, v = carry
-        X1, V1, command, volts = given
-        memory, x, v, a = advance(model, inertia, memory, x, v, command, dt, count, volts[None])
+        X1, V1, command, volts, h = given
+        memory, x, v, a = advance(
+            model, inertia, memory, x, v, command, h[None], count, volts[None]
+        )
         seen_X, seen_V = model.observe(x, v, a)
         return (memory, x, v), jnp.concatenate([se3.local(X1, seen_X), seen_V - V1])
 
-    rate = (V[1] - V[0]) / dt
-    start = (settle(model, before, dt, count), *model.infer(X[0], V[0], rate))
-    return jax.lax.scan(body, start, (X[1:], V[1:], u, voltage))[1]
+    rate = (V[1] - V[0]) / step[:1]
+    start = (settle(model, before, step[:1], count), *model.infer(X[0], V[0], rate))
+    return jax.lax.scan(body, start, (X[1:], V[1:], u, voltage, step))[1]
 
 
 @eqx.filter_jit
-def _apart(model: Extended, effects: tuple, arrays: tuple, dt: float) -> Float[Array, "M 12 K"]:
-    return _errors(model.with_effects(effects), arrays, dt)
+def _apart(model: Extended, effects: tuple, arrays: tuple, count: int) -> Float[Array, "M 12 K"]:
+    return _errors(model.with_effects(effects), arrays, count)
 
 
 @eqx.filter_jit
 def _slopes(
-    model: Extended, library: Library, theta: Array, rows: Array, arrays: tuple, dt: float
+    model: Extended, library: Library, theta: Array, rows: Array, arrays: tuple, count: int
 ) -> tuple[Array, Array]:
     def errors(values: Array) -> Array:
         effects = library.filled(theta.at[rows].set(values))
-        return _errors(model.with_effects(effects), arrays, dt)
+        return _errors(model.with_effects(effects), arrays, count)
 
     values = theta[rows]
     e, push = jax.linearize(errors, values)
@@ -124,7 +134,7 @@ def _slopes(
 
 
 def _arrays(w: Windows) -> tuple:
-    return tuple(jnp.asarray(a) for a in (w.X, w.V, w.u, w.before, w.voltage))
+    return tuple(jnp.asarray(a) for a in (w.X, w.V, w.u, w.before, w.voltage, w.step))
 
 
 def small(bench: Bench, rows: Sequence[int], theta: np.ndarray) -> tuple[Library, list[int]]:
@@ -142,7 +152,7 @@ def forecast_errors(
     """Forecast less record, pose seen from the recorded body (m, rad), then twist."""
     library, at = small(bench, (), theta)
     effects = library.filled(jnp.asarray(theta[at]))
-    return np.asarray(_apart(bench.model, effects, _arrays(w), w.dt))
+    return np.asarray(_apart(bench.model, effects, _arrays(w), w.count))
 
 
 def fit_forecasts(
@@ -180,12 +190,12 @@ def fit_forecasts(
     best[own] = np.clip(np.where(flat, probe, start), low, high)
 
     def tried(values: np.ndarray) -> float:
-        e = _apart(bench.model, library.filled(jnp.asarray(values)), arrays, w.dt)
+        e = _apart(bench.model, library.filled(jnp.asarray(values)), arrays, w.count)
         return _loss(np.asarray(e)[..., kept], size)
 
     def seen(values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         e, J = _slopes(library=library, model=bench.model, theta=jnp.asarray(values),
-                       rows=jnp.asarray(own), arrays=arrays, dt=w.dt)  # fmt: skip
+                       rows=jnp.asarray(own), arrays=arrays, count=w.count)  # fmt: skip
         e, J = np.asarray(e)[..., kept], np.asarray(J)[..., kept]
         return _loss(e, size), e, J
 

@@ -143,7 +143,8 @@ def one_step(bench: Bench, theta: Float[np.ndarray, " p"]) -> Filter:
     N = len(bench.data.u)
     whiten = np.linalg.inv(np.linalg.cholesky(C))
     log_det = float(np.linalg.slogdet(C)[1]) / 2
-    return Filter(np.zeros((N, 12, 12)), np.repeat(whiten[None], N, 0), np.full(N, log_det))
+    alike = np.repeat(whiten[None, ..., None], N, 0)
+    return Filter(np.zeros_like(alike), alike, np.full((N, 1), log_det))
 
 
 def _covariance(bench: Bench, theta: np.ndarray) -> Float[np.ndarray, "12 12"]:

@@ -19,18 +19,19 @@ SUBSTEPS, LONGEST = 2, 0.025
 """Substeps of a step at least, and their length (s) at most: drag is stiff in fast turns."""
 
 
-def substeps(dt: float) -> int:
-    """Substeps of a prediction over `dt` s."""
-    return max(SUBSTEPS, math.ceil(dt / LONGEST - 1e-6))
+def substeps(longest: float) -> int:
+    """Substeps of predictions over steps of up to `longest` s."""
+    return max(SUBSTEPS, math.ceil(longest / LONGEST - 1e-6))
 
 
-Arrays = tuple[Array, Array, Array, Array]
-"""Poses, twists, commands and voltages of `Data`."""
+Arrays = tuple[Array, Array, Array, Array, Array]
+"""Poses, twists, commands, voltages and steps of `Data`."""
 
 
 def as_arrays(data: Data) -> Arrays:
-    """The arrays that compiled programs take."""
-    return jnp.asarray(data.X), jnp.asarray(data.V), jnp.asarray(data.u), jnp.asarray(data.voltage)
+    """The arrays that compiled programs take; equal steps as one column, (N, 1)."""
+    step = data.step[:, :1] if data.even else data.step
+    return tuple(jnp.asarray(a) for a in (data.X, data.V, data.u, data.voltage, step))  # pyright: ignore[reportReturnType]
 
 
 class Predictions(NamedTuple):
@@ -58,7 +59,7 @@ def difference(
     return jnp.concatenate(jnp.broadcast_arrays(se3.local(X, X2), V2 - V))
 
 
-def settle(model: Extended, command: Array, dt: float, substeps: int) -> Memory:
+def settle(model: Extended, command: Array, dt: Array, substeps: int) -> Memory:
     """Initial memories broadcast to what a step makes of them."""
     memory = model.remember(command)
     after = jax.eval_shape(lambda m: model.actuate(m, command, dt, substeps)[0], memory)
@@ -66,8 +67,8 @@ def settle(model: Extended, command: Array, dt: float, substeps: int) -> Memory:
 
 
 @eqx.filter_jit
-def _predict(model: Extended, effects: Any, arrays: Arrays, dt: float) -> Predictions:
-    X, V, u, voltage = arrays
+def _predict(model: Extended, effects: Any, arrays: Arrays, count: int) -> Predictions:
+    X, V, u, voltage, step = arrays
     model = model.with_effects(effects)
     inertia = model.inertia()
     plain = model.with_effects(())
@@ -75,21 +76,21 @@ def _predict(model: Extended, effects: Any, arrays: Arrays, dt: float) -> Predic
 
     def body(carry: tuple[Memory, Array], given: Any) -> Any:
         memory, rate = carry
-        X0, V0, X1, V1, command, volts = given
+        X0, V0, X1, V1, command, volts, h = given
         # what late instruments missed happened under the command before
         x, v = model.infer(X0, V0, rate)
         memory, Xp, Vp, a = advance(
-            model, inertia, memory, x, v, command, dt, substeps(dt), volts[None]
+            model, inertia, memory, x, v, command, h[None], count, volts[None]
         )
         error = difference(*model.observe(Xp, Vp, a), X1, V1)
-        jacobian = _jacobian(plain, rest, x, (v + Vp) / 2, command, dt)
+        jacobian = _jacobian(plain, rest, x, (v + Vp) / 2, command, h)
         return (memory, a), Predictions(error, Xp, Vp, jacobian, a)
 
-    start = settle(model, u[0], dt, substeps(dt)), (V[1] - V[0]) / dt
-    return jax.lax.scan(body, start, (X[:-1], V[:-1], X[1:], V[1:], u, voltage))[1]
+    start = settle(model, u[0], step[:1], count), (V[1] - V[0]) / step[:1]
+    return jax.lax.scan(body, start, (X[:-1], V[:-1], X[1:], V[1:], u, voltage, step))[1]
 
 
-def _jacobian(model: Extended, inertia: Any, X: Array, V: Array, u: Array, dt: float) -> Array:
+def _jacobian(model: Extended, inertia: Any, X: Array, V: Array, u: Array, dt: Array) -> Array:
     """exp(J dt) of δ' = δV - ad_V δ, δV' = ∂a/∂x δ, to third order."""
     F = model.allocate(u)
     eye = jnp.eye(12, dtype=V.dtype)[3:]
@@ -111,7 +112,7 @@ def _jacobian(model: Extended, inertia: Any, X: Array, V: Array, u: Array, dt: f
     )
     top = jnp.concatenate([-ad, unit], axis=1)
     bottom = jnp.concatenate([jnp.zeros_like(lower[:, :3]), lower], axis=1)
-    J = dt * jnp.concatenate([top, bottom])
+    J = dt[None, None] * jnp.concatenate([top, bottom])
     JJ = jnp.einsum("ijr,jkr->ikr", J, J)
     whole = jnp.eye(12, dtype=V.dtype)[:, :, None] + J + JJ / 2
     return whole + jnp.einsum("ijr,jkr->ikr", JJ, J) / 6
@@ -120,4 +121,4 @@ def _jacobian(model: Extended, inertia: Any, X: Array, V: Array, u: Array, dt: f
 def predict(model: Extended, library: Library, theta: np.ndarray, data: Data) -> Predictions:
     """Predictions of all samples with the effects' values `theta`: (p,), or (p, R) by piece."""
     effects = library.filled(jnp.asarray(theta.reshape(len(theta), -1)))
-    return _predict(model, effects, as_arrays(data), data.dt)
+    return _predict(model, effects, as_arrays(data), substeps(data.longest))

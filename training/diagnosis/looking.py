@@ -144,9 +144,9 @@ class Bench:
         A = mean_jacobian(np.asarray(p.jacobian), weight)
         mass = self.mass(theta)
         noise = estimate(error, weight, A, mass, self.data.dt)
-        kalman = make_filter(noise, A, np.linalg.inv(mass), self.data.dt, len(self.data.u))
+        kalman = make_filter(noise, A, np.linalg.inv(mass), self.data.dt, self.data.step)
         # correlated innovations tell less than as many independent ones
-        less = kalman.whiten / np.sqrt(noise.memory)[:, None]
+        less = kalman.whiten / np.sqrt(noise.memory)[:, None, None]
         return p, noise, replace(kalman, whiten=less, memory=noise.memory)
 
     def errors(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "N 12 R"]:

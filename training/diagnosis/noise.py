@@ -9,11 +9,12 @@ there, poses that slip against the twist included, and the errors' correlation i
 so many samples tell less.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 FLOOR = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4] * 3 + [1e-5] * 3)
 """Least standard deviation of a record: m, rad, m/s, rad/s."""
@@ -21,6 +22,8 @@ _SMOOTH = 4
 """Axes of the twist without errors of their own from which states count as estimated."""
 _LONGEST = 0.98
 """Largest correlation of neighbouring errors that is believed."""
+_EVEN, _NODES = 1e-6, 8
+"""Share of a step by which equal ones may differ; nodes of interpolation between uneven ones."""
 
 
 @dataclass(frozen=True)
@@ -47,19 +50,26 @@ class Noise:
 
 @dataclass(frozen=True)
 class Filter:
-    """Gains and whitening of the first N innovations, the same for all pieces.
+    """Gains and whitening of the first N innovations, by piece, or the same for all (R = 1).
 
     Attributes:
-        keep: I - K_n before step n (N, 12, 12).
-        whiten: L_n⁻¹ with L Lᵀ the innovations' covariance after step n (N, 12, 12).
-        log_det: ½ log det of that covariance (N,).
+        keep: I - K_n before step n (N, 12, 12, R).
+        whiten: L_n⁻¹ with L Lᵀ the innovations' covariance after step n (N, 12, 12, R).
+        log_det: ½ log det of that covariance (N, R).
         memory: by which the whitened squares are divided already (`Noise.memory`) (12,).
     """
 
-    keep: Float[np.ndarray, "N 12 12"]
-    whiten: Float[np.ndarray, "N 12 12"]
-    log_det: Float[np.ndarray, " N"]
+    keep: Float[np.ndarray, "N 12 12 R"]
+    whiten: Float[np.ndarray, "N 12 12 R"]
+    log_det: Float[np.ndarray, "N R"]
     memory: Float[np.ndarray, "12"] = field(default_factory=lambda: np.ones(12))
+
+    def of(self, pieces: Int[np.ndarray, " K"]) -> "Filter":
+        """That of some pieces."""
+        if self.keep.shape[-1] == 1:
+            return self
+        parts = (a[..., pieces] for a in (self.keep, self.whiten, self.log_det))
+        return Filter(*parts, memory=self.memory)
 
 
 def mean_jacobian(jacobian: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, "12 12"]:
@@ -133,27 +143,62 @@ def make_filter(
     A: Float[np.ndarray, "12 12"],
     mass_inverse: Float[np.ndarray, "6 6"],
     dt: float,
-    steps: int,
+    step: Float[np.ndarray, "N R"],
 ) -> Filter:
-    """The Kalman filter that starts from the first record: gains of every step."""
-    Q = process_covariance(A, mass_inverse, noise.diffusion, dt, noise.slip)
+    """The Kalman filter that starts from the first record: gains of every step.
+
+    A is that of a step of `dt` s. Where all are equal, one filter serves all pieces.
+    """
+    if np.ptp(step) <= _EVEN * dt:
+        step = step[:, :1]
+    transition = _transitions(noise, A, mass_inverse, dt, step)
     R = np.diag(noise.record**2)
-    keep = np.zeros((steps, 12, 12))
-    whiten, log_det = np.zeros((steps, 12, 12)), np.zeros(steps)
-    P = R
-    gap = np.zeros((12, 12))  # I - K: the first record is believed as it is
-    for n in range(steps):
+    eye = np.eye(12)
+    count = step.shape[1]
+    P = np.repeat(R[None], count, 0)
+    gap = np.zeros_like(P)  # I - K: the first record is believed as it is
+    keep, whiten = np.zeros((2, len(step), count, 12, 12))
+    log_det = np.zeros(step.shape)
+    for n in range(len(step)):
         keep[n] = gap
-        prior = A @ P @ A.T + Q
-        S = prior + R
-        L = np.linalg.cholesky(S)
+        now, Q = transition(step[n])
+        prior = now @ P @ now.swapaxes(1, 2) + Q
+        L = np.linalg.cholesky(prior + R)
         whiten[n] = np.linalg.inv(L)
-        log_det[n] = np.log(np.diag(L)).sum()
-        K = np.linalg.solve(S, prior).T
-        gap = np.eye(12) - K
+        log_det[n] = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
+        K = np.linalg.solve(prior + R, prior).swapaxes(1, 2)
+        gap = eye - K
         # Joseph's form stays positive where exact records meet a long step (Bucy and Joseph 1968)
-        P = gap @ prior @ gap.T + K @ R @ K.T
-    return Filter(keep, whiten, log_det)
+        P = gap @ prior @ gap.swapaxes(1, 2) + K @ R @ K.swapaxes(1, 2)
+    return Filter(np.moveaxis(keep, 1, -1), np.moveaxis(whiten, 1, -1), log_det)
+
+
+def _transitions(
+    noise: Noise, A: np.ndarray, mass_inverse: np.ndarray, dt: float, step: np.ndarray
+) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """A and Q (R, 12, 12) of any steps among these, interpolated between Chebyshev nodes."""
+
+    def process(A: np.ndarray, h: float) -> np.ndarray:
+        return process_covariance(A, mass_inverse, noise.diffusion, h, noise.slip)
+
+    if step.shape[1] == 1 and np.ptp(step) <= _EVEN * dt:
+        alone = A[None], process(A, dt)[None]
+        return lambda h: alone
+    J = np.real(scipy.linalg.logm(A)) / dt
+    low, high = float(step.min()), float(step.max())
+    at = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+    nodes = (low + high) / 2 + (high - low) / 2 * at
+    each = [scipy.linalg.expm(J * h) for h in nodes]
+    values = np.stack([each, [process(a, h) for a, h in zip(each, nodes, strict=True)]], axis=1)
+    inverse = np.linalg.inv(np.polynomial.chebyshev.chebvander(at, _NODES - 1))
+    series = np.tensordot(inverse, values, 1)
+
+    def transition(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x = (2 * h - low - high) / (high - low)
+        both = np.tensordot(np.polynomial.chebyshev.chebvander(x, _NODES - 1), series, 1)
+        return both[:, 0], both[:, 1]
+
+    return transition
 
 
 def filtered(
@@ -162,6 +207,7 @@ def filtered(
     """Whitened innovations of one-step errors."""
     nu, found = np.zeros(error.shape[1:]), np.empty(error.shape)
     for n in range(len(error)):
-        nu = error[n] + np.einsum("ijr,jr->ir", jacobian[n], kalman.keep[n] @ nu)
-        found[n] = kalman.whiten[n] @ nu
+        kept = np.einsum("ijr,jr->ir", kalman.keep[n], nu)
+        nu = error[n] + np.einsum("ijr,jr->ir", jacobian[n], kept)
+        found[n] = np.einsum("ijr,jr->ir", kalman.whiten[n], nu)
     return found

@@ -29,21 +29,21 @@ def _respond(
     predictions: Predictions,
     arrays: Arrays,
     filters: tuple[Array, Array, Array],
-    dt: float,
     lanes: int,
     instruments: bool,
 ) -> Float[Array, "N 12 L R"]:
     """Whitened innovations of lane 0 (the base) and changes of them in the other lanes."""
-    (X, V, u, voltage), (keep, whiten, weight) = arrays, filters
+    (X, V, u, voltage, step), (keep, whiten, weight) = arrays, filters
     base = model.with_effects(believed)
     model = model.with_effects(effects)
     inertia = model.inertia()
 
     def body(carry: Any, given: Any) -> Any:
         memory, nu, rate = carry
-        p, X0, V0, command, volts, gap, white, exists = given
+        p, X0, V0, command, volts, h, gap, white, exists = given
+        dt = h[None, None]
         x, v = model.infer(X0[:, None], V0[:, None], rate[:, None])
-        kept = jnp.tensordot(gap, nu, 1)
+        kept = through(gap, nu)
         if instruments:
             seen = model.observe(p.X[:, None], p.V[:, None], p.rate[:, None])
             direct = _apart(seen)
@@ -60,13 +60,20 @@ def _respond(
         nu = jnp.sum(p.jacobian[:, :, None] * moved[None], axis=1) - direct
         nu = nu.at[:, 0].add(p.error)
         # lane 0 carries the base's own innovation: nothing was changed there
-        return (memory, nu, p.rate), jnp.tensordot(white, nu, 1) * exists[None, None]
+        return (memory, nu, p.rate), through(white, nu) * exists[None, None]
 
     zero = jnp.zeros((12, lanes, V.shape[2]), V.dtype)
-    memory = () if instruments else settle(model, u[0][:, None], dt, 1)
-    start = (memory, zero, (V[1] - V[0]) / dt)
-    xs = (predictions, X[:-1], V[:-1], u, voltage, keep, whiten, weight)
+    memory = () if instruments else settle(model, u[0][:, None], step[:1, None], 1)
+    start = (memory, zero, (V[1] - V[0]) / step[:1])
+    xs = (predictions, X[:-1], V[:-1], u, voltage, step, keep, whiten, weight)
     return jax.lax.scan(body, start, xs)[1].astype(jnp.float32)
+
+
+def through(M: Float[Array, "12 12 #R"], x: Float[Array, "12 L R"]) -> Float[Array, "12 L R"]:
+    """M x, one matrix for all pieces or one for each."""
+    if M.shape[2] == 1:
+        return jnp.tensordot(M[..., 0], x, 1)
+    return jnp.einsum("ijr,jlr->ilr", M, x)
 
 
 def respond(
@@ -109,7 +116,6 @@ def respond(
                     predictions,
                     arrays,
                     filters,
-                    data.dt,
                     size + 1,
                     instruments,
                 )

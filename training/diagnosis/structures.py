@@ -25,6 +25,7 @@ from ...models.effects.base import AXES
 from ...models.effects.extended import Extended
 from ...models.effects.unknown import MOTION, TWIST, Unknown, powers
 from .looking import Bench, Look
+from .responses import through
 
 LANES = 24
 PIECES = 60
@@ -82,19 +83,20 @@ def _through(
     keep: Array,
     whiten: Array,
     weight: Array,
-    dt: float,
+    step: Array,
 ) -> Float[Array, "N 12 L R"]:
     """Whitened responses to accelerations d."""
 
     def body(nu: Array, given: tuple) -> tuple[Array, Array]:
-        a, A, gap, white, exists = given
-        direct = dt / 2 * jnp.concatenate([jnp.zeros_like(a), a])
-        moved = jnp.tensordot(gap, nu, 1) - direct
+        a, A, gap, white, exists, h = given
+        direct = h[None, None] / 2 * jnp.concatenate([jnp.zeros_like(a), a])
+        moved = through(gap, nu) - direct
         nu = jnp.sum(A[:, :, None] * moved[None], axis=1) - direct
-        return nu, jnp.tensordot(white, nu, 1) * exists[None, None]
+        return nu, through(white, nu) * exists[None, None]
 
     zero = jnp.zeros((12, *d.shape[2:]), d.dtype)
-    return jax.lax.scan(body, zero, (d, jacobian, keep, whiten, weight))[1].astype(jnp.float32)
+    xs = (d, jacobian, keep, whiten, weight, step)
+    return jax.lax.scan(body, zero, xs)[1].astype(jnp.float32)
 
 
 class Screen:
@@ -113,12 +115,13 @@ class Screen:
         self.kept = np.array(sorted(chosen))
         self.fold = data.fold[self.kept]
         self.cluster = data.cluster[self.kept]
-        k = look.kalman
+        k = look.kalman.of(self.kept)
         self.filters = (
             jnp.asarray(np.asarray(look.predictions.jacobian)[..., self.kept]),
             jnp.asarray(k.keep),
             jnp.asarray(k.whiten),
             jnp.asarray(data.weight[:, self.kept]),
+            jnp.asarray(data.step[:, :1] if data.even else data.step[:, self.kept]),
         )
         z = look.z[..., self.kept].reshape(len(data.u) * 12, -1)
         self.z = z[None] if beside is None else np.concatenate([z[None], beside[..., self.kept]])
@@ -134,7 +137,7 @@ class Screen:
             width = some.shape[2]
             padded = np.zeros((*some.shape[:2], LANES, some.shape[3]))
             padded[:, :, :width] = some
-            z = np.asarray(_through(jnp.asarray(padded), *self.filters, self.bench.data.dt))
+            z = np.asarray(_through(jnp.asarray(padded), *self.filters))
             parts.append(np.moveaxis(z[:, :, :width], 2, 0).reshape(width, -1, z.shape[3]))
         return np.concatenate(parts)
 
@@ -376,10 +379,10 @@ def _memory(bench: Bench, axis: int, times: Sequence[float], frequencies: Sequen
     def columns(kept: np.ndarray) -> np.ndarray:
         v = bench.data.V[:-1, axis][:, kept]
         rates = np.array([complex(-1 / t, 2 * np.pi * f) for t, f in nodes])[:, None]
-        turn = np.exp(rates * bench.data.dt)
-        gain = (turn - 1) / rates
         z, found = np.zeros((len(nodes), len(kept)), complex), []
-        for x in v:
+        for x, h in zip(v, bench.data.step[:, kept], strict=True):
+            turn = np.exp(rates * h)
+            gain = (turn - 1) / rates
             after = turn * z + gain * x
             mean = (z + after) / 2
             both = np.stack([mean.real, mean.imag], axis=1).reshape(2 * len(nodes), -1)

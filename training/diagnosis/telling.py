@@ -174,8 +174,8 @@ def _responses(bench: Bench, look: Look, axis: str) -> tuple[float, float]:
     d = np.concatenate([dt * dt / 2 * a, dt * a])
     w = bench.data.weight
     A = np.einsum("nijr,nr->ij", np.asarray(look.predictions.jacobian), w) / w.sum()
-    white = look.kalman.whiten[-1]
-    lasting = np.linalg.solve(np.eye(12) - A @ look.kalman.keep[-1], d)
+    white, keep = (k[-1].mean(axis=-1) for k in (look.kalman.whiten, look.kalman.keep))
+    lasting = np.linalg.solve(np.eye(12) - A @ keep, d)
     return abs(float((white @ d)[6 + i])) / dt, abs(float((white @ lasting)[6 + i]))
 
 

@@ -6,6 +6,7 @@ from jaxtyping import Float
 
 from ...models.effects.base import AXES
 from ...models.effects.unknown import Unknown
+from .data import Data
 from .laws import Law, estimated, run_constants
 from .looking import Bench, Look
 from .noise import Noise, estimate, filtered, make_filter, mean_jacobian
@@ -103,11 +104,11 @@ def _swell(bench: Bench, omega: float) -> Group:
     d = bench.data
 
     def columns(kept: np.ndarray) -> np.ndarray:
-        t = (np.arange(len(d.u)) + 0.5) * d.dt
+        t = (d.times[:-1] + d.step / 2)[:, kept]
         found = np.zeros((len(t), 3, 6, len(kept)))
         for way in range(3):
-            found[:, way, 2 * way] = np.cos(omega * t)[:, None]
-            found[:, way, 2 * way + 1] = np.sin(omega * t)[:, None]
+            found[:, way, 2 * way] = np.cos(omega * t)
+            found[:, way, 2 * way + 1] = np.sin(omega * t)
         return found
 
     effect = Unknown.neutral(kind="depth", acts_on="W", numbers=(0.0, 1.0))
@@ -139,14 +140,12 @@ def find_levels(bench: Bench, look: Look) -> list[Law]:
         A = mean_jacobian(jacobian, rest)
         noise = estimate(error, rest, A, mass, data.dt)
         levels[k] = noise.diffusion
-        score = _score(error, jacobian, data.weight, own, noise, A, inverse, data.dt)
+        score = _score(error, jacobian, data, own, noise, A, inverse)
         for i in np.flatnonzero(believed > 0):
             b = noise.diffusion.copy()
             b[i] = believed[i]
             other = type(noise)(noise.record, b)
-            gain[i, own] = score - _score(
-                error, jacobian, data.weight, own, other, A, inverse, data.dt
-            )
+            gain[i, own] = score - _score(error, jacobian, data, own, other, A, inverse)
     found, n = [], len(labels)
     for i in np.flatnonzero(believed > 0):
         spread = np.sqrt((n - 1) / n * np.sum((levels[:, i] - levels[:, i].mean()) ** 2))
@@ -158,11 +157,11 @@ def find_levels(bench: Bench, look: Look) -> list[Law]:
 
 
 def _score(
-    error: np.ndarray, jacobian: np.ndarray, weight: np.ndarray, own: np.ndarray, noise: Noise,
-    A: np.ndarray, inverse: np.ndarray, dt: float,
+    error: np.ndarray, jacobian: np.ndarray, data: Data, own: np.ndarray, noise: Noise,
+    A: np.ndarray, inverse: np.ndarray,
 ) -> Float[np.ndarray, " R"]:  # fmt: skip
     """Log density of the innovations of some pieces, up to a constant."""
-    kalman = make_filter(noise, A, inverse, dt, len(error))
-    w = weight[:, own]
+    kalman = make_filter(noise, A, inverse, data.dt, data.step[:, own])
+    w = data.weight[:, own]
     z = filtered(error[:, :, own], jacobian[..., own], kalman) * w[:, None]
-    return -(z**2).sum(axis=(0, 1)) / 2 - kalman.log_det @ w
+    return -(z**2).sum(axis=(0, 1)) / 2 - (kalman.log_det * w).sum(axis=0)

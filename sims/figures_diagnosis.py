@@ -59,13 +59,12 @@ def residual_figure(finding: Finding) -> Figure:
 def _variables(finding: Finding) -> dict[str, Float[np.ndarray, "N R"]]:
     d = finding.data
     qw, qx, qy, qz = (d.X[:-1, i] for i in range(4))
-    N, R = d.weight.shape
     found = {n: d.V[:-1, i] for i, n in enumerate(("u", "v", "w", "p", "q", "r"))}
     found["heading"] = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2))
     found |= {"east": d.X[:-1, 4], "north": d.X[:-1, 5], "height": d.X[:-1, 6]}
     found["voltage"] = d.voltage
     found["effort"] = np.abs(d.u).sum(axis=1)
-    found["time"] = np.broadcast_to(np.arange(N)[:, None] * d.dt, (N, R))
+    found["time"] = d.times[:-1]
     return found
 
 
@@ -147,15 +146,18 @@ def innovations_figure(finding: Finding) -> Figure:
     worst = int(there[np.argmax([score[d.scenario == s].mean() for s in there])])
     own = d.scenario == worst
     figure, axes = panels(2, 3, 3.9, sharex=True, sharey=True)
-    t = np.arange(len(d.u)) * d.dt
-    n = np.sqrt(own.sum())
+    bins = np.maximum(np.rint(d.times[1:, own] / d.dt).astype(int) - 1, 0)
+    count = np.bincount(bins.ravel(), d.weight[:, own].ravel())
+    t = d.dt * np.arange(1, len(count) + 1)
     for i, ax in enumerate(axes.flat):
         ax.axhspan(-2, 2, color=QUIET, alpha=0.15, lw=0)
         for look, name, color in (
             (finding.base, "belief", PLANNED),
             (finding.final, "with the causes", FLOWN),
         ):
-            ax.plot(t, look.z[:, 6 + i][:, own].sum(axis=1) / n, color=color, lw=0.9, label=name)
+            total = np.bincount(bins.ravel(), look.z[:, 6 + i][:, own].ravel())
+            mean = total / np.sqrt(np.maximum(count, 1))
+            ax.plot(t, mean, color=color, lw=0.9, label=name)
         ax.set_title(_TWIST[i])
     for ax in axes[-1]:
         ax.set_xlabel("t / s")

@@ -12,6 +12,7 @@ from spinndrift.models.errors import UserError
 from spinndrift.models.recording import Recording
 from spinndrift.models.recording_build import Trajectory
 from spinndrift.models.recording_csv import read_csv, write_csv
+from spinndrift.training.windows import make_windows
 
 T = np.arange(0.0, 5.0, 0.05)
 STATE = "t,x,y,z,qw,qx,qy,qz,u,v,w,p,q,r"
@@ -108,6 +109,33 @@ def test_uneven_steps_are_resampled(tmp_path):
     settled = np.searchsorted(t, new + 1e-9) == np.searchsorted(t, new + 0.02 - 1e-9)
     np.testing.assert_allclose(held[settled], last[settled], atol=1e-9)
     assert "Uneven time steps were resampled to" in read_csv(tmp_path).notes[-1]
+
+
+def test_uneven_samples_can_stay_where_they_are(tmp_path):
+    t = np.cumsum(np.random.default_rng(0).uniform(0.03, 0.09, 200))
+    columns = motion_columns(t)
+    raw = read_csv(write(tmp_path / "raw", columns), resample=False)
+    assert raw.uneven
+    assert not raw.notes
+    np.testing.assert_allclose(raw.elapsed(0, 0), t - t[0], atol=1e-9)
+    np.testing.assert_allclose(raw.dataset["V_WB_B"].to_numpy()[0, 0].T, columns[8:14], atol=1e-9)
+    write_csv(raw, tmp_path / "again")
+    again = read_csv(tmp_path / "again", resample=False)
+    np.testing.assert_allclose(again.elapsed(0, 0), raw.elapsed(0, 0), atol=1e-9)
+    np.testing.assert_allclose(raw.cut(1.0, 3.0).elapsed(0, 0)[0], 0)
+    with pytest.raises(UserError, match="times of their own"):
+        make_windows(raw, length_s=1.0)
+    backwards = raw.dataset.copy(deep=True)
+    backwards["elapsed"][0, 0, 5] = 0.0
+    with pytest.raises(ValueError, match="don't rise"):
+        Recording(backwards)
+    # even files are none the less on a grid, and a short pause cuts
+    columns = motion_columns()
+    columns[0, 50:] += 0.4
+    meta = "frames: ENU/FLU\ncheck: false\n"
+    paused = read_csv(write(tmp_path / "paused", columns, meta=meta), resample=False)
+    assert not paused.uneven
+    assert paused.lengths.tolist() == [[50, 50]]
 
 
 def test_a_long_gap_makes_two_runs(tmp_path):

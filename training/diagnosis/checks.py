@@ -5,6 +5,7 @@ import numpy as np
 from ...models.effects.base import AXES
 from ...models.kinematics import spikes
 from ...models.recording import Recording
+from ...models.recording_schema import UNEVEN
 from .data import Data
 
 _STUCK = 0.5  # s
@@ -39,7 +40,9 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
                 if still > _STUCK and np.isfinite(column).all():
                     stuck.setdefault(f"{name}.{label}", []).append(number)
         moved = np.linalg.norm(np.diff(run.X_WB[:, 4:], axis=0), axis=1)
-        speed = np.linalg.norm(run.V_WB_B[:-1, :3], axis=1) * recording.dt
+        elapsed = run.sensors.get(UNEVEN)
+        step = recording.dt if elapsed is None else np.diff(elapsed)
+        speed = np.linalg.norm(run.V_WB_B[:-1, :3], axis=1) * step
         excess = np.abs(moved - speed)
         if np.nansum(excess > 30 * np.nanmedian(excess) + 0.1):
             jumps.append(number)
@@ -66,7 +69,11 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
         found.append(
             f"single velocities lie far from both their neighbours in {len(spiked)} runs: outliers"
         )
-    found += [f"samples are missing: {note}" for note in recording.notes if "cut at" in note]
+    found += [
+        f"samples are missing, or the clock jumped: {note}"
+        for note in recording.notes
+        if "cut at" in note
+    ]
     bad = {*jumps, *filled, *spiked, *(n for runs in stuck.values() for n in runs)}
     return found, sorted(bad)
 

@@ -135,19 +135,19 @@ System = tuple[Float[np.ndarray, "n D"], Float[np.ndarray, "n 6"]]
 """Rows of candidates and of what they explain, of one piece."""
 
 
-def _derivatives(phi: np.ndarray, y: np.ndarray, dt: float, _: int) -> System:
+def _derivatives(phi: np.ndarray, y: np.ndarray, t: np.ndarray, _: int) -> System:
     method = pysindy().SmoothedFiniteDifference(smoother_kws={"window_length": _SMOOTH})
-    return phi[:-1], method(y, dt * np.arange(len(y)))[:-1]
+    return phi[:-1], method(y, t)[:-1]
 
 
-def _weak(phi: np.ndarray, y: np.ndarray, dt: float, number: int) -> System:
+def _weak(phi: np.ndarray, y: np.ndarray, t: np.ndarray, number: int) -> System:
     """Integrals against test functions, the same ones on both sides."""
     sindy = pysindy()
     library = sindy.WeakPDELibrary(
         function_library=sindy.PolynomialLibrary(degree=1, include_bias=False),
-        spatiotemporal_grid=dt * np.arange(len(y)),
+        spatiotemporal_grid=t,
         K=_TESTED,
-        H_xt=[min(_HALF, dt * (len(y) - 1) / 4)],
+        H_xt=[min(_HALF, (t[-1] - t[0]) / 4)],
     )
     state = np.random.get_state()  # noqa: NPY002  pysindy places its test functions by this one
     np.random.seed(number)  # noqa: NPY002
@@ -178,7 +178,7 @@ def sparse(
             y = np.concatenate([np.zeros((1, 6)), np.cumsum(errors[:n, 6:, r], axis=0)])
             own = (phi[:, :n, r].T - centre) / scale
             own = np.concatenate([own, own[-1:]])  # held to the last record
-            systems.append((data.fold[r], *_FORMS[form](own, y, data.dt, r)))
+            systems.append((data.fold[r], *_FORMS[form](own, y, data.times[: n + 1, r], r)))
         weights = _chosen(systems, centre, scale)
     return Sparse(jnp.asarray(directions), jnp.asarray(weights))
 

@@ -129,9 +129,10 @@ class Diagnoser:
         bench, nuisance, structures = self._search(bench, nuisance, found)
         self.progress(0.72, "all causes together")
         rows = telling.joint_rows(found, nuisance, bench)
-        final, joint = found.current, None
+        final = fitted = found.current
+        joint = None
         if rows:
-            theta, _, joint = bench.polish(found.current.theta, rows)
+            theta, fitted, joint = bench.polish(found.current.theta, rows)
             final = bench.look(theta)
         self.progress(0.78, "laws of the disturbance")
         least = found.threshold + _LAW_MARGIN
@@ -152,7 +153,7 @@ class Diagnoser:
             ]
         more, stirring = telling.law_causes(passing, bench, final)
         causes += more
-        gain = self._gain(bench, found, final, rows, passing, bool(causes))
+        gain = self._gain(bench, found, fitted, rows, passing, bool(causes))
         d = bench.data
         diagnosis = result.Diagnosis(
             version=result.VERSION,
@@ -160,7 +161,7 @@ class Diagnoser:
             sentence=telling.sentence(causes, self.faults, bool(nuisance)),
             causes=causes,
             refitted=[] if joint is None else telling.refitted(bench, final, nuisance, joint),
-            ratios=self._ratios(bench, final, rows),
+            ratios=ratios(bench, fitted, rows) if config.refit == "all" else [],
             residual=telling.residual(bench, final),
             gain=gain,
             left_out=d.left_out if len(np.unique(d.fold)) > 1 else "nothing",
@@ -188,11 +189,6 @@ class Diagnoser:
         return Finding(
             diagnosis, extended, bench.library, final.theta, d, base, final, found.fits, laws
         )
-
-    def _ratios(self, bench: Bench, final: Look, rows: list[int]) -> list[result.Ratio]:
-        if self.config.refit != "all":
-            return []
-        return ratios(bench, bench.look(final.theta, rows), rows)
 
     def _refitted(self, bench: Bench) -> Look:
         """The belief with the coefficients fitted that are asked for."""
@@ -246,31 +242,33 @@ class Diagnoser:
         self,
         bench: Bench,
         found: Found,
-        final: Look,
+        fitted: Look,
         rows: list[int],
         laws: list[Law],
         extended: bool,
     ) -> dict[str, result.ModelGain]:
-        """Base, base refitted, extended model and black box on data left out of their fits."""
+        """Base, base refitted, extended model and black box on data left out of their fits.
+
+        `fitted` is the look of the final fit, with responses to the parameters of `rows`.
+        """
         horizon, seed = self.config.horizon, self.config.seed
         self.progress(0.82, "gain: the belief")
         R = len(bench.data.fold)
         still = np.repeat(bench.believed[:, None], R, axis=1)
         contenders = {"base": Contender(still)}
-        if self.config.refit == "all":
-            belief = refitted(bench, "all")
-            look = bench.look(bench.moved(found.first.theta, self.bench.library), belief)
-        else:
-            belief = refitted(bench, "command" if self.config.refit == "command" else "linear")
+        if self.config.refit in ("none", "scales"):
+            belief = refitted(bench, "linear")
             _, look, _ = bench.polish(bench.believed, belief, rounds=3)
+        else:
+            belief = refitted(bench, self.config.refit)
+            look = bench.look(bench.moved(found.first.theta, self.bench.library), belief)
         contenders["refitted"] = Contender(bench.without_each(look, belief))
         if extended:
             won = np.zeros(R)
             best = [law for law in laws if law.name == laws[0].name and len(law.heldout) == R]
             for law in best:
                 won += law.heldout
-            look = bench.look(final.theta, rows) if rows else final
-            contenders["extended"] = Contender(bench.without_each(look, rows), won=won)
+            contenders["extended"] = Contender(bench.without_each(fitted, rows), won=won)
         contenders["black_box"] = Contender(
             still, train(found.base.predictions, bench.data, self.rng)
         )

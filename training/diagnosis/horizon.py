@@ -176,11 +176,8 @@ def fit_forecasts(
     library, at = small(bench, rows, theta)
     own = [at.index(i) for i in rows]
     entries = [library.entries[i].parameter for i in own]
-    low, high = np.array([p.low for p in entries]), np.array([p.high for p in entries])
-    for k, i in enumerate(rows):
-        e = bench.library.entries[i]
-        if e.cause in ("linear_drag", "quadratic_drag"):
-            low[k] = max(low[k], -bench.believes(e.cause, e.where))
+    low, high = bench.limits(rows)
+    low = np.maximum(low, bench.passive(rows))
     probe = np.array([abs(p.probes[0]) for p in entries])
     arrays = _arrays(w)
     best = theta[at]

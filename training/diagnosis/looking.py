@@ -28,6 +28,7 @@ _RANDOM = ("waves", "current_varying")
 """Causes that are sought as laws: their motion differs from run to run."""
 
 
+_DRAG = ("linear_drag", "quadratic_drag")
 _HALVINGS = 4
 """Steps that may fail before a fit ends."""
 _WORSE = 20.0
@@ -102,6 +103,13 @@ class Bench:
         entries = [self.library.entries[i] for i in rows]
         both = [self.bounds.get(_key(e), (e.parameter.low, e.parameter.high)) for e in entries]
         return np.array([b[0] for b in both]), np.array([b[1] for b in both])
+
+    def passive(self, rows: Sequence[int]) -> Float[np.ndarray, " k"]:
+        """Least values at which the drag of no axis drives it; without a bound for all else."""
+        entries = [self.library.entries[i] for i in rows]
+        return np.array(
+            [-self.believes(e.cause, e.where) if e.cause in _DRAG else -np.inf for e in entries]
+        )
 
     def moved(self, theta: Float[np.ndarray, " q"], library: Library) -> Float[np.ndarray, " p"]:
         """A θ of another library in this one's order."""

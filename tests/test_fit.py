@@ -298,6 +298,16 @@ def test_patience_ends_a_run_that_gets_no_better(windows, validation):
     assert result.steps < config.steps
 
 
+def test_steps_that_only_harm_leave_the_start(windows, validation):
+    """The start is among the models to choose from, also once bandwidths were fitted anew."""
+    config = replace(CONFIG, learning_rate=0.5, head_decay=0.0, validate_every=3)
+    result = fit(config, TRUTH, windows, validation=validation)
+    assert result.best_step == 0
+    assert_same_bits(result.model, TRUTH)
+    with pytest.raises(AssertionError):
+        assert_same_bits(result.last, TRUTH)
+
+
 def test_pretraining_brings_the_networks_to_the_preset():
     vehicle = load_vehicle("bluerov2_heavy")
     target = vehicle.dynamics(np.full(6, 0.5), jnp.float32)

@@ -31,7 +31,7 @@ Progress = Callable[[int, int, float], None]
 """Called after every step with steps done, steps in all, and the loss."""
 
 _log = logging.getLogger(__name__)
-_VALIDATION_WINDOWS = 32
+_VALIDATION_WINDOWS = 96
 _FLUSH_EVERY = 20
 
 
@@ -40,7 +40,8 @@ class TrainingResult:
     """What a run ends with.
 
     Attributes:
-        model: the best model on the validation windows, or without those the last.
+        model: the best model on the validation windows, the start among them, or without those the
+            last.
         last: the model after the last step.
         steps: steps done, also those of earlier parts of a resumed run.
         best_step: after how many steps `model` was reached.
@@ -137,6 +138,8 @@ class Run:
                 self.folder.load(state, self.config, self.data_id)
             self.folder.begin(self.config, provenance(self.windows))
             self.folder.begin_metrics(state.step)
+        if state.step == 0:
+            state.best_value = self._score(state.best)
         self.snapshot = (state.arrays(), state.plain())
         self.began = time.monotonic() - state.seconds
 
@@ -169,7 +172,7 @@ class Run:
         state, config = self.state, self.config
         if state.step in {round(f * config.steps) for f in config.refit_at}:
             state.objective = state.objective.refit(self._model(state.params), self._usable())
-            state.best_value = float("inf")  # scores before and after can't be compared
+            state.best_value = self._score(state.best)  # of another scale than before
         usable = np.setdiff1d(np.arange(len(self.windows)), state.excluded)
         size = state.objective.group_size()
         indices = step_indices(config.seed, state.step, config.batch, usable, self.labels, size)
@@ -258,18 +261,23 @@ class Run:
             return False
         if not due:
             return False
-        value = float(
-            _validation_loss(
-                self._model(state.params), state.objective, self.validation, self.config.seed
-            )
-        )
-        row["validation"] = value
+        row["validation"] = value = self._score(state.params)
         if value < state.best_value:
             state.best, state.best_value = jax.tree.map(jnp.array, state.params), value
             state.best_step, state.stale = state.step, 0
         else:
             state.stale += 1
         return 0 < config.patience <= state.stale
+
+    def _score(self, params: Any) -> float:
+        """Loss on the validation windows; infinite without them, or if it is not finite."""
+        if self.validation is None:
+            return float("inf")
+        model = self._model(params)
+        value = float(
+            _validation_loss(model, self.state.objective, self.validation, self.config.seed)
+        )
+        return value if np.isfinite(value) else float("inf")
 
     # files
 

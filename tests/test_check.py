@@ -135,6 +135,10 @@ def test_judgements_follow_the_rules():
     twin = compare(truth, diagnosis(cause("actuation_delay"), cause("lift", "heave")))
     assert (twin["first_right"], twin["place_right"], twin["spurious"]) == (True, None, 1)
     assert (twin["recalled"], twin["z"]) == (1, {})
+    alike = replace(cause("lift", "heave"), indistinguishable_from=["thruster_lag"])
+    told = compare(truth, diagnosis(alike))
+    assert (told["first_right"], told["declared"]) == (False, True)
+    assert not compare(truth, diagnosis(cause("lift", "heave")))["declared"]
     loose = Truth("single", "explained", causes=(replace(lag, tolerance=0.05),))
     within = compare(loose, diagnosis(cause("thruster_lag", time_constant=(0.103, 0.001))))
     assert within["z"]["thruster_lag.time_constant"] == 0
@@ -172,7 +176,7 @@ def test_cases_are_judged_once_and_the_page_keeps_its_own_words(tmp_path, monkey
         single = case.truth.kind == "single"
         return Judgement(
             case.name, case.truth.kind, case.truth.called, 1.0, "usual", "adequate", not single,
-            ["thruster_lag"] * single, [], not single, None, 0, 0, seconds=2.0,
+            ["thruster_lag"] * single, [], not single, not single, None, 0, 0, seconds=2.0,
         ), Finding()  # fmt: skip
 
     monkeypatch.setattr(running, "judge", judge)
@@ -185,12 +189,12 @@ def test_cases_are_judged_once_and_the_page_keeps_its_own_words(tmp_path, monkey
     with pytest.raises(UserError, match="name another --out"):
         running.run_cases(cases, tmp_path / "out", 0.05, lambda f, r="": None)
     page = tmp_path / "page.md"
-    page.write_text(f"# Mine\n\n{BEGIN}\nold\n{END}\n\nThe end.\n")
+    page.write_text(f"# Mine\n\n{BEGIN}\nstale\n{END}\n\nThe end.\n")
     write_page(page, rows, cases)
     text = page.read_text()
     assert text.startswith("# Mine")
     assert text.endswith("The end.\n")
-    assert "old" not in text
+    assert "stale" not in text
     assert "| false alarms | 0 of 2 (0.00 to 0.84) |" in text
     assert "| thruster_lag | 0 of 1 | adequate |" in text
     assert len(tables(rows)) == 2

@@ -99,7 +99,16 @@ def test_rivals_stand_beside_judgements(tmp_path, monkeypatch):
     def judge(case, alpha, progress):
         about = (case.name, "single", case.truth.called, 1.0, "usual", "explained", True)
         return Judgement(
-            *about, [case.name], [case.name], True, None, 1, 0, gain={"all": 0.99}, seconds=2.0
+            *about,
+            [case.name],
+            [case.name],
+            True,
+            True,
+            None,
+            1,
+            0,
+            gain={"all": 0.99},
+            seconds=2.0,
         ), Finding()
 
     def compete(case):

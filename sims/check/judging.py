@@ -33,6 +33,7 @@ class Judgement:
         verdict, verdict_right: what was said, and whether it is so.
         hidden, named: names, as drawn and as told.
         first_right: the first name is hidden, or the twin of one that is.
+        declared: it is, or what is hidden is told to be indistinguishable from the first name.
         place_right: so is the place of the first one; None where it is not judged.
         recalled, spurious: hidden causes that were named, names that are not hidden.
         z: deviation of each judged parameter in standard errors, by cause and name.
@@ -53,6 +54,7 @@ class Judgement:
     hidden: list[str]
     named: list[str]
     first_right: bool
+    declared: bool
     place_right: bool | None
     recalled: int
     spurious: int
@@ -82,6 +84,8 @@ def compare(truth: Truth, d: Diagnosis) -> dict[str, Any]:
     causes = d.causes
     first = causes[0] if causes else None
     matched = [h for h in truth.causes if first is not None and fits(h, first)]
+    alike = () if first is None else first.indistinguishable_from
+    told_alike = [h for h in truth.causes if h.name in alike]
     place = None
     if first is not None and matched and matched[0].where and matched[0].name == first.name:
         places = {w.strip() for w in first.where.split(",")}
@@ -113,6 +117,7 @@ def compare(truth: Truth, d: Diagnosis) -> dict[str, Any]:
         "hidden": [h.name for h in truth.causes],
         "named": [c.name for c in causes],
         "first_right": bool(matched) if truth.causes else not causes,
+        "declared": bool(matched or told_alike) if truth.causes else not causes,
         "place_right": place,
         "recalled": sum(any(fits(h, c) for c in causes) for h in truth.causes),
         "spurious": sum(not any(fits(h, c) for h in truth.causes) for c in causes),

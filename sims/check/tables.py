@@ -83,6 +83,12 @@ def _summary(rows: Sequence[Row]) -> Table:
                 share(sum(r["first_right"] for r in true), len(true)),
             )
         )
+        lines.append(
+            (
+                "or told to be indistinguishable from the first name",
+                share(sum(r["declared"] for r in true), len(true)),
+            )
+        )
         alone = sum(r["first_right"] and len(r["named"]) == 1 for r in true)
         lines.append(("and no other name beside them", share(alone, len(true))))
         placed = [r["place_right"] for r in true if r["place_right"] is not None]
@@ -191,6 +197,7 @@ def _varied(rows: Sequence[Row]) -> Table:
             (
                 kind,
                 share(sum(r["first_right"] for r in own), len(own)),
+                str(sum(r["declared"] for r in own)),
                 str(sum(r["first_right"] and len(r["named"]) == 1 for r in own)),
                 str(sum(not r["named"] for r in own)),
                 share(int(np.sum(z <= CLOSE)), len(z)),
@@ -199,8 +206,8 @@ def _varied(rows: Sequence[Row]) -> Table:
             )
         )
     header = (
-        "data", "first name right", "alone", "nothing named", f"parameters within {CLOSE:g} SE",
-        "gain ≥ 90 %", "s",
+        "data", "first name right", "or told as alike", "alone", "nothing named",
+        f"parameters within {CLOSE:g} SE", "gain ≥ 90 %", "s",
     )  # fmt: skip
     return Table("Single causes of realistic size by how they were recorded.", header, lines)
 

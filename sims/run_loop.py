@@ -4,7 +4,7 @@ import gc
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
@@ -87,11 +87,39 @@ def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engin
         UserError: the scenario names what can't be read, its controller lacks a port, or the
             engine is to be `compiled` and can't.
     """
+    return next(simulate_seeds(scenario, [scenario.seed], progress, engine))
+
+
+def simulate_seeds(
+    scenario: Scenario,
+    seeds: Iterable[int],
+    progress: Progress | None = None,
+    engine: Engine = "auto",
+) -> Iterator[Run]:
+    """Fly a scenario with one seed after the other: the runs of `simulate`, one diagram for all.
+
+    With a planner, building and compiling takes longer than many a flight. After Ctrl-C the run at
+    hand is the last.
+
+    Raises:
+        UserError: as `simulate`, when the first run is asked for.
+    """
     tell = progress or (lambda fraction, remark: None)
     tell(0.0, "building")
     diagram = build_diagram(
         scenario.station, scenario.controller, log_periods=log_periods(scenario)
     )
+    warm = False
+    for seed in seeds:
+        run = _one(diagram, scenario.with_changes(seed=seed), warm, tell, engine)
+        warm = True
+        yield run
+        if run.outcome.reason == "interrupted":
+            return
+
+
+def _one(diagram: Diagram, scenario: Scenario, warm: bool, tell: Progress, engine: Engine) -> Run:
+    """Fly a diagram once, in a context of its own; `warm` says that its programs are compiled."""
     simulator = _simulator(diagram, scenario, engine)
     context = simulator.get_mutable_context()
     seeded(diagram, context, scenario.seed)
@@ -105,7 +133,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engin
         if isinstance(simulator, CompiledSimulator):
             timing.engine = "compiled"
             simulator.compile()
-        else:
+        elif not warm:
             _warm_up(diagram, min(scenario.duration, _WARM_UP))
     timing.compilation = time.perf_counter() - started
     with _stop_on_interrupt() as stopped, _few_collections():

@@ -24,6 +24,9 @@ from .path_integral import (
 )
 from .wrench_limits import WrenchLimits
 
+_WORST = 1e3
+"""Condition beyond which slopes of the felt wrench are not inverted."""
+
 
 class MppiState(eqx.Module):
     """What one call hands to the next: the wrenches planned from the time of the last call on."""
@@ -89,6 +92,10 @@ class MppiPlanner(eqx.Module):
     noise, by K_p log(g⁻¹ g_mid) + K_d (ξ_mid − ξ). Without them a path strays ever further, as the
     problem above has it, and the plan shuns gaps that the tracked vehicle passes safely.
 
+    The noise of the sequences is that of the wrench which the body feels. Where the model's thrust
+    is not what is commanded (a weak thruster, say), commands are sampled that together make it;
+    noise on the commands themselves would hardly ever surge without turning.
+
     `F_bias_W` is a wrench about Bo with axes of W that acts besides the model's (an observed
     current, say); the plan's wrenches then contain what counters it.
     """
@@ -101,6 +108,7 @@ class MppiPlanner(eqx.Module):
     V_goal: Float[Array, "6"]
     axes: Float[Array, "6"]
     bases: tuple[Float[Array, "horizon _"], ...]
+    command: Float[Array, "6 6"] | None
     tracking: tuple[Float[Array, "6 6"], Float[Array, "6 6"]] | None
     config: MppiConfig = eqx.field(static=True)
 
@@ -128,6 +136,9 @@ class MppiPlanner(eqx.Module):
         self.X_WG = jnp.asarray(X_WG, dtype)
         self.V_goal = jnp.zeros(6, dtype) if V_goal is None else jnp.asarray(V_goal, dtype)
         self.axes = eqx.filter_jit(type(limits).axes)(limits).astype(dtype)
+        scale = np.maximum(self.config.noise, 0.01) * np.asarray(self.axes, float)
+        command = command_of_felt(dynamics, X_WG, scale)
+        self.command = None if command is None else jnp.asarray(command, dtype)
         self.tracking = None
         if tracking is not None:
             self.tracking = jnp.asarray(tracking[0], dtype), jnp.asarray(tracking[1], dtype)
@@ -136,8 +147,14 @@ class MppiPlanner(eqx.Module):
         )
 
     def hold_wrench(self, F_bias_W: Float[Array, "6"]) -> Float[Array, "6"]:
-        """The wrench that keeps the vehicle at rest at the goal."""
-        return -self.dynamics.potential_wrench(self.X_WG) - _in_body(self.X_WG, F_bias_W)
+        """The wrench that keeps the vehicle at rest at the goal.
+
+        What counters the potential, and then what the model leaves over: buoyancy, payload, tether
+        or current of an extended model.
+        """
+        hold = -self.dynamics.potential_wrench(self.X_WG)
+        hold = hold - self.dynamics.balance(self.X_WG, jnp.zeros_like(hold), hold)[1]
+        return hold - _in_body(self.X_WG, F_bias_W)
 
     def init(self) -> MppiState:
         """State before the first call: hold."""
@@ -248,7 +265,10 @@ class MppiPlanner(eqx.Module):
             w = jax.random.normal(k, (basis.shape[1], 6 * count), basis.dtype)
             part = c.smallest_noise ** jnp.linspace(0, 1, count, dtype=basis.dtype)
             parts.append((basis @ w).reshape(c.horizon, 6, count) * part[None, None])
-        F = nominal[:, :, None] + jnp.concatenate(parts, axis=2) * noise[None, :, None]
+        change = jnp.concatenate(parts, axis=2) * noise[None, :, None]
+        if self.command is not None:
+            change = jnp.einsum("ij,tjn->tin", self.command, change)
+        F = nominal[:, :, None] + change
         F = F.at[:, :, 0].set(nominal)
         if n > 1:
             F = F.at[:, :, 1].set(self.hold_wrench(F_bias_W)[None])
@@ -352,6 +372,25 @@ class MppiPlanner(eqx.Module):
         start = (X, V, jnp.zeros_like(V[0]), jnp.full_like(V[0], jnp.inf))
         (_, _, cost, least), kept = jax.lax.scan(advance, start, (F, dW, last))
         return Rolled(cost.reshape(r, n), least.reshape(r, n), kept)
+
+
+def command_of_felt(
+    dynamics: Dynamics, X_WB: Float[Array, "7"], scale: Float[np.ndarray, "6"]
+) -> Float[np.ndarray, "6 6"] | None:
+    """The change of the commanded wrench for a unit change of the one that the body feels.
+
+    The inverse of the model's mean slope over ± `scale` (N, N·m) about a command of zero, at rest;
+    None where it is the identity, as for every model without effects on its thrusters, and where
+    some direction can hardly be commanded at all.
+    """
+    X = jnp.asarray(X_WB, dynamics.rigid_inertia.dtype)
+    steps = jnp.asarray(np.concatenate([np.diag(scale), -np.diag(scale)], axis=1), X.dtype)
+    X = jnp.broadcast_to(X[:, None], (7, 12))
+    felt = np.asarray(dynamics.balance(X, jnp.zeros_like(steps), steps)[1], float)
+    slope = (felt[:, :6] - felt[:, 6:]) / (2 * scale)
+    if np.allclose(slope, np.eye(6), atol=1e-3) or np.linalg.cond(slope) > _WORST:
+        return None
+    return np.linalg.inv(slope)
 
 
 def _in_body(X_WB: Array, F_W: Array) -> Array:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,12 +15,14 @@ from pydrake.systems.primitives import ConstantVectorSource, RandomSource
 from scipy.linalg import solve_discrete_lyapunov
 
 from spinndrift.models import se3
+from spinndrift.models.effects import Extended, kind
 from spinndrift.models.errors import UserError
 from spinndrift.models.integrate import rollout
 from spinndrift.models.rigid_body import FossenDynamics
+from spinndrift.models.vehicle import load_vehicle
 from spinndrift.systems.mppi import FIGURES, Mppi, key_from_gaussians
 from spinndrift.systems.mppi_config import MppiConfig
-from spinndrift.systems.mppi_core import MppiPlanner, MppiState
+from spinndrift.systems.mppi_core import MppiPlanner, MppiState, command_of_felt
 from spinndrift.systems.obstacles import Cylinders, Pylon, SphereHull
 from spinndrift.systems.plan_samples import SampleLayout
 from spinndrift.systems.wrench_limits import BoxLimits
@@ -108,6 +111,54 @@ def test_without_obstacles_it_finds_the_optimum_of_a_double_integrator():
     assert optimum < float(plan.cost) * (1 + 1e-5)
     assert float(plan.cost) - optimum < 0.01 * (idle - optimum)
     assert np.max(np.abs(np.asarray(plan.F_Bo_B[0]) - F)) < 0.15 * np.max(np.abs(F))
+
+
+def test_holding_counters_what_effects_add():
+    """At rest at the goal nothing is left over: of net buoyancy, current, and an observed bias."""
+    vehicle = load_vehicle("bluerov2_heavy")
+    effects = (kind("net_buoyancy").of(force=-12.0), kind("current_steady").of(east=0.4, north=0.1))
+    model = Extended.create(vehicle.dynamics(), effects, vehicle.thrusters())
+    X_WG = se3.retract(at(1.0, 2.0, -3.0), jnp.array([0, 0, 0, 0, 0, 0.7]))
+    bias = jnp.array([3.0, 0.0, 2.0, 0.0, 0.0, 0.5])
+    planner = MppiPlanner(
+        model, LIMIT, Cylinders.create([]), HULL, X_WG, config=FREE, dtype=jnp.float64
+    )
+    hold = planner.hold_wrench(bias)
+    v_C = se3.rotate_inverse(X_WG, jnp.array([0.4, 0.1, 0.0]))
+    drag = vehicle.dynamics().drag_wrench(-jnp.concatenate([v_C, jnp.zeros(3)]))
+    expected = -drag - jnp.array([0, 0, 2.0 - 12.0, 0, 0, 0])  # 2 N: the preset's own buoyancy
+    turned = jnp.concatenate([se3.rotate_inverse(X_WG, f) for f in (bias[:3], bias[3:])])
+    # the Munk moment of a hull that a current passes stays for the balance to tell
+    rest = model.balance(X_WG, jnp.zeros(6), hold + turned)[1]
+    np.testing.assert_allclose(rest, 0, atol=1e-9)
+    np.testing.assert_allclose((hold + turned)[:3], expected[:3], atol=1e-9)
+
+
+def test_sampled_commands_are_felt_along_the_axes():
+    """With a dead thruster the commands' noise is coupled so that what the body feels is not."""
+    vehicle = load_vehicle("bluerov2_heavy")
+    scale = np.array([30.0, 30.0, 20.0, 0.1, 0.2, 0.5])
+    plain = vehicle.dynamics()
+    assert command_of_felt(plain, at(0.0), scale) is None
+    dead = Extended.create(plain, (kind("thruster_gain").of("2", gain=-1.0),), vehicle.thrusters())
+    command = command_of_felt(dead, at(0.0), scale)
+    assert command is not None
+    felt = jax.vmap(lambda F: dead.balance(at(0.0), NONE, F)[1], 1, 1)(jnp.asarray(command))
+    felt = felt - dead.balance(at(0.0), NONE, NONE)[1][:, None]
+    np.testing.assert_allclose(felt, np.eye(6), atol=1e-9)
+    blind = Extended.create(
+        plain, (kind("thruster_dead_zone").of("all", width=15.0),), vehicle.thrusters()
+    )
+    assert command_of_felt(blind, at(0.0), scale) is None  # moments of this size do nothing at all
+    limit = BoxLimits(1e3 * jnp.ones(6))
+    config = replace(FREE, noise=(0.01, 0.01, 0.01, 0.01, 0.01, 0.01))
+    planner = MppiPlanner(dead, limit, Cylinders.create([]), HULL, at(0.0), config=config)
+    nominal = jnp.zeros((config.horizon, 6), jnp.float32)
+    F = planner.sample(jax.random.key(0), nominal, jnp.zeros(6, jnp.float32))[:, :, 2:]
+    felt = np.linalg.solve(command, np.asarray(F, float).reshape(-1, 6, F.shape[2]))
+    plain_planner = eqx.tree_at(lambda p: p.command, planner, None)
+    plainly = plain_planner.sample(jax.random.key(0), nominal, jnp.zeros(6, jnp.float32))
+    np.testing.assert_allclose(felt, plainly[:, :, 2:], atol=1e-4)
 
 
 # ------------------------------------------------------------------------------- among obstacles

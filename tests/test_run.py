@@ -14,7 +14,7 @@ from spinndrift.sims import run_folder
 from spinndrift.sims.cli import main
 from spinndrift.sims.run_folder import atomic_folder, free_folder, write_run
 from spinndrift.sims.run_log import RunLog
-from spinndrift.sims.run_loop import simulate
+from spinndrift.sims.run_loop import simulate, simulate_seeds
 from spinndrift.sims.run_signals import mean_over
 from spinndrift.sims.scenario import Scenario, load_scenario, overridden
 from spinndrift.systems.closed_loop import Signal
@@ -53,6 +53,17 @@ def test_another_seed_is_another_run(crossing):
     for name in ("X_WB", "X_WB_estimate", "flow_W", "F_Bo_B", "sample_p_WB"):
         one, two = (r.log.recording.dataset[name].to_numpy() for r in (crossing, other))
         assert not np.array_equal(one[..., -1, :], two[..., -1, :]), name
+
+
+def test_runs_of_one_diagram_are_those_of_their_own(crossing):
+    seed = crossing.scenario.seed
+    other, again = simulate_seeds(crossing.scenario, [seed + 1, seed])
+    assert (other.scenario.seed, again.scenario) == (seed + 1, crossing.scenario)
+    first, second = crossing.log.recording.dataset, again.log.recording.dataset
+    for name in first:
+        np.testing.assert_array_equal(first[name].to_numpy(), second[name].to_numpy(), str(name))
+    assert not np.array_equal(other.log["X_WB"], again.log["X_WB"])
+    assert again.timing.compilation < other.timing.compilation  # nothing is left to compile
 
 
 def test_log_holds_what_happened(crossing):

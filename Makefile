@@ -84,7 +84,8 @@ bench: $(INSTALLED) ## the benchmarks, on a quiet machine; ONLY=word picks some
 
 .PHONY: blind
 blind: $(INSTALLED) ## write cases of hidden effects for `spinndrift check diagnosis` into runs/blind
-	PYTHONPATH=tests $(BIN)/python -m hidden runs/blind --scale $(or $(SCALE),small)
+	PYTHONPATH=tests $(BIN)/python -m hidden runs/blind --scale $(or $(SCALE),small) \
+		$(if $(NULLS),--nulls $(NULLS))
 
 .PHONY: lock
 lock: ## write requirements.txt anew with the newest versions that pyproject.toml allows

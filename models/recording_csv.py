@@ -33,7 +33,10 @@ Frames = Literal["ENU/FLU", "NED/FRD"]
 _POSITION, _QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 _STATE = ("t", *_POSITION, *_QUATERNION, *TWIST)
 _LACKABLE = MAY_LACK["X_WB"] + MAY_LACK["V_WB_B"]
-_UNIFORM, _GAP_STEPS, _GAP_S, _FEW_STEPS = 1e-3, 10.0, 1.0, 4.5
+_UNIFORM, _GAP_STEPS, _GAP_S = 1e-3, 10.0, 1.0
+_FEW_STEPS, _USUAL = 4.5, 0.9
+"""Where samples stay in their places a step is too long at so many times the 90th percentile: files
+whose lines come in bursts are not cut at each of them."""
 _NORM = 0.02
 _RANGES = {"pwm": (500.0, 2500.0, "µs (1500 is stopped)"), "voltage": (1.0, 100.0, "V")}
 
@@ -86,7 +89,7 @@ def read_csv(
     Uneven time steps are resampled to `rate` (Hz; by default that of the YAML, else of the files):
     commands held, poses along the geodesic, twists linearly. At long gaps a run is cut in two.
     With `resample` off samples stay where they are (`Recording.elapsed`), and a run is cut wherever
-    a step is longer than a few usual ones, because commands are not known there.
+    a step is longer than 4.5 times the 90th percentile: commands are not known there.
 
     Raises:
         UserError: one sentence naming file, line, column and remedy.
@@ -246,7 +249,7 @@ def _cut(run: _Run, table: Table, notes: list[str], resample: bool) -> list[_Run
     step = np.diff(run.t)
     limit = max(_GAP_STEPS * np.median(step), _GAP_S)
     if not resample:
-        limit = min(limit, _FEW_STEPS * float(np.median(step)))
+        limit = min(limit, _FEW_STEPS * float(np.quantile(step, _USUAL)))
     edges = np.flatnonzero(step > limit) + 1
     if not edges.size:
         return [run]

@@ -136,6 +136,11 @@ def test_uneven_samples_can_stay_where_they_are(tmp_path):
     paused = read_csv(write(tmp_path / "paused", columns, meta=meta), resample=False)
     assert not paused.uneven
     assert paused.lengths.tolist() == [[50, 50]]
+    # lines in bursts of four are whole
+    columns = motion_columns(np.cumsum(np.tile([0.01, 0.01, 0.01, 0.12], 40)))
+    bursts = read_csv(write(tmp_path / "bursts", columns, meta=meta), resample=False)
+    assert bursts.uneven
+    assert bursts.lengths.tolist() == [[160]]
 
 
 def test_a_long_gap_makes_two_runs(tmp_path):

@@ -185,8 +185,9 @@ def sparse(
 
 def _chosen(systems: list[tuple], centre: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Weights (D, 6) on the candidates as they are, each axis with its own best threshold."""
-    folds = np.array([np.full(len(P), f) for f, P, _ in systems], object)
-    folds = np.concatenate(list(folds)).astype(int)
+    if not systems:
+        return np.zeros((len(scale), 6))
+    folds = np.concatenate([np.full(len(P), f) for f, P, _ in systems])
     P, y = (np.concatenate([s[i] for s in systems]) for i in (1, 2))
     unit = y.std(axis=0) + 1e-12
     halves = [folds % 2 == 0, folds % 2 == 1] if len(np.unique(folds)) > 1 else []

@@ -376,7 +376,7 @@ def test_further_fields_are_stored(tmp_path):
     np.testing.assert_array_equal(
         again.extra_wrench(X, V), model.extra_wrench(X, V)
     )  # the bottom lies where it was
-    assert again.remember(U)[0].shape == (240, N)
+    assert again.remember(U)[0].shape == ((8 + 1) * 30, N)
 
 
 def test_a_memory_without_a_name_is_its_convolution():

@@ -241,7 +241,7 @@ def _rivals(rows: Sequence[Row]) -> Table:
     names = tuple(chosen[0]["rivals"]) if chosen else ()
     caption = (
         "Rivals on the same files: the share of the true model's gain (in brackets the terms of "
-        "sparse regressions, in all six axes; median over cases)."
+        "sparse regressions besides constants, in all six axes; median over cases)."
     )
     return Table(caption, ("hidden", "named by spinndrift", "its gain", *names), lines)
 

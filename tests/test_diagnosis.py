@@ -12,6 +12,7 @@ from hidden.scenarios import Plan
 from spinndrift.models.effects import KINDS, Extended, Library
 from spinndrift.models.recording_csv import read_csv
 from spinndrift.models.vehicle import load_vehicle
+from spinndrift.training.diagnosis import looking
 from spinndrift.training.diagnosis.data import Data
 from spinndrift.training.diagnosis.diagnose import DiagnoseConfig, Diagnoser
 from spinndrift.training.diagnosis.hypotheses import Fit
@@ -87,6 +88,15 @@ def null(tmp_path_factory):
         diagnoser = Diagnoser(recording, VEHICLE).bench
         found.append((diagnoser, diagnoser.look(diagnoser.believed)))
     return found
+
+
+def test_slopes_that_overflow_are_a_step_too_far(null, monkeypatch):
+    bench, look = null[0]
+    steep = np.full(look.predictions.jacobian.shape, np.inf)
+    broken = look.predictions._replace(jacobian=steep)
+    monkeypatch.setattr(looking, "predict", lambda *given: broken)
+    with pytest.raises(FloatingPointError, match="overflow"):
+        bench.predict(bench.believed)
 
 
 def test_noise_is_found_and_innovations_are_white_on_a_null(null):

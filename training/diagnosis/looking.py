@@ -150,6 +150,8 @@ class Bench:
         if not np.isfinite(error[:, :, weight.any(axis=0)]).all():
             raise FloatingPointError("predictions diverge")
         A = mean_jacobian(np.asarray(p.jacobian), weight)
+        if not np.isfinite(A).all():
+            raise FloatingPointError("slopes of predictions overflow")
         mass = self.mass(theta)
         noise = estimate(error, weight, A, mass, self.data.dt)
         kalman = make_filter(noise, A, np.linalg.inv(mass), self.data.dt, self.data.step)

@@ -28,6 +28,8 @@ COMMANDS = {
     "thruster_force": ("thruster", "N"),
     "pwm": ("thruster", "us"),
 }
+UNEVEN = "elapsed"
+"""Time since a trajectory's index 0, where its steps differ from dt; dt is then a nominal step."""
 SENSORS: dict[str, tuple[str | None, str]] = {
     "voltage": (None, "V"),
     "imu_specific_force": ("axis", "m/s^2"),
@@ -35,7 +37,7 @@ SENSORS: dict[str, tuple[str | None, str]] = {
     "pressure_depth": (None, "m"),
     "vertical_velocity": (None, "m/s"),
     "rc": ("channel", "us"),
-    "elapsed": (None, "s"),
+    UNEVEN: (None, "s"),
 }
 LABELS: dict[str, tuple[str, ...]] = {
     "pose_component": POSE,
@@ -43,8 +45,6 @@ LABELS: dict[str, tuple[str, ...]] = {
     "wrench_component": WRENCH,
     "axis": AXES,
 }
-UNEVEN = "elapsed"
-"""Time since a trajectory's index 0, where its steps differ from dt; dt is then a nominal step."""
 # Channels that a log may simply not have; they are then NaN throughout a trajectory.
 MAY_LACK = {"X_WB": ("x", "y", "z"), "V_WB_B": TWIST}
 _NORM_TOLERANCE = 1e-4

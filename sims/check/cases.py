@@ -20,6 +20,8 @@ from ...models.effects.unknown import Unknown
 from ...models.errors import UserError
 from ...training.diagnosis.result import Verdict
 
+USUAL = "usual"
+"""Data recorded as most cases are."""
 Kind = Literal["null", "single", "pair", "triple", "unknown", "fault"]
 
 
@@ -75,7 +77,7 @@ class Truth:
     verdict: Verdict
     label: str = ""
     size: float = 1.0
-    data: str = "usual"
+    data: str = USUAL
     causes: tuple[HiddenCause, ...] = ()
     vehicle: str = ""
     diffusion: tuple[float, ...] = ()

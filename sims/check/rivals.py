@@ -27,9 +27,11 @@ from jaxtyping import Array, Float
 from ...models import se3
 from ...models.errors import UserError
 from ...models.recording_csv import read_csv
+from ...models.recording_schema import TWIST, WRENCH
 from ...training.diagnosis.blackbox import arguments, train
 from ...training.diagnosis.data import Data
 from ...training.diagnosis.forecast import Learned
+from ...training.diagnosis.innovations import predict
 from ...training.diagnosis.looking import Bench
 from .cases import Case
 from .judging import believed, share_of_gain
@@ -80,7 +82,6 @@ class Sparse(eqx.Module):
         return jnp.tensordot(self.weights.T, terms(self.directions, X, V, u, before), 1)
 
 
-_TWIST = ("u", "v", "w", "p", "q", "r")
 _PAIRS = [(i, j) for i in range(6) for j in range(i + 1, 6)]
 
 
@@ -104,8 +105,8 @@ def terms(
 def labels(thrusters: int) -> list[str]:
     """What the candidates are called."""
     numbers = range(1, thrusters + 1)
-    found = ["1", *_TWIST, *(f"|{v}|{v}" for v in _TWIST)]
-    found += [f"{_TWIST[i]} {_TWIST[j]}" for i, j in _PAIRS]
+    found = ["1", *TWIST, *(f"|{v}|{v}" for v in TWIST)]
+    found += [f"{TWIST[i]} {TWIST[j]}" for i, j in _PAIRS]
     found += ["up_x", "up_y", "up_z", "cos yaw", "sin yaw", "x", "y", "z"]
     for form in ("f{}", "f{} before", "|f{}|", "f{} axial speed"):
         found += [form.format(i) for i in numbers]
@@ -227,8 +228,8 @@ def compete(case: Case) -> dict[str, Rival]:
     recording = read_csv(case.folder / "data", resample=False)
     vehicle, base = believed(case.truth, recording)
     bench = Bench.of(recording, vehicle, base)
-    predictions = bench.predict(bench.believed)[0]
-    errors = bench.errors(bench.believed)
+    predictions = predict(bench.model, bench.library, bench.believed, bench.data)
+    errors = np.asarray(predictions.error) * bench.data.weight[:, None]
     directions = np.asarray(vehicle.thrusters().directions)
     judged = functools.partial(_judged, case, bench)
     found = {}
@@ -249,9 +250,8 @@ def _judged(case: Case, bench: Bench, rest: Learned) -> dict[str, float]:
 def _told(model: Sparse) -> dict[str, list[str]]:
     names = labels(model.directions.shape[1])
     weights = np.asarray(model.weights)
-    axes = ("X", "Y", "Z", "K", "M", "N")
     found = {}
-    for i, axis in enumerate(axes):
+    for i, axis in enumerate(WRENCH):
         order = np.argsort(-np.abs(weights[:, i]))
         found[axis] = [names[k] for k in order if weights[k, i] != 0 and k > 0]
     return found

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
+from .cases import USUAL
 from .judging import CLOSE
 
 Row = dict[str, Any]
-USUAL = "usual"
 ENOUGH = 0.9
 """Share of the true model's gain that an extended model should reach."""
 

@@ -84,6 +84,12 @@ class Data:
         """Whether all steps are equal."""
         return bool(np.ptp(self.step) <= _EVEN * self.dt)
 
+    def own_steps(
+        self, pieces: Int[np.ndarray, " K"] | slice = slice(None)
+    ) -> Float[np.ndarray, "N _"]:
+        """Steps of some pieces (s), as one column where all are equal."""
+        return self.step[:, :1] if self.even else self.step[:, pieces]
+
     @property
     def longest(self) -> float:
         """The longest step (s)."""

@@ -116,8 +116,8 @@ def _simulated(
     kinds: set[tuple[str, str]],
 ) -> Judged:
     data = bench.data
-    X, V, u, voltage, step = as_arrays(data)
-    step = step if data.even else step[:, kept]
+    X, V, u, voltage, _ = as_arrays(data)
+    step = jnp.asarray(data.own_steps(kept))
     arrays = X[..., kept], V[..., kept], u[..., kept], voltage[..., kept], step
     theta = contender.theta[:, kept]
     every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))

@@ -30,8 +30,8 @@ Arrays = tuple[Array, Array, Array, Array, Array]
 
 def as_arrays(data: Data) -> Arrays:
     """The arrays that compiled programs take; equal steps as one column, (N, 1)."""
-    step = data.step[:, :1] if data.even else data.step
-    return tuple(jnp.asarray(a) for a in (data.X, data.V, data.u, data.voltage, step))  # pyright: ignore[reportReturnType]
+    arrays = (data.X, data.V, data.u, data.voltage, data.own_steps())
+    return tuple(jnp.asarray(a) for a in arrays)  # pyright: ignore[reportReturnType]
 
 
 class Predictions(NamedTuple):

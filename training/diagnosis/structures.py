@@ -121,7 +121,7 @@ class Screen:
             jnp.asarray(k.keep),
             jnp.asarray(k.whiten),
             jnp.asarray(data.weight[:, self.kept]),
-            jnp.asarray(data.step[:, :1] if data.even else data.step[:, self.kept]),
+            jnp.asarray(data.own_steps(self.kept)),
         )
         z = look.z[..., self.kept].reshape(len(data.u) * 12, -1)
         self.z = z[None] if beside is None else np.concatenate([z[None], beside[..., self.kept]])

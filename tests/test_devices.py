@@ -11,48 +11,56 @@ from diagonal import Diagonal, simulated
 
 from spinndrift.sims.compile_cache import compiled_folder
 from spinndrift.training.config import TrainingConfig
+from spinndrift.training.distance_aware import DistanceAwareObjective
 from spinndrift.training.fit import fit
-from spinndrift.training.losses import Mse
+from spinndrift.training.losses import Fdm
 from spinndrift.training.step import usable_devices
 
 CONFIG = TrainingConfig(
-    objective=Mse(substeps=1),
+    objective=Fdm(samples=4, substeps=1, time_pairs=2),
     steps=5,
     batch=6,
     learning_rate=1e-2,
     warm_up=1,
     refit_at=(),
+    validate_every=2,
 )
+START = Diagonal.of(mass=14.0, drag=5.0, diffusion=2.0)
 
 
-def learned() -> tuple[np.ndarray, int]:
-    """Parameters after a few steps, and the number of devices that hold them."""
+def learned() -> np.ndarray:
+    """Parameters after a few steps, then the training losses, then the validation's."""
     truth = Diagonal.of(mass=10.0, drag=8.0, diffusion=1.0)
-    start = Diagonal.of(mass=14.0, drag=5.0, diffusion=2.0)
-    model = fit(CONFIG, start, simulated(truth, 20)).last
+    result = fit(CONFIG, START, simulated(truth, 20), validation=simulated(truth, 8))
+    model, metrics = result.last, result.metrics
     assert isinstance(model, Diagonal)
-    parameters = [model.log_mass, model.log_drag]
-    return np.stack([np.asarray(a) for a in parameters]), len(model.log_mass.sharding.device_set)
+    parameters = [model.log_mass, model.log_drag, model.log_diffusion]
+    assert all(len(a.sharding.device_set) == 1 for a in parameters)
+    parts = [np.asarray(a).ravel() for a in (*parameters, metrics["loss"], metrics["validation"])]
+    return np.concatenate(parts)
 
 
 def test_two_devices_learn_what_one_does(tmp_path):
+    """With the noise they draw: that of a window is a matter of its place in the batch."""
     out = tmp_path / "two.npy"
     code = (
         "import sys, jax, numpy; jax.config.update('jax_num_cpu_devices', 2);"
-        "jax.config.update('jax_enable_x64', True); import test_devices;"
-        "found, devices = test_devices.learned(); assert devices == 2, devices;"
-        "numpy.save(sys.argv[1], found)"
+        "jax.config.update('jax_enable_x64', True); import test_devices as t;"
+        "objective = t.CONFIG.objective.build(t.START, t.simulated(t.START, 8));"
+        "assert [t.usable_devices(objective, n) for n in (6, 7, 8)] == [2, 1, 2];"
+        "numpy.save(sys.argv[1], t.learned())"
     )
     here = Path(__file__).parent
     kept = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(compiled_folder())}
     command = [sys.executable, "-c", code, str(out)]
     subprocess.run(command, check=True, cwd=here, timeout=300, env=kept)
-    one, devices = learned()
-    assert devices == 1
+    one = learned()
     # sums over windows are taken in another order: float32's rounding, through a few Adam steps
     np.testing.assert_allclose(np.load(out), one, atol=1e-3 * CONFIG.learning_rate * CONFIG.steps)
 
 
-def test_devices_share_a_batch_equally():
-    assert len(jax.devices()) == 1
-    assert usable_devices(7) == 1
+def test_a_loss_that_is_no_mean_of_windows_stays_on_one_device(monkeypatch):
+    monkeypatch.setattr(jax, "devices", lambda: [None, None])
+    objective = Fdm(substeps=1).build(START, simulated(START, 4))
+    assert usable_devices(objective, 4) == 2
+    assert usable_devices(object.__new__(DistanceAwareObjective), 4) == 1

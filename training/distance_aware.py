@@ -75,6 +75,7 @@ class DistanceAwareObjective(Objective):
     """The loss of `DistanceAware`."""
 
     name: ClassVar[str] = "distance-aware"
+    mean_of_windows: ClassVar[bool] = False  # 1/μ of the mean μ
     config: DistanceAware = eqx.field(static=True)
     steps: int = eqx.field(static=True)
     dt: float = eqx.field(static=True)
@@ -166,6 +167,7 @@ class UnconstrainedObjective(Objective):
     """The loss of `Unconstrained`."""
 
     name: ClassVar[str] = "unconstrained"
+    mean_of_windows: ClassVar[bool] = False  # a threshold on the mean gradient
     config: Unconstrained = eqx.field(static=True)
     steps: int = eqx.field(static=True)
     dt: float = eqx.field(static=True)
@@ -248,7 +250,7 @@ def _diffusion(model: EuclideanSpinn, kind: str) -> Diffusion:
 
 
 def _beginning(batch: Batch, steps: int) -> Batch:
-    return Batch(batch.X[: steps + 1], batch.V[: steps + 1], batch.F[:steps])
+    return batch._replace(X=batch.X[: steps + 1], V=batch.V[: steps + 1], F=batch.F[:steps])
 
 
 def _ball(key: Array, z: Float[Array, "6 *batch"], radius: float, samples: int) -> Array:

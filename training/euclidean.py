@@ -23,6 +23,7 @@ from .groups import group_size
 from .kernels import VelocityKernel, bandwidths_from_differences
 from .moments import Moments, MomentsObjective, Unit, compare, pooled, units, vector_moments
 from .objective import Batch, Objective
+from .predict import normal_by_window
 from .scores import kernel_score, time_pairs
 from .windows import Windows
 
@@ -64,7 +65,9 @@ def predict_coordinates(
     dW = None
     if key is not None:
         scale = jnp.asarray(dt**0.5, batch.F.dtype)
-        dW = scale * jax.random.normal(key, (T * substeps, 6, samples, W), batch.F.dtype)
+        shape = (T * substeps, 6)
+        drawn = normal_by_window(key, batch.place, shape, samples, batch.F.dtype)
+        dW = scale * jnp.swapaxes(drawn, 2, 3)
         quiet = jnp.zeros((T * substeps, 6, count - samples, W), batch.F.dtype)
         dW = jnp.concatenate([dW, quiet], axis=2)
     F = jnp.repeat(batch.F[:, :, None], substeps, axis=0)

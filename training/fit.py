@@ -24,7 +24,15 @@ from .guard import Diagnosis, TrainingError, diagnose, not_finite
 from .objective import Batch, Objective
 from .provenance import fingerprint, provenance
 from .run_folder import RunFolder, TrainState
-from .step import Report, TrainStep, learning_rate, optimizer, partition
+from .step import (
+    Report,
+    TrainStep,
+    learning_rate,
+    mean_over_devices,
+    optimizer,
+    partition,
+    usable_devices,
+)
 from .windows import Windows
 
 Progress = Callable[[int, int, float], None]
@@ -146,7 +154,8 @@ class Run:
     def go(self, progress: Progress | None, resume: bool) -> TrainingResult:
         """All steps that are left."""
         self.begin(resume)
-        step = TrainStep(self.config, self.state.params, self.static)
+        devices = usable_devices(self.state.objective, self.config.batch)
+        step = TrainStep(self.config, self.state.params, self.static, devices)
         stopped = False
         with deferred_interrupt() as interrupted:
             try:
@@ -273,9 +282,10 @@ class Run:
         """Loss on the validation windows; infinite without them, or if it is not finite."""
         if self.validation is None:
             return float("inf")
-        model = self._model(params)
+        model, objective = self._model(params), self.state.objective
+        devices = usable_devices(objective, self.validation.place.size)
         value = float(
-            _validation_loss(model, self.state.objective, self.validation, self.config.seed)
+            _validation_loss(model, objective, self.validation, self.config.seed, devices)
         )
         return value if np.isfinite(value) else float("inf")
 
@@ -314,7 +324,7 @@ class Run:
         state = self.state
         if self.validation is None:
             state.best, state.best_step = state.params, state.step
-        best = self._model(state.best)
+        best, last = (self._model(_on_one_device(p)) for p in (state.best, state.params))
         if self.folder is None:
             names = list(self.rows[0]) if self.rows else []
             metrics = {
@@ -326,7 +336,7 @@ class Run:
             metrics = self.folder.read_metrics()
         return TrainingResult(
             model=best,
-            last=self._model(state.params),
+            last=last,
             steps=state.step,
             best_step=state.best_step,
             metrics=metrics,
@@ -336,10 +346,23 @@ class Run:
         )
 
 
+def _on_one_device(params: Any) -> Any:
+    """What was trained on several devices, as any other arrays."""
+    return jax.device_put(params, jax.devices()[0])
+
+
 @eqx.filter_jit
-def _validation_loss(model: Dynamics, objective: Objective, batch: Batch, seed: int) -> jax.Array:
+def _validation_loss(
+    model: Dynamics, objective: Objective, batch: Batch, seed: int, devices: int
+) -> jax.Array:
     key = jax.random.fold_in(jax.random.key(seed), np.uint32(2**32 - 1))
-    return objective.loss(model, batch, key)[0]
+    whole, rest = eqx.partition((model, objective), eqx.is_array)
+
+    def of_part(batch: Batch, whole: Any, key: jax.Array) -> jax.Array:
+        model, objective = eqx.combine(whole, rest)
+        return objective.loss(model, batch, key)[0]
+
+    return mean_over_devices(of_part, devices)(batch, whole, key)
 
 
 @contextmanager

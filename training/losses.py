@@ -23,7 +23,7 @@ from .kernels import (
     bandwidths_from_differences,
 )
 from .objective import Batch, Objective
-from .predict import predict, predict_drift
+from .predict import normal_by_window, predict, predict_drift
 from .scores import kernel_score, time_pairs
 from .windows import Windows
 
@@ -180,6 +180,7 @@ class FdmObjective(Objective):
             P,
             substeps=c.substeps,
             with_path_of_drift=drift,
+            place=batch.place,
         )
         first, second = time_pairs(time_key, batch.F.shape[0], self.lags, c.time_pairs)
         pose = kernel_score(
@@ -243,7 +244,8 @@ def _mass_variation(model: Dynamics, batch: Batch, key: Array) -> Array:
         return jnp.zeros((), batch.V.dtype)
     time_key, direction_key = jax.random.split(key)
     V = batch.V[jax.random.randint(time_key, (), 0, batch.V.shape[0])]
-    return model.mass_variation(V, jax.random.normal(direction_key, V.shape, V.dtype))
+    direction = normal_by_window(direction_key, batch.place, (6,), 1, V.dtype)[..., 0]
+    return model.mass_variation(V, direction)
 
 
 def typical_motion(

@@ -174,6 +174,7 @@ class MomentsObjective(Objective):
             self.config.samples,
             substeps=self.config.substeps,
             with_path_of_drift=with_path_of_drift,
+            place=batch.place,
         )
 
     def pose_parts(self, X: Float[Array, "T C P W"], batch: Batch) -> dict[str, Array]:

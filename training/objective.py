@@ -9,35 +9,51 @@ from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..models.dynamics import Dynamics
 from .windows import Windows
 
 
 class Batch(NamedTuple):
-    """Windows as arrays on the device: poses and twists at t_0 … t_T, wrenches of the T steps."""
+    """Windows as arrays on the device: poses and twists at t_0 … t_T, wrenches of the T steps.
+
+    `place` numbers the windows: what is drawn for a window depends on its place, not on which
+    others are at hand, so a batch shared among devices sees the noise that one device would.
+    """
 
     X: Float[Array, "N 7 W"]
     V: Float[Array, "N 6 W"]
     F: Float[Array, "T 6 W"]
+    place: Int[Array, " W"]
 
     @classmethod
     def of(cls, windows: Windows) -> "Batch":
         """All windows as one batch."""
-        return cls(jnp.asarray(windows.X), jnp.asarray(windows.V), jnp.asarray(windows.F))
+        X, V, F = (jnp.asarray(a) for a in (windows.X, windows.V, windows.F))
+        return cls(X, V, F, jnp.arange(len(windows)))
+
+    def take(self, indices: Int[Array, " B"]) -> "Batch":
+        """The windows of some indices, in places of their own."""
+        X, V, F = (a[:, :, indices] for a in (self.X, self.V, self.F))
+        return Batch(X, V, F, jnp.arange(indices.size))
 
 
 class Objective(eqx.Module):
     """A loss with what it needs to know; its array fields are data (bandwidths), never trained."""
 
     name: ClassVar[str]
+    mean_of_windows: ClassVar[bool] = True
+    """Whether the loss of a batch is the mean of the losses of its groups of windows."""
 
     @abc.abstractmethod
     def loss(
         self, model: Dynamics, batch: Batch, key: Array
     ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-        """The mean loss over the batch and its parts by name; all randomness comes from `key`."""
+        """The mean loss over the batch and its parts by name.
+
+        All randomness comes from `key`, and what is drawn for a window from its place too.
+        """
 
     def group_size(self) -> int:
         """How many windows of equal scenario and start stand side by side in a batch.

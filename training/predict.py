@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, DTypeLike, Float, Int
 
 from ..models.dynamics import Dynamics
 from ..models.integrate import rollout
@@ -19,11 +19,12 @@ def predict(
     *,
     substeps: int = 1,
     with_path_of_drift: bool = False,
+    place: Int[Array, " W"] | None = None,
 ) -> tuple[Float[Array, "T 7 P W"], Float[Array, "T 6 P W"]]:
     """Draw `samples` motions from each window's first state and commands, at t_1 … t_T.
 
     `with_path_of_drift` appends the noise-free motion as one more sample. Increments come from
-    `key` alone.
+    `key` and the windows' places (0, 1 … W - 1 unless given).
     """
     T, _, W = F.shape
     count = samples + with_path_of_drift
@@ -31,7 +32,8 @@ def predict(
     dt = dt / substeps
     scale = jnp.asarray(dt**0.5, F.dtype)
     n = model.brownian_size
-    dW = scale * jax.random.normal(key, (T * substeps, 1, n, W, samples), F.dtype)
+    place = jnp.arange(W) if place is None else place
+    dW = scale * normal_by_window(key, place, (T * substeps, 1, n), samples, F.dtype)
     if with_path_of_drift:
         dW = jnp.concatenate([dW, jnp.zeros((T * substeps, 1, n, W, 1), F.dtype)], axis=4)
 
@@ -44,6 +46,17 @@ def predict(
     dW = dW.reshape(T * substeps, 1, n, W * count)
     Xs, Vs = rollout(model, flat(X_0), flat(V_0), F, dt, dW)
     return _by_sample(Xs[substeps - 1 :: substeps], W), _by_sample(Vs[substeps - 1 :: substeps], W)
+
+
+def normal_by_window(
+    key: Array, place: Int[Array, " W"], shape: tuple[int, ...], samples: int, dtype: DTypeLike
+) -> Float[Array, "*shape W P"]:
+    """Standard normal numbers, those of a window a function of `key` and its place alone."""
+
+    def draw(number: Array) -> Array:
+        return jax.random.normal(jax.random.fold_in(key, number), (*shape, samples), dtype)
+
+    return jax.vmap(draw, out_axes=len(shape))(place)
 
 
 def _by_sample(a: Float[Array, "T C WP"], windows: int) -> Float[Array, "T C P W"]:

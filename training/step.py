@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as Spec
 from jaxtyping import Array, Bool, Float, Int, UInt
 
 from ..models.dynamics import Dynamics
@@ -19,6 +20,8 @@ from .objective import Batch, Objective
 QUICK_COMPILE = {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512}
 """On a CPU: a third less time to compile at equal speed (18.1 to 12.5 s, 74 and 76 ms a step), and
 vectors as wide as the processor has them, of which XLA uses half by itself."""
+
+_WINDOWS = "windows"  # the mesh's axis
 
 
 class Report(NamedTuple):
@@ -69,19 +72,18 @@ def head_weights(params: Any) -> Any:
 
 
 class TrainStep:
-    """The compiled step of one kind of model and one objective, over all of JAX's devices.
+    """The compiled step of one kind of model and one objective, over some of JAX's devices.
 
     `static` is what the model holds besides its parameters; its arrays are handed to the program,
     so that models which differ in numbers alone share a compiled one. `traces` counts how often
     Python was traced: 1 after the first call and ever after.
     """
 
-    def __init__(self, config: TrainingConfig, params: Any, static: Any):
+    def __init__(self, config: TrainingConfig, params: Any, static: Any, devices: int = 1):
         self.optimizer = optimizer(config)
         self.traces = 0
         self._frozen, structure = eqx.partition(static, eqx.is_array)
-        update = _update(config, self.optimizer, params, structure)
-        devices = usable_devices(config.batch)
+        update = _update(config, self.optimizer, params, structure, devices)
 
         def step(
             params: Any,
@@ -95,12 +97,12 @@ class TrainStep:
             rate: Float[Array, ""],
         ) -> tuple[Any, Any, Report]:
             self.traces += 1
-            batch = over_devices(_taken(data, indices), devices)
+            batch = data.take(indices)
             return update(frozen, params, moments, objective, batch, seed, number, rate)
 
-        sharding = NamedSharding(_mesh(devices), PartitionSpec()) if devices > 1 else None
+        everywhere = NamedSharding(_mesh(devices), Spec()) if devices > 1 else None
         self._step = jax.jit(
-            step, donate_argnums=(0, 1), compiler_options=QUICK_COMPILE, in_shardings=sharding
+            step, donate_argnums=(0, 1), compiler_options=QUICK_COMPILE, in_shardings=everywhere
         )
 
     def __call__(
@@ -138,7 +140,7 @@ class EnsembleStep:
 
         def step(frozen: Any, runs: list[tuple]) -> list[tuple[Any, Any, Report]]:
             self.traces += 1
-            inputs = [(*run[:3], _taken(run[3], run[4]), *run[5:]) for run in runs]
+            inputs = [(*run[:3], run[3].take(run[4]), *run[5:]) for run in runs]
             together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *inputs)
             done = jax.vmap(update)(frozen, *together)
             return [jax.tree.map(lambda a, i=i: a[i], done) for i in range(len(runs))]
@@ -159,17 +161,22 @@ def _numbers(indices: np.ndarray, seed: int, number: int, rate: float) -> tuple[
     )
 
 
-def _taken(data: Batch, indices: Array) -> Batch:
-    return Batch(*(a[:, :, indices] for a in data))
-
-
 def _update(
     config: TrainingConfig,
     transformation: optax.GradientTransformation,
     params: Any,
     structure: Any,
+    devices: int = 1,
 ) -> Callable[..., tuple[Any, Any, Report]]:
     """What a step compiles: loss, gradient, Adam, decay; nothing changes if not all is finite."""
+
+    def of_part(batch: Batch, params: Any, frozen: Any, objective: Objective, key: Array) -> Any:
+        def loss(p: Any) -> tuple[Array, dict[str, Array]]:
+            return objective.loss(eqx.combine(p, frozen, structure), batch, key)
+
+        return jax.value_and_grad(loss, has_aux=True)(params)
+
+    of_batch = mean_over_devices(of_part, devices)
     decay = jax.tree.map(lambda w: config.head_decay * w, head_weights(params))
 
     def update(
@@ -183,11 +190,7 @@ def _update(
         rate: Float[Array, ""],
     ) -> tuple[Any, Any, Report]:
         key = jax.random.fold_in(jax.random.key(seed), number)
-
-        def loss(p: Any) -> tuple[Array, dict[str, Array]]:
-            return objective.loss(eqx.combine(p, frozen, structure), batch, key)
-
-        (value, parts), gradient = jax.value_and_grad(loss, has_aux=True)(params)
+        (value, parts), gradient = of_batch(batch, params, frozen, objective, key)
         with jax.numpy_dtype_promotion("standard"):  # optax mixes int32 and float
             direction, new_moments = transformation.update(gradient, moments, params)
         new = jax.tree.map(
@@ -207,23 +210,33 @@ def _update(
     return update
 
 
-def over_devices(batch: Batch, devices: int) -> Batch:
-    """The batch with its windows spread over so many devices, each computing its own share.
+def mean_over_devices(of_part: Callable[..., Any], devices: int) -> Callable[..., Any]:
+    """`of_part(batch, *whole)` of equal parts of the batch's windows, one a device, averaged.
 
-    Parameters stay whole on each; the compiler adds the sum of gradients. The numbers drawn don't
-    depend on the number of devices.
+    Each device differentiates its own part from end to end and they meet once, at the mean. (Left
+    to the compiler, they meet at every step of the integration, which is slower than one alone.)
     """
     if devices == 1:
-        return batch
-    spread = NamedSharding(_mesh(devices), PartitionSpec(None, None, "windows"))
-    return Batch(*(jax.lax.with_sharding_constraint(a, spread) for a in batch))
+        return of_part
+
+    def here(batch: Batch, whole: tuple[Any, ...]) -> Any:
+        return jax.lax.pmean(of_part(batch, *whole), _WINDOWS)
+
+    share = Spec(None, None, _WINDOWS)
+    parts = Batch(X=share, V=share, F=share, place=Spec(_WINDOWS))  # pyright: ignore[reportArgumentType]
+    mean = jax.shard_map(
+        here, mesh=_mesh(devices), in_specs=(parts, Spec()), out_specs=Spec(), check_vma=False
+    )
+    return lambda batch, *whole: mean(batch, whole)
 
 
 def _mesh(devices: int) -> Mesh:
-    return jax.make_mesh((devices,), ("windows",), axis_types=(AxisType.Auto,))
+    return jax.make_mesh((devices,), (_WINDOWS,), axis_types=(AxisType.Auto,))
 
 
-def usable_devices(windows: int) -> int:
-    """How many of JAX's devices can share `windows` equally."""
-    count = len(jax.devices())
-    return max(n for n in range(1, count + 1) if windows % n == 0)
+def usable_devices(objective: Objective, windows: int) -> int:
+    """How many of JAX's devices can share a batch of so many windows, whole groups each."""
+    if not objective.mean_of_windows:
+        return 1
+    groups = max(1, windows // objective.group_size())
+    return max(n for n in range(1, len(jax.devices()) + 1) if groups % n == 0)

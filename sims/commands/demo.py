@@ -28,10 +28,12 @@ class Demo:
     def run(self) -> None:
         """Run the demo and print its summary."""
         from ...training.config import TrainingConfig
+        from ..cores import share_cores
         from ..demo import EMBEDDED, demo
         from ..progress import console
         from ..scenario import load_scenario
 
+        share_cores()
         config = TrainingConfig()
         if self.steps is not None:
             config = replace(config, steps=self.steps)

@@ -50,6 +50,7 @@ class Study:
         """Train, judge, tell."""
         from ...models.config import load
         from ...training.methods import METHODS
+        from ..cores import share_cores
         from ..study.config import StudyConfig, scaled
         from ..study.pages import render
         from ..study.run import run_study
@@ -57,6 +58,7 @@ class Study:
 
         if self.docs is not None and self.docs.suffix != ".md":
             raise UserError(f"--docs {self.docs}: end the name in .md")
+        share_cores()
         shown = console()
         failed = []
         if not self.render_only:

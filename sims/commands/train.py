@@ -46,10 +46,12 @@ class Train:
         from ...systems.mavlink.logs import load_data
         from ...training.config import TrainingConfig
         from ...training.methods import method_config
+        from ..cores import share_cores
         from ..learning import learn
         from ..learning_report import add_data, add_evaluation, add_training
         from ..pages import Page
 
+        share_cores()
         if self.method is not None:
             config = method_config(self.method, self.config)
         else:

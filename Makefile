@@ -55,7 +55,7 @@ lint: $(INSTALLED) ## ruff (lint and format) and basedpyright
 
 .PHONY: unit
 unit: $(INSTALLED) ## all tests, one worker a core
-	$(ONE_THREAD) $(BIN)/python -m pytest -n auto --dist worksteal --durations 10
+	$(ONE_THREAD) $(BIN)/python -m pytest -n auto --dist worksteal --durations 40
 
 .PHONY: slow
 slow: $(INSTALLED) ## the tests left out of `make test` for the time they take

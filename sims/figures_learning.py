@@ -1,5 +1,6 @@
 """Figures of data, training and held-out errors."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -139,11 +140,12 @@ def bands_figure(
     one = windows.take(np.array([index]))
     observed_X, observed_V, F = (jnp.asarray(a) for a in (one.X, one.V, one.F))
     X_0, V_0 = observed_X[0], observed_V[0]
-    X, V = predict(
+    drawn = eqx.filter_jit(predict)
+    X, V = drawn(
         learned, X_0, V_0, F, windows.dt, jax.random.key(0), samples,
         substeps=substeps[0], with_path_of_drift=True,
     )  # fmt: skip
-    Xp, Vp = predict(
+    Xp, Vp = drawn(
         preset, X_0, V_0, F, windows.dt, jax.random.key(0), 0,
         substeps=substeps[1], with_path_of_drift=True,
     )  # fmt: skip

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import xarray as xr
 
-from ..models.checkpoint import save_model
+from ..models.checkpoint import load_model, save_model
 from ..models.dynamics import Dynamics
 from ..models.errors import UserError
 from ..models.recording import Recording
@@ -105,19 +105,25 @@ def learn(
 ) -> Learned:
     """Train a SPINN from a preset and judge both on the held-out part.
 
-    Writes into `out` what `training.fit` writes, `evaluation.csv`, `evaluation.json` and the
-    preset with its estimated diffusion as `preset.spinn`.
+    Writes into `out` what `training.fit` writes, `evaluation.csv`, `evaluation.json`, the model
+    that training starts from as `start.spinn`, and the preset with its estimated diffusion as
+    `preset.spinn`. With `resume` a run that has a checkpoint goes on from both.
 
     Raises:
         UserError: the data don't suffice; the sentence says what is missing.
     """
     parts = split_parts(recording, vehicle, config.windows)
-    model = starting_model(
-        config,
-        vehicle,
-        parts.learn,
-        lambda step, total, loss: progress(_DRIFT * step / total, "drift first"),
-    )
+    kept = out / "start.spinn"
+    if resume and kept.exists() and (out / "checkpoint.npz").exists():
+        model, _ = load_model(kept)
+    else:
+        model = starting_model(
+            config,
+            vehicle,
+            parts.learn,
+            lambda step, total, loss: progress(_DRIFT * step / total, "drift first"),
+        )
+        save_model(kept, model)
     dtype = jnp.dtype(parts.learn.X.dtype)
     preset = vehicle.dynamics(estimate_diffusion(vehicle.dynamics(dtype=dtype), parts.learn), dtype)
     substeps = config.objective.substeps

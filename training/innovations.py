@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, DTypeLike, Float
 
 from ..models.dynamics import Dynamics
 from .windows import Windows
@@ -111,13 +111,24 @@ def whitening(
     return jnp.moveaxis(inverse, 0, 2), found / expected
 
 
+def mass_at_rest(model: Dynamics, dtype: DTypeLike) -> Float[np.ndarray, "6 6"]:
+    """M at ξ = 0 (kg, kg·m, kg·m²)."""
+    return np.asarray(_mass(model, jnp.zeros(6, dtype)), np.float64)
+
+
+@eqx.filter_jit
+def _mass(model: Dynamics, V: Float[Array, "6"]) -> Float[Array, "6 6"]:
+    return model.coefficients(V).mass.matrix()
+
+
 def likely_diffusion(
     model: Dynamics, steps: Steps, substeps: int, b: Float[np.ndarray, "6"] | None = None
 ) -> Float[np.ndarray, "6"]:
     """The most likely diffusion b (N√s, N·m√s) for this drift, sought from `b` if it is given."""
     if b is None:
-        mass = model.coefficients(jnp.zeros(6, steps.V.dtype)).mass.matrix()
-        wrench = np.asarray(mass, np.float64) @ np.asarray(innovations(model, steps, substeps))
+        wrench = mass_at_rest(model, steps.V.dtype) @ np.asarray(
+            innovations(model, steps, substeps)
+        )
         b = np.sqrt(np.mean(wrench**2, axis=1) / steps.dt)
     found = np.asarray(b, np.float64)
     for _ in range(4):

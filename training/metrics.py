@@ -3,6 +3,7 @@
 All take predicted samples (T, C, P, W) and observations (T, C, W) of W windows at T times.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -24,6 +25,7 @@ GROUPS: dict[str, slice] = {
 BANDS = (0.5, 0.9)
 
 
+@jax.jit
 def displacement(
     X: Float[Array, "T 7 P W"],
     V: Float[Array, "T 6 P W"],

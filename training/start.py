@@ -15,6 +15,7 @@ from ..models.vehicle import Vehicle
 from .config import TrainingConfig
 from .drift import fit_drift
 from .fit import Progress
+from .innovations import mass_at_rest
 from .likelihood import fit_innovations
 from .objective import Batch
 from .predict import predict, predict_drift
@@ -42,8 +43,7 @@ def estimate_diffusion(
     pieces = windows.thin(256).subdivide(steps).thin(1024)
     batch = Batch.of(pieces)
     start = batch.X[0], batch.V[0], batch.F, windows.dt
-    mass = dynamics.coefficients(jnp.zeros(6, batch.V.dtype)).mass.matrix()
-    M = np.asarray(mass, np.float64)
+    M = mass_at_rest(dynamics, batch.V.dtype)
     floor = 1e-3 * np.diag(M)
 
     def spread(difference: Float[Array, "6 W"]) -> Float[np.ndarray, "6"]:

@@ -20,6 +20,9 @@ from .signals_bin import signals_from_bin
 from .signals_tlog import WANTED as TLOG_WANTED
 from .signals_tlog import signals_from_tlog
 
+RATES = (50.0, 40.0, 25.0, 20.0)
+"""Rates (Hz) at which logs are imported unless another one is asked for; the last by default."""
+
 
 @dataclass(frozen=True)
 class LogOptions:
@@ -44,7 +47,7 @@ class LogOptions:
 def import_log(
     path: str | os.PathLike[str],
     *,
-    rate: float = 20.0,
+    rate: float | None = RATES[-1],
     vehicle: str = "bluerov2_heavy",
     options: LogOptions | None = None,
     progress: Progress = no_progress,
@@ -53,7 +56,8 @@ def import_log(
 
     Args:
         path: the log; its kind is told by its content.
-        rate: of the recording (Hz).
+        rate: of the recording (Hz); None takes that of the slowest stream of state and outputs,
+            within 20 to 50 Hz.
         vehicle: preset or file whose thruster directions the PWM shall have; named in the result.
         options: what is taken from the log.
         progress: called with the fraction done, 0 to 1.
@@ -63,11 +67,12 @@ def import_log(
     """
     path = Path(path)
     options = options or LogOptions()
-    _check_options(rate, options)
+    _check_options(RATES[-1] if rate is None else rate, options)
     motors = [mount.motor for mount in load_vehicle(vehicle).propulsion.mounts]
     raw = read_log_bytes(path, progress)
     try:
         signals = _signals(raw, motors, options, progress)
+        rate = own_rate(signals) if rate is None else rate
         trajectories, lines, dropped = fuse(
             signals,
             rate=rate,
@@ -100,6 +105,13 @@ def import_log(
     return recording, report
 
 
+def own_rate(signals: Signals) -> float:
+    """The largest of `RATES` that no stream of state or outputs falls short of, or the least."""
+    streams = (signals.attitude, signals.rates, signals.outputs, signals.velocity)
+    slowest = min(s.rate for s in streams if s is not None)
+    return next((rate for rate in RATES if rate <= 1.05 * slowest), RATES[-1])
+
+
 def load_data(
     path: str | os.PathLike[str],
     *,
@@ -113,7 +125,8 @@ def load_data(
 
     Args:
         path: file, or folder with a `recording.yaml`.
-        rate: Hz; None keeps that of the data (20 for logs).
+        rate: Hz; None keeps that of the data (20 for logs, or their streams' own as in
+            `import_log` where nothing is to be resampled).
         vehicle: preset or file; None keeps what the data name (bluerov2_heavy for logs).
         options: what is taken from a log.
         resample: False keeps the samples of CSV files at uneven times where they are.
@@ -138,7 +151,7 @@ def load_data(
     else:
         logged, _ = import_log(
             path,
-            rate=20.0 if rate is None else rate,
+            rate=RATES[-1] if rate is None and resample else rate,
             vehicle=vehicle or "bluerov2_heavy",
             options=options,
             progress=progress,

@@ -25,7 +25,7 @@ from .hypotheses import Fit
 from .identify import identify, with_coefficients
 from .laws import Law
 from .looking import Bench, Look
-from .naming import Hypothesis
+from .naming import Hypothesis, parameters_of
 from .ratios import ratios
 from .search import RIVALS, Found, Search, best_law, refitted
 from .unknowns import accept, seek, structure
@@ -132,7 +132,7 @@ class Diagnoser:
         final = fitted = found.current
         joint = None
         if rows:
-            theta, fitted, joint = bench.polish(found.current.theta, rows)
+            theta, fitted, joint = self._together(bench, found, rows)
             final = bench.look(theta)
         self.progress(0.78, "laws of the disturbance")
         least = found.threshold + _LAW_MARGIN
@@ -197,6 +197,17 @@ class Diagnoser:
             return bench.look(identify(bench, lambda f: self.progress(0.03 + 0.07 * f, remark)))
         rows = refitted(bench, self.config.refit)
         return bench.look(bench.polish(bench.believed, rows)[0])
+
+    def _together(
+        self, bench: Bench, found: Found, rows: list[int]
+    ) -> tuple[np.ndarray, Look, Fit]:
+        """All causes and what is refitted beside them, fitted jointly."""
+        if self.config.refit != "all":
+            return bench.polish(found.current.theta, rows)
+        causes = parameters_of(bench.library, found.hypotheses)
+        theta = identify(bench, start=found.current.theta, also=causes)
+        fitted = bench.look(theta, rows)
+        return theta, fitted, fitted.evidence.fit(rows)
 
     def _within(self, low: float, high: float) -> Progress:
         return lambda fraction, remark: self.progress(low + (high - low) * fraction, remark)

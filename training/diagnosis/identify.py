@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from ...models.effects.base import AXES
 from ...models.effects.library import COEFFICIENTS
+from .hypotheses import PRIOR
 from .looking import Bench, Look
 from .noise import Filter
 
@@ -34,8 +35,9 @@ _ENOUGH = 1.0
 """Nats a round from which a fit goes on."""
 _START = 0.3
 """Dead zone (N) to start from: at none its response is one-sided."""
-_DRAG, _BUOYANCY = 3.0, 20.0
-"""How far drag (in multiples of itself) and net buoyancy (N) are known beforehand."""
+_DRAG, _BUOYANCY, _DELAY = 3.0, 20.0, 0.01
+"""How far drag (in multiples of itself), net buoyancy (N) and the commands' delay (s) are known
+beforehand."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,8 @@ def coefficients(bench: Bench) -> list[Coefficient]:
             spread, low = max(old, 0.1 * float(rigid[AXES.index(where)])), -old
         elif cause == "net_buoyancy":
             spread = _BUOYANCY
+        elif (cause, where) == ("actuation_delay", "all") and level:
+            spread = _DELAY
         elif cause in OF_ALL and level and where == "all" and p.name == OF_ALL[cause][0]:
             spread = OF_ALL[cause][1]
         elif cause not in (*WRENCH, *CURVE):
@@ -84,22 +88,30 @@ def coefficients(bench: Bench) -> list[Coefficient]:
 
 
 def identify(
-    bench: Bench, progress: Callable[[float], None] = lambda fraction: None
+    bench: Bench,
+    progress: Callable[[float], None] = lambda fraction: None,
+    start: Float[np.ndarray, " p"] | None = None,
+    also: Sequence[int] = (),
 ) -> Float[np.ndarray, " p"]:
     """θ with all coefficients where data and prior have them (Levenberg and Marquardt).
 
-    Every step is weighed by the covariance that the one-step errors of pose and of twist have at
-    it, which asks for no noise levels that a wrong model makes too large.
+    From the belief, or from `start`; with the parameters `also` of causes free beside them. Every
+    step is weighed by the covariance that the one-step errors of pose and of twist have at it,
+    which asks for no noise levels that a wrong model makes too large.
     """
-    chosen = coefficients(bench)
+    chosen = [*coefficients(bench), *_beside(bench, also)]
     rows = [c.row for c in chosen]
     spread = np.array([c.spread for c in chosen])
     low, high = np.array([c.low for c in chosen]), np.array([c.high for c in chosen])
     centre = bench.believed[rows]
-    theta = bench.believed.copy()
-    for c in chosen:
-        if bench.library.entries[c.row].cause == "thruster_dead_zone":
-            theta[c.row] += _START
+    if start is None:
+        theta = bench.believed.copy()
+        for c in chosen:
+            if bench.library.entries[c.row].cause == "thruster_dead_zone":
+                theta[c.row] += _START
+    else:
+        theta = start.copy()
+        theta[rows] = np.clip(theta[rows], low, high)
 
     def loss(theta: np.ndarray) -> float:
         away = (theta[rows] - centre) / spread
@@ -137,6 +149,16 @@ def identify(
     return theta
 
 
+def _beside(bench: Bench, rows: Sequence[int]) -> list[Coefficient]:
+    """Parameters of causes as coefficients: known no better than a name's prior has them."""
+    low, high = bench.limits(rows)
+    known = [bench.library.entries[i].parameter for i in rows]
+    return [
+        Coefficient(i, p.spread or PRIOR * p.probes[0], a, b)
+        for i, p, a, b in zip(rows, known, low.tolist(), high.tolist(), strict=True)
+    ]
+
+
 def one_step(bench: Bench, theta: Float[np.ndarray, " p"]) -> Filter:
     """The filter that believes every record: innovations are one-step errors, whitened."""
     C = _covariance(bench, theta)
@@ -149,18 +171,12 @@ def one_step(bench: Bench, theta: Float[np.ndarray, " p"]) -> Filter:
 
 def _covariance(bench: Bench, theta: np.ndarray) -> Float[np.ndarray, "12 12"]:
     """Of one-step errors, pose and twist apart: what poses lack is an instrument's."""
-    error = bench.errors(theta)
-    C = np.einsum("nir,njr->ij", error, error) / bench.data.weight.sum()
-    C[:6, 6:], C[6:, :6] = 0.0, 0.0
-    return C
+    return bench.covariance(bench.errors(theta), apart=True)
 
 
 def _fit(bench: Bench, theta: np.ndarray) -> float:
     """Minus the log likelihood of one-step errors under a covariance of their own."""
-    C = _covariance(bench, theta)
-    if not np.isfinite(C).all():
-        return np.inf
-    return float(bench.data.weight.sum() * np.linalg.slogdet(C)[1] / 2)
+    return bench.merit(_covariance(bench, theta))
 
 
 def _quadratic(seen: Look, rows: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -172,13 +172,15 @@ class Bench:
     ) -> Look:
         """Innovations at θ and the responses to the parameters chosen.
 
-        By default all but those in single thrusters of causes that may be in all of them.
+        By default all but those in single thrusters of causes that may be in all of them, and all
+        coefficients that have a range of their own (`within`).
         """
         p, noise, own = self.predict(theta)
         kalman = own if kalman is None else kalman
         if chosen is None:
             first = parameters_of(self.library, self.library.hypotheses(single=False))
-            chosen = sorted({*first, *np.flatnonzero(theta).tolist()})
+            own = (i for i, e in enumerate(self.library.entries) if _key(e) in self.bounds)
+            chosen = sorted({*first, *np.flatnonzero(theta).tolist(), *own})
         design = Design.of(self.library, theta, chosen)
         z = respond(self.model, self.library, theta, design.probes, self.data, p, kalman)
         data = self.data
@@ -238,10 +240,21 @@ class Bench:
 
         It asks for no filter, whose noise levels change with what is fitted.
         """
-        w = self.data.weight
-        e = np.asarray(seen.predictions.error) * w[:, None]
-        C = np.einsum("nir,njr->ij", e, e) / w.sum()
-        return float(w.sum() * np.linalg.slogdet(C)[1] / 2)
+        error = np.asarray(seen.predictions.error) * self.data.weight[:, None]
+        return self.merit(self.covariance(error, seen.noise.estimated))
+
+    def covariance(self, error: np.ndarray, apart: bool) -> Float[np.ndarray, "12 12"]:
+        """Of one-step errors; pose and twist `apart`: what estimated poses lack is no wrench's."""
+        C = np.einsum("nir,njr->ij", error, error) / self.data.weight.sum()
+        if apart:
+            C[:6, 6:], C[6:, :6] = 0.0, 0.0
+        return C
+
+    def merit(self, C: Float[np.ndarray, "12 12"]) -> float:
+        """Minus the log likelihood of errors of that covariance."""
+        if not np.isfinite(C).all():
+            return np.inf
+        return float(self.data.weight.sum() * np.linalg.slogdet(C)[1] / 2)
 
     def _stepped(
         self, theta: np.ndarray, chosen: list[int], step: np.ndarray, low: np.ndarray,

@@ -4,9 +4,9 @@ With y = x + e, r_n = e_(n+1) - A e_n + w_n has the covariances C_0 = Q + R + A 
 none further on. A slow model error adds about the same to C_1 and C_2, so C_1 - C_2 is used.
 
 States that an autopilot has estimated have no errors of their own at each sample, but slow ones:
-then R comes out as none on most axes of the twist. All that steps show is taken for process noise
-there, poses that slip against the twist included, and the errors' correlation in time is kept:
-so many samples tell less.
+then R comes out as none on most axes of the twist, or of all. All that steps show is taken for
+process noise there, poses that slip against the twist included, and the errors' correlation in time
+is kept: so many samples tell less.
 """
 
 from collections.abc import Callable
@@ -18,8 +18,9 @@ from jaxtyping import Float, Int
 
 FLOOR = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4] * 3 + [1e-5] * 3)
 """Least standard deviation of a record: m, rad, m/s, rad/s."""
-_SMOOTH = 4
-"""Axes of the twist without errors of their own from which states count as estimated."""
+_SMOOTH, _SMOOTH_OF_ALL, _NEAR = 4, 8, 3.0
+"""States count as estimated from so many axes of the twist without errors of their own, or from so
+many of pose and twist whose errors are within so many times the least."""
 _LONGEST = 0.98
 """Largest correlation of neighbouring errors that is believed."""
 _EVEN, _NODES = 1e-6, 8
@@ -111,7 +112,8 @@ def estimate(
         C.append(np.einsum("nir,njr->ij", a, b) / max(w.sum(), 1.0))
     R = np.diag(-np.linalg.solve(A, C[1] - C[2]))
     variance = np.maximum(R, FLOOR**2)
-    if np.sum(R[6:] <= FLOOR[6:] ** 2) >= _SMOOTH:
+    near = R <= (_NEAR * FLOOR) ** 2
+    if np.sum(R[6:] <= FLOOR[6:] ** 2) >= _SMOOTH or np.sum(near) >= _SMOOTH_OF_ALL:
         return _of_estimates(C[0], C[1], variance, A, mass, dt)
     C0 = C[0] - (C[2] + C[2].T) / 2
     Q = C0 - np.diag(variance) - A * variance @ A.T

@@ -135,7 +135,8 @@ def test_the_ranges_are_physical_and_wrenches_have_no_curve():
 def test_the_table_is_linear_between_its_knots_and_in_proportion_beyond():
     values = np.linspace(-0.5, 0.4, 2 * len(KNOTS))
     table = ThrustTable(jnp.asarray(values))
-    force = np.array([0.0, 1.0, *KNOTS, 13.5, 56.0, *(-np.array(KNOTS)), -56.0])
+    beyond = 2 * KNOTS[-1]
+    force = np.array([0.0, 1.0, *KNOTS, 13.5, beyond, *(-np.array(KNOTS)), -beyond])
     belief = load_vehicle("bluerov2_heavy")
     plant = Extended.create(belief.dynamics(), (), belief.thrusters()).plant
     given = table.thrust(jnp.asarray(force), jnp.zeros(6), jnp.ones(1), plant)
@@ -143,7 +144,7 @@ def test_the_table_is_linear_between_its_knots_and_in_proportion_beyond():
     up = knots * np.concatenate([[1.0], 1 + values[: len(KNOTS)]])
     down = knots * np.concatenate([[1.0], 1 + values[len(KNOTS) :]])
     expected = np.where(force > 0, np.interp(force, knots, up), -np.interp(-force, knots, down))
-    expected[force == 56.0], expected[force == -56.0] = 2 * up[-1], -2 * down[-1]
+    expected[force == beyond], expected[force == -beyond] = 2 * up[-1], -2 * down[-1]
     np.testing.assert_allclose(given, expected, atol=1e-12)
 
 

@@ -121,7 +121,7 @@ class ThrustScale(Effect):
         return force * (1 + self.part(0, force)[None])
 
 
-KNOTS = (2.0, 5.0, 10.0, 17.0, 28.0)
+KNOTS = (2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0)
 """Forces (N), each way, between which `ThrustTable` is linear."""
 
 

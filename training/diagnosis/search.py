@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -25,6 +26,9 @@ RIVALS = 0.25
 """Share of what the best law wins on data left out that no imitation of random structure wins."""
 _OF_A_LAW = 0.02
 """Share of what the best law wins that a name must win where the law wins more."""
+_OF_ESTIMATES = 0.05
+"""Nats a sample that a name must win where states were estimated: below that a name may as well
+explain what the estimator makes of its own errors."""
 
 
 @dataclass
@@ -111,6 +115,7 @@ class Search:
             if h[0] not in free and not (h[1] in quiet and kind(h[0]).family == "body")
         ]
         self.shortest = shortest
+        self._asked: tuple[Any, tuple[Choice | None, dict[Hypothesis, Fit]]] | None = None
 
     def run(self, found: Found) -> Found:
         """Add causes until none passes; all accepted are refitted together."""
@@ -128,7 +133,20 @@ class Search:
         return found
 
     def next(self, found: Found) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
-        """The name that explains most of what is left, and the fits of all names."""
+        """The name that explains most of what is left, and the fits of all names.
+
+        What was found for a state of the search is kept until another one is asked for.
+        """
+        state = (found.current, found.hypotheses, frozenset(found.dropped))
+        if (
+            self._asked is None
+            or self._asked[0][0] is not state[0]
+            or self._asked[0][1:] != state[1:]
+        ):
+            self._asked = (state, self._next(found))
+        return self._asked[1]
+
+    def _next(self, found: Found) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
         bench, current, taken = self.bench, found.current, found.hypotheses
         beside = self.nuisance + parameters_of(bench.library, taken)
         open_names = [h for h in self.names if h not in taken and h not in found.dropped]
@@ -147,14 +165,15 @@ class Search:
                 gains, strict,
             )  # fmt: skip
 
-        choice = chosen(False, 0.0)
+        least = _OF_ESTIMATES * bench.data.steps if current.noise.estimated else 0.0
+        choice = chosen(False, least)
         if choice is not None and self._about_thrust(choice):
             fits |= self._single_thrusters(current, beside, [*taken, *found.dropped])
-            choice = chosen(False, 0.0)
+            choice = chosen(False, least)
         law = best_law(bench, current)
         if choice is not None and RIVALS * law > choice.fit.heldout_gain:
             # random structure is imitated by names: they must hold between runs by themselves
-            choice = chosen(True, _OF_A_LAW * law)
+            choice = chosen(True, max(_OF_A_LAW * law, least))
         return choice, fits
 
     def _about_thrust(self, choice: Choice) -> bool:
@@ -224,9 +243,11 @@ class Search:
         for choice, fit in found.accepted:
             own = library.at(*choice.hypothesis)
             others = [i for i in chosen if i not in own]
-            again = current.evidence.fit(own, others)
-            ratio = current.theta[own] / np.maximum(again.errors, 1e-300)
-            if float(np.sum(ratio**2)) / 2 > found.threshold:
+            weight = 0.0
+            if current.theta[own].any():  # else the joint fit itself has taken it back
+                errors = current.evidence.fit(own, others).errors
+                weight = float(np.sum((current.theta[own] / np.maximum(errors, 1e-300)) ** 2)) / 2
+            if weight > found.threshold:
                 kept.append((choice, fit))
             else:
                 found.dropped.add(choice.hypothesis)

@@ -4,9 +4,11 @@ import os
 
 import jax
 
+_MOST = 8  # a batch has some ten to a hundred windows: shares of one or two are mostly overhead
+
 
 def share_cores() -> None:
-    """Let JAX count every core that this process may use as a device of its own.
+    """Let JAX count each core that this process may use, up to eight, as a device of its own.
 
     Training then shares each batch among them (`training.step`); all else runs on the first. A
     number chosen before (`JAX_NUM_CPU_DEVICES`) stays, and so does one already in use.
@@ -14,7 +16,7 @@ def share_cores() -> None:
     if jax.config.jax_num_cpu_devices >= 0:  # pyright: ignore[reportAttributeAccessIssue]
         return
     try:
-        jax.config.update("jax_num_cpu_devices", _cores())
+        jax.config.update("jax_num_cpu_devices", min(_cores(), _MOST))
     except RuntimeError:  # JAX has begun to compute with what it found
         return
 

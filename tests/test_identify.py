@@ -181,7 +181,11 @@ def test_slow_errors_of_an_estimator_are_told_from_those_of_instruments():
     assert estimated.estimated
     np.testing.assert_allclose(estimated.memory, (1 + rho) / (1 - rho), rtol=0.1)
     np.testing.assert_allclose(estimated.diffusion, 0.01 * 10 / DT**0.5, rtol=0.05)
-    measured = estimate(white[1:] - white[:-1], weight, A, mass, DT)
+    fast = white[1:] - white[:-1]
+    measured = estimate(fast, weight, A, mass, DT)
     assert not measured.estimated
+    with_a_gyro = estimate(np.concatenate([slow[:, :9], fast[:, 9:]], 1), weight, A, mass, DT)
+    assert with_a_gyro.estimated
+    np.testing.assert_allclose(with_a_gyro.record[9:], 0.01, rtol=0.06)
     np.testing.assert_allclose(measured.record, 0.01, rtol=0.06)  # four standard errors
     np.testing.assert_array_equal(measured.slip, 0)

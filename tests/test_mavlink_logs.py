@@ -36,10 +36,11 @@ from spinndrift.sims.cli import main
 from spinndrift.systems.mavlink import codec
 from spinndrift.systems.mavlink.cut_tlog import cut_tlog
 from spinndrift.systems.mavlink.log_bytes import read_log_bytes
-from spinndrift.systems.mavlink.logs import LogOptions, import_log, load_data
+from spinndrift.systems.mavlink.logs import LogOptions, import_log, load_data, own_rate
 from spinndrift.systems.mavlink.logs_bin import read_bin
 from spinndrift.systems.mavlink.logs_tlog import read_tlog
 from spinndrift.systems.mavlink.packets import scan
+from spinndrift.systems.mavlink.signals import Series, Signals
 
 DEMO = ROOT / "sims" / "data" / "sitl_dive.tlog.xz"
 
@@ -476,6 +477,19 @@ def test_the_demo_log_has_what_its_readme_says(demo):
         for part in agreement(t, run.X_WB.T, run.V_WB_B.T):
             assert part.explained > 0.998
             assert part.slope == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_log_may_keep_the_rate_of_its_slowest_stream():
+    assert import_log(DEMO, rate=None)[0].dt == pytest.approx(0.02)
+
+    def rate(*each):
+        one, two, three = (Series(np.arange(0, 10, 1 / hz), np.zeros(1), "") for hz in each)
+        return own_rate(Signals(attitude=one, rates=two, outputs=three))
+
+    assert rate(100, 100, 100) == 50
+    assert rate(50, 48.5, 100) == 50  # a stream that drops a few
+    assert rate(50, 100, 30) == 25
+    assert rate(4, 100, 10) == 20
 
 
 def test_the_demo_log_is_what_its_command_makes():

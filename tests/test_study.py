@@ -17,7 +17,14 @@ from spinndrift.models import config as yaml
 from spinndrift.models.errors import UserError
 from spinndrift.sims.cli import main
 from spinndrift.sims.study import train
-from spinndrift.sims.study.config import SizeConfig, StudyConfig, TruthConfig, scaled
+from spinndrift.sims.study.config import (
+    SizeConfig,
+    StudyConfig,
+    TruthConfig,
+    asked_for,
+    from_belief,
+    scaled,
+)
 from spinndrift.sims.study.fanout import run_here
 from spinndrift.sims.study.judge import diffusions
 from spinndrift.sims.study.pages import render
@@ -68,6 +75,18 @@ def test_every_scale_survives_its_yaml_file():
     for scale in ("full", "small", "tiny"):
         study = scaled(scale)
         assert yaml.loads(StudyConfig, yaml.dump(study)) == study
+
+
+def test_the_options_told_are_those_that_were_given():
+    assert asked_for(scaled("full")) == ""
+    assert asked_for(scaled("small")) == " --scale small"
+    belief = from_belief(scaled("full"))
+    assert asked_for(belief) == " --start belief"
+    assert asked_for(from_belief(TINY)) == " --scale tiny --start belief"
+    assert asked_for(replace(belief, validation=0.2)) == " --config study.yaml"
+    assert belief.size.steps == 2000
+    assert belief.size.drift_iterations == 0
+    assert replace(belief, size=scaled("full").size) == scaled("full")
 
 
 def test_the_full_study_has_the_papers_sizes():

@@ -30,8 +30,12 @@ class Study:
     """Methods to train, by name; by default all."""
     scale: Literal["full", "small", "tiny"] = "full"
     """How much of everything: `full` as in the paper, `small` for a look, `tiny` for a test."""
+    start: Literal["fit", "belief"] = "fit"
+    """Where training starts: at the most likely constants of the data (`fit`), or, with more steps,
+    at a wrong `belief`, as in the paper: then the objective has to find everything."""
     config: Path | None = None
-    """Settings of the study (YAML) in place of `--scale`; `study.yaml` in `--out` shows all."""
+    """Settings of the study (YAML) in place of `--scale` and `--start`; `study.yaml` in `--out`
+    shows all."""
     out: Path = Path("runs/ablation")
     """Folder of all runs, tables and pages."""
     workers: int = 0
@@ -51,7 +55,7 @@ class Study:
         from ...models.config import load
         from ...training.methods import METHODS
         from ..cores import share_cores
-        from ..study.config import StudyConfig, scaled
+        from ..study.config import StudyConfig, from_belief, scaled
         from ..study.pages import render
         from ..study.run import run_study
         from ..study.task import make_tasks
@@ -62,7 +66,11 @@ class Study:
         shown = console()
         failed = []
         if not self.render_only:
-            study = scaled(self.scale) if self.config is None else load(StudyConfig, self.config)
+            study = scaled(self.scale)
+            if self.start == "belief":
+                study = from_belief(study)
+            if self.config is not None:
+                study = load(StudyConfig, self.config)
             tasks = make_tasks(
                 self.regime, self.methods or tuple(METHODS), self.seeds, self.together
             )

@@ -1,7 +1,7 @@
 """What a study consists of: a true vehicle, a belief to start from, regimes of data, sizes."""
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 from ...models.checks import Vector6, check_numbers, require
 from ...models.errors import UserError
@@ -176,6 +176,35 @@ class StudyConfig:
     def regime(self, name: Regime) -> RegimeConfig:
         """The data of a regime."""
         return self.rich if name == "rich" else self.sparse
+
+
+def from_belief(study: StudyConfig) -> StudyConfig:
+    """The study whose methods start from the belief alone, whose coefficients no data have touched.
+
+    They have farther to go: 10/3 of the steps, at a larger rate with less decay, and bandwidths
+    that are fitted anew as they come nearer.
+    """
+    steps = study.size.steps
+    size = replace(
+        study.size,
+        steps=None if steps is None else steps * 10 // 3,
+        drift_iterations=0,
+        learning_rate=5e-3,
+        head_decay=20.0,
+        refit_at=(0.1, 0.25, 0.5),
+    )
+    return replace(study, size=size)
+
+
+def asked_for(study: StudyConfig) -> str:
+    """The options that give these settings; with `--config` if none does."""
+    for scale in get_args(Scale):
+        option = "" if scale == "full" else f" --scale {scale}"
+        if study == scaled(scale):
+            return option
+        if study == from_belief(scaled(scale)):
+            return f"{option} --start belief"
+    return " --config study.yaml"
 
 
 def scaled(scale: Scale) -> StudyConfig:

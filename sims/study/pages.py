@@ -13,7 +13,7 @@ from ...models.files import atomic_path
 from ...training.methods import METHODS
 from ..pages import Page
 from .claims import Verdict, targets, verdicts
-from .config import REGIMES, StudyConfig
+from .config import REGIMES, StudyConfig, asked_for
 from .figures import (
     curves_figure,
     diffusion_figure,
@@ -84,7 +84,7 @@ def render(out: str | os.PathLike[str], docs: str | os.PathLike[str] | None = No
         names = {name: f"{docs.stem}-{name}.png" for name in kept}
         for name, file in names.items():
             _save(figures[name], docs.with_name(file))
-        _write_text(docs, ablation_text(rows, _settings(out), figures=kept, names=names))
+        _write_text(docs, ablation_text(rows, _settings(out), kept, names, docs.name))
     return rows
 
 
@@ -173,7 +173,7 @@ def _told(rows: Sequence[Row]) -> str:
     return f"{methods} methods, {regimes} data, {seeds} seed{'s' * (seeds > 1)}, {len(rows)} runs"
 
 
-def _command(rows: Sequence[Row]) -> str:
+def _command(rows: Sequence[Row], study: StudyConfig | None, docs: str) -> str:
     """What to type for the same runs."""
     regimes = [r for r in REGIMES if any(row["regime"] == r for row in rows)]
     methods = list(dict.fromkeys(row["method"] for row in rows))
@@ -182,7 +182,9 @@ def _command(rows: Sequence[Row]) -> str:
         words.append(f"--regime {' '.join(regimes)}")
     if set(methods) != set(METHODS):
         words.append(f"--methods {' '.join(methods)}")
-    words.append(f"--seeds {1 + max(int(row['seed']) for row in rows)} --docs docs/ablation.md")
+    seeds = 1 + max(int(row["seed"]) for row in rows)
+    options = "" if study is None else asked_for(study)
+    words.append(f"--seeds {seeds}{options} --docs docs/{docs}")
     return " ".join(words)
 
 
@@ -210,8 +212,9 @@ def ablation_text(
     study: StudyConfig | None,
     figures: Sequence[str] = (),
     names: dict[str, str] | None = None,
+    docs: str = "ablation.md",
 ) -> str:
-    """The page docs/ablation.md: verdicts, aims and numbers, all computed from the rows."""
+    """A page in docs/ with verdicts, aims and numbers, all computed from the rows."""
     files = {name: f"{name}.png" for name in figures} | (names or {})
     lines = [
         "# Ablation study",
@@ -219,7 +222,7 @@ def ablation_text(
         *_wrapped(f"{_told(rows)}, as written by"),
         "",
         "```",
-        _command(rows),
+        _command(rows, study, docs),
         "```",
         "",
     ]
@@ -256,9 +259,11 @@ def _setting_words(study: StudyConfig, rows: Sequence[Row]) -> str:
                 f"maneuver{'s' * (len(c.maneuvers) > 1)} of {c.duration:g} s at {c.rate:g} Hz"
             )
     e, words = study.evaluation, "; ".join(parts)
+    fitted = study.size.drift_iterations != 0
     return (
         f"The truth is the preset `{study.truth.vehicle}` with the diffusion b = ({b}) N√s and "
-        f"N·m√s; networks are pre-trained to the preset `{study.belief}`. "
+        f"N·m√s; networks are pre-trained to the preset `{study.belief}`"
+        f"{'' if fitted else ', and no data have touched that start'}. "
         f"{words[:1].upper()}{words[1:]}. "
         f"Laws are compared by {e.samples} samples a scenario at {e.times} times; the distance's "
         f"weights are {e.metric.position:g} a metre, {e.metric.rotation:g} a radian, "

@@ -5,6 +5,7 @@ import platform
 from pathlib import Path
 
 import jax
+from filelock import FileLock, Timeout
 from platformdirs import user_cache_path
 
 _LARGEST = 2**30  # bytes; what was used longest ago goes first
@@ -19,9 +20,28 @@ def keep_compiled(folder: Path | None = None) -> None:
     if compiled_folder() is not None:
         return
     base = user_cache_path("spinndrift") / "jax" if folder is None else folder
-    jax.config.update("jax_compilation_cache_dir", str(base / f"{jax.__version__}-{_processor()}"))
+    chosen = base / f"{jax.__version__}-{_processor()}"
+    mend(chosen)
+    jax.config.update("jax_compilation_cache_dir", str(chosen))
     jax.config.update("jax_compilation_cache_max_size", _LARGEST)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+def mend(folder: Path) -> None:
+    """Remove programs that a process was killed in the middle of writing.
+
+    JAX writes a program first and the time of its last use after it, and stores nothing more in a
+    folder where it meets a program without one; it says so at no log level.
+    """
+    if not folder.is_dir():
+        return
+    try:
+        with FileLock(folder / ".lockfile", timeout=10):  # JAX's own, held while it writes
+            for program in folder.glob("*-cache"):
+                if not program.with_name(f"{program.name.removesuffix('cache')}atime").exists():
+                    program.unlink()
+    except (Timeout, OSError):  # another process is busy there, or the folder is not ours
+        return
 
 
 def compiled_folder() -> str | None:

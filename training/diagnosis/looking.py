@@ -179,8 +179,8 @@ class Bench:
         kalman = own if kalman is None else kalman
         if chosen is None:
             first = parameters_of(self.library, self.library.hypotheses(single=False))
-            own = (i for i, e in enumerate(self.library.entries) if _key(e) in self.bounds)
-            chosen = sorted({*first, *np.flatnonzero(theta).tolist(), *own})
+            ranged = (i for i, e in enumerate(self.library.entries) if _key(e) in self.bounds)
+            chosen = sorted({*first, *np.flatnonzero(theta).tolist(), *ranged})
         design = Design.of(self.library, theta, chosen)
         z = respond(self.model, self.library, theta, design.probes, self.data, p, kalman)
         data = self.data

@@ -49,6 +49,18 @@ def compiled_folder() -> str | None:
     return jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def compiled_environment() -> dict[str, str]:
+    """Variables by which another process keeps its programs in the same folder, bounded alike.
+
+    One that knew the folder alone would store programs without the time of their last use, which
+    those that bound it can't read (`mend`).
+    """
+    return {
+        "JAX_COMPILATION_CACHE_DIR": str(compiled_folder()),
+        "JAX_COMPILATION_CACHE_MAX_SIZE": str(_LARGEST),
+    }
+
+
 def _processor() -> str:
     """A short name of this processor: compiled code may use what another one lacks."""
     info = Path("/proc/cpuinfo")

@@ -8,7 +8,7 @@ import hypothesis
 import jax
 import pytest
 
-from spinndrift.sims.compile_cache import keep_compiled
+from spinndrift.sims.compile_cache import compiled_folder, keep_compiled, mend
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -33,7 +33,11 @@ _MOST_MAPS = 20_000  # Linux gives a process 65530, and a compiler that gets no 
 
 @pytest.fixture(autouse=True, scope="module")
 def _few_compiled_programs() -> Iterator[None]:
-    """Forget compiled programs before their pages, several maps a kernel, use up the process's."""
+    """Forget compiled programs before their pages, several maps a kernel, use up the process's.
+
+    And remove what processes that tests kill may have left half stored.
+    """
+    mend(Path(str(compiled_folder())))
     yield
     if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MOST_MAPS:
         jax.clear_caches()

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from diagonal import Diagonal, simulated
 
-from spinndrift.sims.compile_cache import compiled_folder
+from spinndrift.sims.compile_cache import compiled_environment
 from spinndrift.training.config import TrainingConfig
 from spinndrift.training.distance_aware import DistanceAwareObjective
 from spinndrift.training.fit import fit
@@ -17,7 +17,15 @@ from spinndrift.training.losses import Fdm
 from spinndrift.training.step import usable_devices
 
 CONFIG = TrainingConfig(
-    objective=Fdm(samples=4, substeps=1, time_pairs=2),
+    objective=Fdm(
+        pose_kernel="chordal",
+        samples=4,
+        lags_s=(0.5,),
+        time_pairs=2,
+        scales=(1.0,),
+        substeps=1,
+        mse_weight=0.0,
+    ),
     steps=5,
     batch=6,
     learning_rate=1e-2,
@@ -51,7 +59,7 @@ def test_two_devices_learn_what_one_does(tmp_path):
         "numpy.save(sys.argv[1], t.learned())"
     )
     here = Path(__file__).parent
-    kept = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(compiled_folder())}
+    kept = os.environ | compiled_environment()
     command = [sys.executable, "-c", code, str(out)]
     subprocess.run(command, check=True, cwd=here, timeout=300, env=kept)
     one = learned()

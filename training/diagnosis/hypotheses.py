@@ -16,6 +16,7 @@ import scipy.stats
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 
+from ...models.effects.base import Parameter
 from ...models.effects.library import Library
 from .gram import pooled
 
@@ -87,6 +88,11 @@ class Fit:
         return float(self.heldout.sum())
 
 
+def known_within(parameter: Parameter) -> float:
+    """Standard deviation of what is known of a parameter beforehand."""
+    return parameter.spread or PRIOR * parameter.probes[0]
+
+
 class Evidence:
     """Inner products of innovations (column 0) and probed responses, by run and by fold."""
 
@@ -125,8 +131,8 @@ class Evidence:
 
     def prior(self, parameters: Sequence[int]) -> np.ndarray:
         """Precision of the prior: weak, but where a parameter says how far it is known."""
-        known = [self.library.entries[i].parameter for i in parameters]
-        return 1 / np.array([p.spread or PRIOR * p.probes[0] for p in known]) ** 2
+        known = [known_within(self.library.entries[i].parameter) for i in parameters]
+        return 1 / np.array(known) ** 2
 
     def curve(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Values t of a curved parameter, and for each the weights of all columns."""

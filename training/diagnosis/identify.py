@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from ...models.effects.base import AXES
 from ...models.effects.library import COEFFICIENTS
-from .hypotheses import PRIOR
+from .hypotheses import known_within
 from .looking import Bench, Look
 from .noise import Filter
 
@@ -152,10 +152,9 @@ def identify(
 def _beside(bench: Bench, rows: Sequence[int]) -> list[Coefficient]:
     """Parameters of causes as coefficients: known no better than a name's prior has them."""
     low, high = bench.limits(rows)
-    known = [bench.library.entries[i].parameter for i in rows]
     return [
-        Coefficient(i, p.spread or PRIOR * p.probes[0], a, b)
-        for i, p, a, b in zip(rows, known, low.tolist(), high.tolist(), strict=True)
+        Coefficient(i, known_within(bench.library.entries[i].parameter), a, b)
+        for i, a, b in zip(rows, low.tolist(), high.tolist(), strict=True)
     ]
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -115,7 +114,7 @@ class Search:
             if h[0] not in free and not (h[1] in quiet and kind(h[0]).family == "body")
         ]
         self.shortest = shortest
-        self._asked: tuple[Any, tuple[Choice | None, dict[Hypothesis, Fit]]] | None = None
+        self._asked: tuple[Look, tuple[Choice | None, dict[Hypothesis, Fit]]] | None = None
 
     def run(self, found: Found) -> Found:
         """Add causes until none passes; all accepted are refitted together."""
@@ -135,15 +134,10 @@ class Search:
     def next(self, found: Found) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
         """The name that explains most of what is left, and the fits of all names.
 
-        What was found for a state of the search is kept until another one is asked for.
+        It is kept until another fit is current: causes are added and dropped with a new one.
         """
-        state = (found.current, found.hypotheses, frozenset(found.dropped))
-        if (
-            self._asked is None
-            or self._asked[0][0] is not state[0]
-            or self._asked[0][1:] != state[1:]
-        ):
-            self._asked = (state, self._next(found))
+        if self._asked is None or self._asked[0] is not found.current:
+            self._asked = (found.current, self._next(found))
         return self._asked[1]
 
     def _next(self, found: Found) -> tuple[Choice | None, dict[Hypothesis, Fit]]:

@@ -1,9 +1,10 @@
 """All named causes, and how their numbers lie in one vector."""
 
-import dataclasses
+import itertools
 from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -121,7 +122,10 @@ class Library:
         self.effects = tuple(sorted(effects, key=lambda effect: effect.order))
         self.entries = tuple(_entries(self.effects))
         sizes = [effect.size() for effect in self.effects]
-        self._starts = np.concatenate([[0], np.cumsum(sizes)])
+        self._starts = list(itertools.accumulate(sizes, initial=0))
+        self._leaves, self._structure = jax.tree.flatten(self.effects)
+        values = {id(effect.values) for effect in self.effects}
+        self._values = [i for i, leaf in enumerate(self._leaves) if id(leaf) in values]
         self._index = {(e.cause, e.where, e.parameter.name): i for i, e in enumerate(self.entries)}
 
     @property
@@ -151,21 +155,17 @@ class Library:
             return every
         return [h for h in every if (kind(h[0]).places == ALL_OR_ONE and h[1] != "all") == single]
 
-    def filled(self, theta: Float[Array, "p *batch"]) -> tuple[Effect, ...]:
+    def filled(self, theta: Float[Array | np.ndarray, "p *batch"]) -> tuple[Effect, ...]:
         """The effects with values from θ, whose batch axes they take."""
-        a = self._starts
-        return tuple(
-            _filled(effect, theta[a[i] : a[i + 1]]) for i, effect in enumerate(self.effects)
-        )
+        leaves = self._leaves.copy()
+        for at, (a, b) in zip(self._values, itertools.pairwise(self._starts), strict=True):
+            leaves[at] = jnp.asarray(theta[a:b])
+        return jax.tree.unflatten(self._structure, leaves)
 
     def used(self, theta: Float[np.ndarray, " p"]) -> tuple[Effect, ...]:
         """Those effects of one θ that are not absent."""
-        chosen = self.filled(jnp.asarray(theta))
+        chosen = self.filled(theta)
         return tuple(effect for effect in chosen if bool(np.any(np.asarray(effect.values) != 0)))
-
-
-def _filled(effect: Effect, values: Any) -> Effect:
-    return dataclasses.replace(effect, values=values)
 
 
 def _entries(effects: tuple[Effect, ...]) -> Iterator[Entry]:

@@ -121,7 +121,7 @@ def _simulated(
     arrays = X[..., kept], V[..., kept], u[..., kept], voltage[..., kept], step
     theta = contender.theta[:, kept]
     every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))
-    effects = bench.library.filled(jnp.asarray(theta)[:, None])
+    effects = bench.library.filled(theta[:, None])
     used = tuple(e for e in effects if any((e.name, where) in kinds for where in e.places))
     box = contender.box
     if box is not None:

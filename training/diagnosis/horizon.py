@@ -29,7 +29,7 @@ from ...models.effects.library import Library
 from ...models.effects.predict import advance
 from .data import Data
 from .innovations import settle, substeps
-from .looking import Bench
+from .looking import Bench, mass
 
 _ENOUGH = 1e-3
 """Relative gain of a step below which a fit has ended."""
@@ -151,7 +151,7 @@ def forecast_errors(
 ) -> Float[np.ndarray, "M 12 K"]:
     """Forecast less record, pose seen from the recorded body (m, rad), then twist."""
     library, at = small(bench, (), theta)
-    effects = library.filled(jnp.asarray(theta[at]))
+    effects = library.filled(theta[at])
     return np.asarray(_apart(bench.model, effects, _arrays(w), w.count))
 
 
@@ -187,7 +187,7 @@ def fit_forecasts(
     best[own] = np.clip(np.where(flat, probe, start), low, high)
 
     def tried(values: np.ndarray) -> float:
-        e = _apart(bench.model, library.filled(jnp.asarray(values)), arrays, w.count)
+        e = _apart(bench.model, library.filled(values), arrays, w.count)
         return _loss(np.asarray(e)[..., kept], size)
 
     def seen(values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -217,8 +217,7 @@ def fit_forecasts(
 
 
 def _is_body(bench: Bench, library: Library, values: np.ndarray) -> bool:
-    model = bench.model.with_effects(library.filled(jnp.asarray(values)))
-    return bool(np.linalg.eigvalsh(np.asarray(model.inertia().matrix))[0] > 0)
+    return bool(np.linalg.eigvalsh(mass(bench.model, library, values))[0] > 0)
 
 
 def _loss(e: np.ndarray, size: np.ndarray) -> float:

@@ -243,7 +243,7 @@ class Evidence:
         H = tangent @ self.total @ tangent.T + np.diag(prior)
         H = H + 1e-10 * np.diag(np.maximum(np.diag(H), 1e-300))
         inverse = np.linalg.inv(H)
-        scores = np.einsum("ki,rij,j->rk", tangent, self.runs, weights)
+        scores = self.runs @ weights @ tangent.T
         n = len(scores)
         meat = scores.T @ scores * n / max(n - 1, 1)
         spread = inverse @ meat @ inverse
@@ -252,7 +252,7 @@ class Evidence:
         project = np.eye(len(tangent))[own]
         if len(other):
             project[:, other] = -H[np.ix_(own, other)] @ np.linalg.inv(H[np.ix_(other, other)])
-        s = np.einsum("ki,rij,j->rk", project @ tangent, self.runs, base)
+        s = self.runs @ base @ (project @ tangent).T
         meat = s.T @ s
         total = s.sum(axis=0)
         try:

@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import equinox as eqx
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ...models.dynamics import Dynamics
 from ...models.effects.base import AXES, XYZ, Effect
@@ -138,8 +138,7 @@ class Bench:
 
     def mass(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "6 6"]:
         """The mass matrix under θ (kg, kg·m, kg·m²)."""
-        model = self.model.with_effects(self.library.filled(jnp.asarray(theta)))
-        return np.asarray(model.inertia().matrix)
+        return mass(self.model, self.library, theta)
 
     # ------------------------------------------------------------------------------- looking
 
@@ -290,6 +289,18 @@ class Bench:
             values = np.clip(look.theta[chosen] + change, low, high)
             theta[np.ix_(chosen, data.fold == label)] = values[:, None]
         return theta
+
+
+def mass(
+    model: Extended, library: Library, theta: Float[np.ndarray, " p"]
+) -> Float[np.ndarray, "6 6"]:
+    """The mass matrix with a library's effects (kg, kg·m, kg·m²)."""
+    return np.asarray(_mass(model, library.filled(theta)))
+
+
+@eqx.filter_jit
+def _mass(model: Extended, effects: tuple[Effect, ...]) -> Float[Array, "6 6"]:
+    return model.with_effects(effects).inertia().matrix
 
 
 def _key(entry: tuple) -> tuple[str, str, str]:

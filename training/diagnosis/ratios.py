@@ -8,12 +8,15 @@ is taken for known.
 
 from collections.abc import Callable, Sequence
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ...models import se3
 from ...models.effects.base import AXES
+from ...models.effects.extended import Extended
 from ...models.rigid_body import FossenDynamics
 from . import result
 from .looking import Bench, Look
@@ -75,18 +78,34 @@ def _numbers(bench: Bench) -> Callable[[np.ndarray], dict[tuple[str, str], float
     data = bench.data
     thrusters = bench.vehicle.thrusters()
     volts = float((data.voltage * data.weight).sum() / data.weight.sum())
+    nominal = float(thrusters.nominal_voltage)
     identity = se3.identity(jnp.float64)
+    B = np.asarray(bench.model.allocate(jnp.eye(data.u.shape[1])))
+    half = 1500.0 + _HALF * np.sign(np.round(B, 9))
+
+    @eqx.filter_jit
+    def at_rest(model: Extended, effects: tuple, X: Array) -> Array:
+        """Wrench without motion and command."""
+        still, model = jnp.zeros(6), model.with_effects(effects)
+        _, wrench = model.base.balance(X, still, jnp.zeros(6))
+        return wrench + model.extra_wrench(X, still)
+
+    @eqx.filter_jit
+    def pushed(model: Extended, effects: tuple, pwm: Array) -> Array:
+        """Wrenches (6, 6) of commands for all thrusters (6, n)."""
+        still, model = jnp.zeros(6), model.with_effects(effects)
+
+        def wrench(pwm: Array) -> Array:
+            force = thrusters.force(pwm, jnp.full(len(pwm), volts * nominal))
+            given = model.thrust(force, still, jnp.array([volts]))
+            return model.together(model.allocate(given))
+
+        return jax.vmap(wrench)(pwm)
 
     def numbers(theta: Float[np.ndarray, " p"]) -> dict[tuple[str, str], float]:
-        model = bench.model.with_effects(bench.library.filled(jnp.asarray(theta)))
+        effects = bench.library.filled(theta)
         inertia = np.diag(bench.mass(theta))
-        still = jnp.zeros(6)
-
-        def static(X: jnp.ndarray) -> np.ndarray:
-            _, wrench = model.base.balance(X, still, jnp.zeros(6))
-            return np.asarray(wrench + model.extra_wrench(X, still))
-
-        level = static(identity)
+        level = at_rest(bench.model, effects, identity)
         found = {("inertia", a): inertia[i] / inertia[i // 3 * 3] for i, a in enumerate(AXES)}
         for name in ("quadratic_drag", "linear_drag"):
             for i, axis in enumerate(AXES):
@@ -94,17 +113,13 @@ def _numbers(bench: Bench) -> Callable[[np.ndarray], dict[tuple[str, str], float
                 value = bench.believes(name, axis) + change
                 found[name, axis] = float(value / inertia[i])
         if data.command == "pwm":
-            B = np.asarray(model.allocate(jnp.eye(data.u.shape[1])))
-            nominal = float(thrusters.nominal_voltage)
+            F = np.asarray(pushed(bench.model, effects, jnp.asarray(half)))
             for i, axis in enumerate(AXES):
-                pwm = jnp.asarray(1500.0 + _HALF * np.sign(np.round(B[i], 9)))
-                force = thrusters.force(pwm, jnp.full(len(pwm), volts * nominal))
-                given = model.thrust(force, still, jnp.array([volts]))
-                F = model.together(model.allocate(given))
-                found["half_thrust", axis] = float(F[i] / inertia[i])
+                found["half_thrust", axis] = float(F[i, i] / inertia[i])
         for i, axis in ((3, "roll"), (4, "pitch")):
             tilted = se3.retract(identity, jnp.zeros(6).at[i].set(_TILT))
-            found["restoring", axis] = float((level[i] - static(tilted)[i]) / _TILT / inertia[i])
+            less = level[i] - at_rest(bench.model, effects, tilted)[i]
+            found["restoring", axis] = float(less / _TILT / inertia[i])
         found["net_buoyancy", "heave"] = float(level[2] / inertia[2])
         return found
 

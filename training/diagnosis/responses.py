@@ -1,6 +1,8 @@
 """How the innovations would change if an effect were there: probes through the same filter."""
 
-from collections.abc import Callable
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
 from typing import Any
 
 import equinox as eqx
@@ -19,6 +21,14 @@ from .noise import Filter
 
 LANES, FEW = 28, 8
 """Probes that one call of the compiled program runs side by side, besides the base."""
+AHEAD = 4
+"""Calls that wait or run while the results of one are taken: each holds its probes' innovations."""
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    """A program runs in the thread that calls it and leaves other cores idle."""
+    return ThreadPoolExecutor(AHEAD, thread_name_prefix="responses")
 
 
 @eqx.filter_jit
@@ -84,13 +94,12 @@ def respond(
     data: Data,
     predictions: Predictions,
     kalman: Filter,
-    progress: Callable[[float], None] = lambda fraction: None,
 ) -> Float[np.ndarray, "m N12 R"]:
     """Whitened innovations at `theta`, then the changes that each row of `probes` makes in them.
 
     Rows of `probes` are differences from `theta`. Those of instruments go through one compiled
     program, all others through another one, `LANES` (or `FEW`) at a time: reading instruments costs
-    several times what a wrench costs.
+    several times what a wrench costs. Calls run side by side on as many cores as there are.
     """
     arrays = as_arrays(data)
     filters = (jnp.asarray(kalman.keep), jnp.asarray(kalman.whiten), jnp.asarray(data.weight))
@@ -98,7 +107,18 @@ def respond(
     of_instruments = np.any((probes != 0) & reads, axis=1)
     steps = data.u.shape[0] * 12
     found = np.empty((1 + len(probes), steps, data.u.shape[2]), np.float32)
-    done = 0
+    believed = library.filled(theta[:, None, None])
+    running: deque[tuple[np.ndarray, Future[np.ndarray]]] = deque()
+
+    def run(*arguments: Any) -> np.ndarray:
+        return np.asarray(_respond(*arguments))
+
+    def collect() -> None:
+        some, z = running.popleft()
+        seen = np.moveaxis(z.result(), 2, 0)
+        found[1 + some] = seen[1 : 1 + len(some)].reshape(len(some), steps, -1)
+        found[0] = seen[0].reshape(steps, -1)
+
     for instruments in (False, True):
         rows = np.flatnonzero(of_instruments == instruments)
         size = LANES if len(rows) > FEW else FEW
@@ -107,25 +127,13 @@ def respond(
             chunk = np.zeros((size + 1, library.size))
             chunk[1 : 1 + len(some)] = probes[some]
             effects = _values(library, theta, chunk, instruments)
-            believed = library.filled(jnp.asarray(theta[:, None, None]))
-            z = np.asarray(
-                _respond(
-                    model,
-                    effects,
-                    believed,
-                    predictions,
-                    arrays,
-                    filters,
-                    size + 1,
-                    instruments,
-                )
-            )
-            found[1 + some] = np.moveaxis(z[:, :, 1 : 1 + len(some)], 2, 0).reshape(
-                len(some), steps, -1
-            )
-            found[0] = z[:, :, 0].reshape(steps, -1)
-            done += len(some)
-            progress(done / len(probes))
+            arguments = predictions, arrays, filters, size + 1, instruments
+            call = _threads().submit(run, model, effects, believed, *arguments)
+            running.append((some, call))
+            if len(running) > AHEAD:
+                collect()
+    while running:
+        collect()
     return found
 
 
@@ -133,8 +141,8 @@ def _values(
     library: Library, theta: np.ndarray, chunk: np.ndarray, instruments: bool
 ) -> tuple[Effect, ...]:
     """Effects whose values differ from lane to lane where the chunk asks for it."""
-    lanes = library.filled(jnp.asarray((theta + chunk).T[:, :, None]))
-    alike = library.filled(jnp.asarray(theta[:, None, None]))
+    lanes = library.filled((theta + chunk).T[:, :, None])
+    alike = library.filled(theta[:, None, None])
     return tuple(
         a if (a.family == "measurement") == instruments else b
         for a, b in zip(lanes, alike, strict=True)

@@ -21,6 +21,7 @@ UNSCALED = ("axis_thrust", "linear_drag", "quadratic_drag", "net_buoyancy")
 REFITS = {"none": (), "scales": ("thrust_scale",), "linear": BELIEFS, "command": UNSCALED}
 _TIMES = ("thruster_lag", "actuation_delay", "clock_offset")
 _CLOSE = 0.7
+_TAKEN_BACK = 2
 RIVALS = 0.25
 """Share of what the best law wins on data left out that no imitation of random structure wins."""
 _OF_A_LAW = 0.02
@@ -117,7 +118,12 @@ class Search:
         self._asked: tuple[Look, tuple[Choice | None, dict[Hypothesis, Fit]]] | None = None
 
     def run(self, found: Found) -> Found:
-        """Add causes until none passes; all accepted are refitted together."""
+        """Add causes until none passes; all accepted are refitted together.
+
+        Where exact fits take back what was added `_TAKEN_BACK` times in a row, what names promise
+        is not to be had: the rest of them is not tried.
+        """
+        taken_back = 0
         for number in range(len(found.accepted), self.most):
             self.progress(number / self.most, f"{number} causes so far")
             choice, fits = self.next(found)
@@ -129,6 +135,9 @@ class Search:
             found.accepted.append((choice, choice.fit))
             found.current = self.bench.look(theta)
             self._backward(found)
+            taken_back = taken_back + 1 if choice.hypothesis in found.dropped else 0
+            if taken_back == _TAKEN_BACK:
+                break
         return found
 
     def next(self, found: Found) -> tuple[Choice | None, dict[Hypothesis, Fit]]:

@@ -11,7 +11,7 @@ networks for a SPINN.
 """
 
 import abc
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,6 +19,9 @@ from jaxtyping import Array, Float
 
 from . import se3
 from .spd import Operator, Spd
+
+Memory = tuple[Array, ...]
+"""What a model remembers of earlier commands and motion: arrays (m, *batch)."""
 
 
 class Coefficients(NamedTuple):
@@ -67,6 +70,28 @@ class Dynamics(eqx.Module):
             ValueError: the model has none.
         """
         raise ValueError(f"{type(self).__name__} has no pushes that last: give it noise of 6 axes")
+
+    @property
+    def remembers(self) -> bool:
+        """Whether earlier commands or motion act later, so that rollouts carry a memory."""
+        return False
+
+    def commanded(self, F_Bo_B: Float[Array, "6 *batch"]) -> Memory:
+        """The memory of a vehicle that has been commanded a wrench for ever."""
+        del F_Bo_B
+        return ()
+
+    def arriving(
+        self,
+        memory: Memory,
+        F_Bo_B: Float[Array, "6 *batch"],
+        V_WB_B: Float[Array, "6 *batch"],
+        dt: Any,
+        substeps: int,
+    ) -> tuple[Memory, Float[Array, "6 *batch S"]]:
+        """Memory after a wrench is commanded for `dt` s, and what acts over its S substeps."""
+        del V_WB_B, dt
+        return memory, jnp.broadcast_to(F_Bo_B[..., None], (*F_Bo_B.shape, substeps))
 
     @abc.abstractmethod
     def coefficients(self, V_WB_B: Float[Array, "6 *#batch"]) -> Coefficients:

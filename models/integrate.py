@@ -17,7 +17,7 @@ from diffrax import RESULTS
 from jaxtyping import Array, Float
 
 from . import se3
-from .dynamics import Dynamics, Flow
+from .dynamics import Dynamics, Flow, Memory
 
 
 def step(
@@ -69,9 +69,9 @@ def rollout(
     `dW` holds the Brownian increments of S substeps of length dt / S each and must then have
     variance dt / S; without it `substeps` deterministic ones are taken. They are 6 a substep, or
     `Dynamics.brownian_size` for a model with pushes that last, which start in their stationary law:
-    with 6 those pushes are left out. `remat` recomputes each
-    step in the backward pass: memory then grows with the states alone, not with the networks'
-    activations.
+    with 6 those pushes are left out. A model whose actuation remembers (lag, delay) has been
+    commanded its first wrench for ever. `remat` recomputes each step in the backward pass: memory
+    then grows with the states alone, not with the networks' activations.
     """
     count = substeps if dW is None else dW.shape[1]
     h = dt / count
@@ -81,17 +81,24 @@ def rollout(
         dW = dW[:, :, :6]
         push = dynamics.lasting_push(w, h).reshape(dW.shape)
 
-    def advance(carry: tuple[Array, Array], inputs: tuple[Array, Any, Any]) -> Any:
-        X, V = carry
+    def shaped(F: Array) -> Array:
+        return F.reshape(F.shape + (1,) * (V_WB_B.ndim - F.ndim))
+
+    def advance(carry: tuple[Array, Array, Memory], inputs: tuple[Array, Any, Any]) -> Any:
+        X, V, memory = carry
         F, dW_step, push_step = inputs
-        (F,) = (F.reshape(F.shape + (1,) * (V.ndim - F.ndim)),)
+        F, late = shaped(F), None
+        if dynamics.remembers:
+            memory, late = dynamics.arriving(memory, F, V, dt, count)
         for s in range(count):
-            F_s = F if push_step is None else F + push_step[s]
+            F_s = F if late is None else late[..., s]
+            F_s = F_s if push_step is None else F_s + push_step[s]
             X, V = step(dynamics, X, V, F_s, h, None if dW_step is None else dW_step[s])
-        return (X, V), (X, V)
+        return (X, V, memory), (X, V)
 
     body = jax.checkpoint(advance) if remat else advance
-    _, (Xs, Vs) = jax.lax.scan(body, (X_WB, V_WB_B), (F_Bo_B, dW, push))
+    memory = dynamics.commanded(shaped(F_Bo_B[0])) if dynamics.remembers else ()
+    _, (Xs, Vs) = jax.lax.scan(body, (X_WB, V_WB_B, memory), (F_Bo_B, dW, push))
     return Xs, Vs
 
 

@@ -1,7 +1,9 @@
 """The vehicle as a discrete-time system around any model of its dynamics."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import accumulate
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -9,8 +11,9 @@ from numpy.typing import ArrayLike
 from pydrake.common import RandomDistribution
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from ..models import integrate
+from ..models import integrate, se3
 from ..models.dynamics import Dynamics, Flow
+from ..models.effects.extended import Extended
 from ..models.thruster_curves import NEUTRAL
 from ..models.thrusters import Thrusters
 from .jit import VectorFunction, value_or_none, value_or_zeros
@@ -34,6 +37,13 @@ class LearnedPlant(LeafSystem):
     (N) and `voltage_loaded` (V), what remains of the voltage under load, are those of the end of
     the last period. These four ports exist with thrusters only.
 
+    A model with effects (`models.effects.extended.Extended`) is simulated with all of them: those
+    on thrusters act on their forces one by one, with the voltage under load (a `F_Bo_B` counts as
+    thruster forces of least effort, a disturbance does not pass them); memories and random states
+    are a part of the state, and `noise` takes what random states need besides. `thruster_lag`
+    stands in place of the thrusters' own lag. `X_WB_seen` and `V_WB_B_seen` are pose and twist as
+    effects on instruments show them.
+
     .. pydrake_system::
 
         name: LearnedPlant
@@ -49,6 +59,8 @@ class LearnedPlant(LeafSystem):
         - V_WB_B
         - A_WB_B
         - state
+        - X_WB_seen
+        - V_WB_B_seen
         - thruster_force
         - voltage_loaded
 
@@ -82,7 +94,13 @@ class LearnedPlant(LeafSystem):
         self._F_disturbance = self.DeclareVectorInputPort("F_disturbance_Bo_B", 6)
         self._flow = self.DeclareVectorInputPort("flow_W", 6)
         gaussian = RandomDistribution.kGaussian
-        self._noise = self.DeclareVectorInputPort("noise", 6 * substeps, gaussian)
+        if isinstance(dynamics, Extended):
+            dynamics = dynamics.for_steps_of(period)
+        model = integrate.cast(dynamics, jnp.float64)
+        self._model = model if isinstance(model, Extended) else None
+        self._gaussians = 6 if self._model is None else self._model.noise_size
+        draws = self._gaussians * substeps
+        self._noise = self.DeclareVectorInputPort("noise", draws, gaussian)
         self._X = self.DeclareDiscreteState(BasicVector(X0.tolist()))
         self._V = self.DeclareDiscreteState(BasicVector(V0.tolist()))
         self._A = self.DeclareDiscreteState(6)
@@ -90,16 +108,52 @@ class LearnedPlant(LeafSystem):
         self.DeclareStateOutputPort("V_WB_B", self._V)
         self.DeclareStateOutputPort("A_WB_B", self._A)
         self.DeclareVectorOutputPort("state", 13, self._calc_state, {self.xd_ticket()})
+        self._declare_seen()
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         self._thrusters = None if thrusters is None else integrate.cast(thrusters, jnp.float64)
         bank = self._declare_thrusters(self._thrusters) if self._thrusters is not None else []
 
-        sizes = [7, 6, 6, 6, 6 * substeps, *bank]
-        results = [7, 6, 6, 1, *bank[2:]]
-        model = integrate.cast(dynamics, jnp.float64)
+        carried = self._declare_carried()
+
+        sizes = [7, 6, 6, 6, draws, *bank, *carried]
+        results = [7, 6, 6, 1, *bank[2:], *carried]
         self._steps = self._step(model, False), self._step(model, True)
         self._still = VectorFunction(self._steps[0], sizes, results)
         self._flowing = VectorFunction(self._steps[1], [*sizes, 6], results)
+
+    def _declare_seen(self) -> None:
+        """Add the ports that show the state as effects on instruments have it."""
+        model = self._model
+        self._instruments = model is not None and any(e.acts("measure") for e in model.effects)
+        if not self._instruments:
+            self.DeclareStateOutputPort("X_WB_seen", self._X)
+            self.DeclareStateOutputPort("V_WB_B_seen", self._V)
+            return
+        see = VectorFunction(self._seen, [7, 6, 6], [7, 6])
+        for name, size, part in (("X_WB_seen", 7, slice(0, 7)), ("V_WB_B_seen", 6, slice(7, 13))):
+
+            def show(context: Context, output: BasicVector, part: slice = part) -> None:
+                state = context.get_discrete_state()
+                output.SetFromVector(see.flat(*(state.value(i) for i in range(3)))[part])
+
+            self.DeclareVectorOutputPort(name, size, show, {self.xd_ticket()})
+
+    def _seen(self, X: Array, V: Array, A: Array) -> tuple[Array, Array]:
+        assert self._model is not None
+        return self._model.observe(X, V, A)
+
+    def _declare_carried(self) -> list[int]:
+        """Add the state of effects with memory or chance; its size, if there is any."""
+        self._carries: list[int] = []
+        if self._model is None:
+            return []
+        parts = jax.tree.leaves(self._model.carried(jnp.zeros(self._model.inverse.shape[0])))
+        self._carries = [part.size for part in parts]
+        if not parts:
+            return []
+        start = np.concatenate([np.asarray(part) for part in parts])
+        self.DeclareDiscreteState(BasicVector(start.tolist()))
+        return [start.size]
 
     def _declare_thrusters(self, thrusters: Thrusters) -> list[int]:
         """Add the thrusters' ports and state; sizes of pwm, of voltage, and of the state."""
@@ -124,40 +178,83 @@ class LearnedPlant(LeafSystem):
         period, substeps, thrusters = self.period, self.substeps, self._thrusters
         h = period / substeps
 
-        def push(pwm: Array, voltage: Array, bank: Array) -> tuple[Array, Array]:
-            """The thrusters' wrench over the period and their state at its end."""
+        effects = self._model
+        lags = effects is None or all(e.name != "thruster_lag" for e in effects.effects)
+
+        def turn(pwm: Array, voltage: Array, bank: Array) -> tuple[Array, Array]:
+            """The thrusters' mean forces over the period and their state at its end."""
             assert thrusters is not None
             before, waited = bank[: pwm.size], bank[pwm.size : 2 * pwm.size]
             loaded = thrusters.loaded_voltage(pwm, voltage[0])
-            command = thrusters.force(pwm, loaded)
-            after, waited = thrusters.lag_from_rest(before, waited, command, period)
-            mean = jnp.where(thrusters.time_constant > 0, (before + after) / 2, after)
-            return thrusters.wrench(mean), jnp.concatenate([after, waited, loaded[None]])
+            mean = after = thrusters.force(pwm, loaded)
+            if lags:
+                after, waited = thrusters.lag_from_rest(before, waited, after, period)
+                mean = jnp.where(thrusters.time_constant > 0, (before + after) / 2, after)
+            return mean, jnp.concatenate([after, waited, loaded[None]])
 
         def advance(
             X: Array, V: Array, F: Array, F_disturbance: Array, noise: Array, *more: Array
         ) -> tuple[Array, ...]:
-            start, F, bank = V, F + F_disturbance, ()
+            start, force, bank = V, None, ()
             if thrusters is not None:
-                F_thrusters, *bank = push(*more[:3])
-                F = F + F_thrusters
-            dW = h**0.5 * noise.reshape(substeps, 6)
-            for s in range(substeps):
-                water = None
-                if flowing:
-                    flow = more[-1]
-                    water = Flow(flow[:3] + s * h * flow[3:], flow[3:])
-                X, V = integrate.step(model, X, V, F, h, dW[s], water)
+                force, *bank = turn(*more[:3])
+            water = [None] * substeps
+            if flowing:
+                flow, more = more[-1], more[:-1]
+                water = [Flow(flow[:3] + s * h * flow[3:], flow[3:]) for s in range(substeps)]
+            noise = noise.reshape(substeps, -1)
+            if effects is None:
+                F = F + F_disturbance
+                F = F if force is None or thrusters is None else F + thrusters.wrench(force)
+                for s in range(substeps):
+                    X, V = integrate.step(model, X, V, F, h, h**0.5 * noise[s], water[s])
+                carried = ()
+            else:
+                level = effects.inverse @ F if force is None else effects.inverse @ F + force
+                volts = bank[0][-1:] / self._nominal if bank else None
+                kept = more[-1] if self._carries else jnp.zeros(0)
+                X, V, carried = self._stirred(
+                    effects, X, V, kept, level, volts, F_disturbance, noise, water
+                )
             finite = jnp.all(jnp.isfinite(jnp.concatenate([X, V])))
-            return X, V, (V - start) / period, finite.astype(V.dtype), *bank
+            return X, V, (V - start) / period, finite.astype(V.dtype), *bank, *carried
 
         return advance
+
+    def _stirred(
+        self, effects: Extended, X: Array, V: Array, kept: Array, level: Array,
+        volts: Array | None, F_disturbance: Array, noise: Array, water: Sequence[Flow | None],
+    ) -> tuple[Array, Array, tuple[Array, ...]]:  # fmt: skip
+        """One period of a model with effects under thruster forces `level` (N)."""
+        h = self.period / self.substeps
+        structure = jax.tree.structure(effects.carried(level))
+        ends = list(accumulate(self._carries))[:-1]
+        parts = jnp.split(kept, ends) if self._carries else []
+        memory, random = jax.tree.unflatten(structure, parts)
+        memory, levels = effects.actuate(memory, level, self.period, self.substeps)
+        memory, felt = effects.feel(memory, V, self.period)
+        F_other = F_disturbance if felt is None else F_disturbance + felt
+        body = effects.body
+        for s in range(self.substeps):
+            V_r = V
+            if (flow := water[s]) is not None:
+                V_r = V - jnp.concatenate([se3.rotate_inverse(X, flow.v_WC_W), jnp.zeros(3)])
+            random, push = effects.stir(random, X, V, noise[s], h)
+            F = effects.push(levels[..., s], X, V_r, volts) + push + F_other
+            X, V = integrate.step(body, X, V, F, h, h**0.5 * noise[s, :6], flow)
+        left = jax.tree.leaves((memory, random))
+        return X, V, (jnp.concatenate(left),) if left else ()
 
     def pure(self) -> Pure:
         """The update as a pure function."""
         still = {"F_Bo_B": np.zeros(6), "F_disturbance_Bo_B": np.zeros(6)}
-        still["noise"] = np.zeros(6 * self.substeps)
+        still["noise"] = np.zeros(self._gaussians * self.substeps)
         outputs = {name: shown(i) for i, name in enumerate(("X_WB", "V_WB_B", "A_WB_B"))}
+        for i, name in enumerate(("X_WB_seen", "V_WB_B_seen")):
+            seen = shown(i)
+            if self._instruments:
+                seen = lambda state, _, i=i: self._seen(*state[:3])[i]  # noqa: E731
+            outputs[name] = seen
         outputs["state"] = lambda state, _: jnp.concatenate(state[:2])
         if self._thrusters is not None:
             n = self._neutral.size
@@ -173,8 +270,8 @@ class LearnedPlant(LeafSystem):
             ]
             flow = [inputs["flow_W"]] if "flow_W" in inputs else []
             advance = self._steps[len(flow)]
-            X, V, A, _, *bank = advance(*state[:2], *parts, *state[3:], *flow)
-            return dict(enumerate([X, V, A, jnp.concatenate(bank)] if bank else [X, V, A]))
+            X, V, A, _, *rest = advance(*state[:2], *parts, *state[3:], *flow)
+            return dict(enumerate([X, V, A, *rest]))
 
         return Pure((Event(self.period, update),), outputs, ("noise",), (0, 1))
 
@@ -204,7 +301,7 @@ class LearnedPlant(LeafSystem):
             voltage = value_or_none(self._voltage, context)
             parts.append(self._neutral if pwm is None else pwm)
             parts.append(self._nominal if voltage is None else voltage)
-            parts.append(state.value(3))
+        parts += [state.value(i) for i in range(3, state.num_groups())]
         flow = value_or_none(self._flow, context)
         if flow is None:
             result = self._still.flat(*parts)
@@ -216,8 +313,11 @@ class LearnedPlant(LeafSystem):
         discrete_state.set_value(0, result[:7])
         discrete_state.set_value(1, result[7:13])
         discrete_state.set_value(2, result[13:19])
-        if self._thrusters is not None:
-            discrete_state.set_value(3, result[20:])
+        at = 20
+        for i in range(3, state.num_groups()):
+            size = state.value(i).size
+            discrete_state.set_value(i, result[at : at + size])
+            at += size
 
     def _explain(self, t: float, parts: list[np.ndarray], V: np.ndarray) -> str:
         names = ["X_WB", "V_WB_B", "F_Bo_B", "F_disturbance_Bo_B", "noise"]

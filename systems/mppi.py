@@ -98,8 +98,8 @@ class Mppi(LeafSystem):
         now = vector[7], vector[6], vector[6]
         of_draw = nominal, vector[6], vector[4]
         draw = jax.eval_shape(self._draw, *of_draw)
-        roll = [compiled(self._roll, part, draw.dW, *now) for part in draw.parts]
-        rolled = [jax.eval_shape(self._roll, part, draw.dW, *now) for part in draw.parts]
+        roll = [compiled(self._roll, part, draw.dW, draw.before, *now) for part in draw.parts]
+        rolled = [jax.eval_shape(self._roll, p, draw.dW, draw.before, *now) for p in draw.parts]
         choose = compiled(self._choose, vector[1], draw, rolled, *now)
         return compiled(self._draw, *of_draw), roll, choose
 
@@ -107,8 +107,10 @@ class Mppi(LeafSystem):
         state = MppiState(nominal.reshape(-1, 6))
         return self.planner.draw(state, key_from_gaussians(noise), bias)
 
-    def _roll(self, part: Array, dW: Array | None, X: Array, V: Array, bias: Array) -> Rolled:
-        return self.planner.roll(part, dW, X, V, bias)
+    def _roll(
+        self, part: Array, dW: Array | None, before: Array, X: Array, V: Array, bias: Array
+    ) -> Rolled:
+        return self.planner.roll(part, dW, X, V, bias, before)
 
     def _choose(
         self, t: Array, draw: Draw, rolled: Sequence[Rolled], X: Array, V: Array, bias: Array
@@ -137,7 +139,7 @@ class Mppi(LeafSystem):
         draw, roll, choose = self._programs
         now = X_WB, V_WB_B, F_bias_Bo_W
         drawn = draw.call(nominal, F_bias_Bo_W, noise)
-        rolled = together(roll, [(part, drawn.dW, *now) for part in drawn.parts])
+        rolled = together(roll, [(part, drawn.dW, drawn.before, *now) for part in drawn.parts])
         flat = np.asarray(choose.call(np.array([t]), drawn, rolled, *now))
         return [flat[part] for part in self._slices]
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..models import se3
 from ..models.dynamics import Dynamics
+from ..models.effects.extended import Extended
 from ..models.integrate import cast, step
 from .held_model import HeldModel
 from .mppi_config import MppiConfig
@@ -56,11 +57,13 @@ class Draw(NamedTuple):
 
     Attributes:
         nominal: the last plan, shifted by the time that went by.
+        before: the wrench of the last plan that has acted until now.
         parts: the sequences, in as many parts as `MppiConfig.threads`.
         dW: Brownian increments (√s) of the realisations; None for a single one.
     """
 
     nominal: Float[Array, "horizon 6"]
+    before: Float[Array, "6"]
     parts: tuple[Float[Array, "horizon 6 _"], ...]
     dW: Float[Array, "horizon substeps 6 r"] | None
 
@@ -129,6 +132,8 @@ class MppiPlanner(eqx.Module):
         All arrays are cast to `dtype`.
         """
         self.config = MppiConfig() if config is None else config
+        if isinstance(dynamics, Extended):
+            dynamics = dynamics.for_steps_of(self.config.dt)
         self.dynamics = cast(dynamics, dtype)
         self.limits = cast(limits, dtype)
         self.cylinders = cast(cylinders, dtype)
@@ -176,7 +181,7 @@ class MppiPlanner(eqx.Module):
         bias = jnp.zeros_like(self.V_goal) if F_bias_W is None else F_bias_W
         draw = self.draw(state, key, bias)
         whole = jnp.concatenate(draw.parts, axis=2)
-        rolled = self.roll(whole, draw.dW, X_WB, V_WB_B, bias)
+        rolled = self.roll(whole, draw.dW, X_WB, V_WB_B, bias, draw.before)
         return self.choose(draw, [rolled], X_WB, V_WB_B, bias)
 
     def draw(self, state: MppiState, key: Array, F_bias_W: Float[Array, "6"]) -> Draw:
@@ -186,7 +191,8 @@ class MppiPlanner(eqx.Module):
         last, bias = self._cast(state.F_Bo_B, F_bias_W)
         nominal = jnp.concatenate([last[c.shift :], jnp.repeat(last[-1:], c.shift, 0)])[: c.horizon]
         parts = jnp.array_split(self.sample(control_key, nominal, bias), c.threads, axis=2)
-        return Draw(nominal, tuple(parts), self._process_noise(noise_key))
+        before = last[max(min(c.shift, c.horizon) - 1, 0)]
+        return Draw(nominal, before, tuple(parts), self._process_noise(noise_key))
 
     def roll(
         self,
@@ -195,11 +201,15 @@ class MppiPlanner(eqx.Module):
         X_WB: Float[Array, "7"],
         V_WB_B: Float[Array, "6"],
         F_bias_W: Float[Array, "6"],
+        before: Float[Array, "6"],
     ) -> Rolled:
-        """Sequences from a state under all noise paths; of the states it keeps positions."""
+        """Sequences from a state under all noise paths; of the states it keeps positions.
+
+        A model with lag or delay has been commanded `before` until now.
+        """
         X, V, bias = self._cast(X_WB, V_WB_B, F_bias_W)
         n = F_Bo_B.shape[2]
-        return self._rollouts(X, V, F_Bo_B, bias, dW, lambda X, V: (X[4:, :n],))
+        return self._rollouts(X, V, F_Bo_B, bias, dW, lambda X, V: (X[4:, :n],), before)
 
     def choose(
         self,
@@ -221,7 +231,9 @@ class MppiPlanner(eqx.Module):
         best = F[:, :, jnp.argmin(jnp.where(jnp.isfinite(cost), cost, jnp.inf))]
         candidates = jnp.stack([mean, best, draw.nominal], axis=2)
         quiet = None if dW is None else jnp.concatenate([dW, jnp.zeros_like(dW[..., :1])], axis=3)
-        tried = self._rollouts(X, V, candidates, bias, quiet, lambda X, V: (X[:, -3:], V[:, -3:]))
+        tried = self._rollouts(
+            X, V, candidates, bias, quiet, lambda X, V: (X[:, -3:], V[:, -3:]), draw.before
+        )
         if dW is not None:
             tried = Rolled(tried.cost[:-1], tried.clearance[:-1], tried.states)
         candidate_cost, probability = self.sequence_cost(candidates, tried, bias)
@@ -343,7 +355,10 @@ class MppiPlanner(eqx.Module):
             cost = cost + c.speed_weight * jnp.maximum(speed - c.speed_limit, 0) ** 2
         return cost
 
-    def _rollouts(self, X0: Array, V0: Array, F: Array, bias: Array, dW: Array | None, keep):
+    def _rollouts(
+        self, X0: Array, V0: Array, F: Array, bias: Array, dW: Array | None, keep,
+        before: Array | None = None,
+    ):  # fmt: skip
         """Sequences (horizon, 6, n) under all noise paths (horizon, substeps, 6, r), r-major."""
         c = self.config
         n = F.shape[2]
@@ -354,23 +369,31 @@ class MppiPlanner(eqx.Module):
         last = jnp.zeros(c.horizon, V.dtype).at[-1].set(c.terminal_time)
 
         def advance(carry, inputs):
-            X, V, cost, least = carry
+            X, V, cost, least, memory = carry
             F, dW, terminal = inputs
-            wrench = jnp.tile(F, (1, r)) + _in_body(X, bias)
+            wrench, later = jnp.tile(F, (1, r)), _in_body(X, bias)
             if self.tracking is not None and dW is not None:
                 wrench = wrench + self._pull(X, V, n)
+            wrenches = [wrench + later] * c.steps_of_model
+            if self.dynamics.remembers:
+                memory, late = self.dynamics.arriving(memory, wrench, V, c.dt, c.steps_of_model)
+                wrenches = [late[..., i] + later for i in range(c.steps_of_model)]
             model = HeldModel(self.dynamics, V) if c.steps_of_model > 1 else self.dynamics
             for i in range(c.steps_of_model):
                 noise = None if dW is None else jnp.repeat(dW[i], n, 1)
-                X, V = step(model, X, V, wrench, h, noise)
+                X, V = step(model, X, V, wrenches[i], h, noise)
             distance = self.hull.clearance(X, self.cylinders)
             near = jnp.maximum(1 - distance / c.margin, 0)
             cost = cost + (c.dt + terminal) * self._state_cost(X, V)
             cost = cost + c.dt * c.margin_weight * near * near
-            return (X, V, cost, jnp.minimum(least, distance)), keep(X, V)
+            return (X, V, cost, jnp.minimum(least, distance), memory), keep(X, V)
 
-        start = (X, V, jnp.zeros_like(V[0]), jnp.full_like(V[0], jnp.inf))
-        (_, _, cost, least), kept = jax.lax.scan(advance, start, (F, dW, last))
+        memory = ()
+        if self.dynamics.remembers:
+            first = F[0] if before is None else before[:, None]
+            memory = self.dynamics.commanded(jnp.broadcast_to(first, (6, r * n)))
+        start = (X, V, jnp.zeros_like(V[0]), jnp.full_like(V[0], jnp.inf), memory)
+        (_, _, cost, least, _), kept = jax.lax.scan(advance, start, (F, dW, last))
         return Rolled(cost.reshape(r, n), least.reshape(r, n), kept)
 
 

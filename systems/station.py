@@ -92,9 +92,9 @@ def _simulated(config: StationConfig) -> Diagram:
     connect(allocation, "pwm", plant)
     connect(water, "F_disturbance_Bo_B", plant)
     connect(water, "flow_W", plant)
-    for reader in (water, sensors):
-        connect(plant, "X_WB", reader)
-        connect(plant, "V_WB_B", reader)
+    for reader, seen in ((water, ""), (sensors, "_seen")):
+        connect(plant, f"X_WB{seen}", reader, "X_WB")
+        connect(plant, f"V_WB_B{seen}", reader, "V_WB_B")
     connect(plant, "A_WB_B", sensors)
     for reading in ("imu", "dvl", "depth", "compass"):
         connect(sensors, reading, ekf)

@@ -192,6 +192,11 @@ class Effect(eqx.Module):
         del dt
         return memory, level
 
+    def for_steps_of(self, dt: float) -> "Effect":
+        """The same with a memory that suffices at steps of `dt` s."""
+        del dt
+        return self
+
     def feel(
         self,
         memory: Float[Array, "m *#batch"],

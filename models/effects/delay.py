@@ -1,9 +1,12 @@
 """Commands that arrive late."""
 
+import dataclasses
+import math
 from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .base import ALL_OR_ONE, Effect, Parameter
@@ -35,6 +38,11 @@ class ActuationDelay(Effect):
     def initial(self, command: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
         held = jnp.ones((self.steps, *command.shape[1:]), command.dtype)
         return jnp.concatenate([command] * self.steps + [held])
+
+    def for_steps_of(self, dt: float) -> "ActuationDelay":
+        values = np.asarray(self.values, float)
+        longest = float(np.max(values[:1] + np.concatenate([np.zeros(1), values[1:]])))
+        return dataclasses.replace(self, steps=max(math.ceil(longest / dt - 1e-9), 0) + 1)
 
     def actuate(
         self,

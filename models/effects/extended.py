@@ -8,13 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import se3
-from ..dynamics import Coefficients, Dynamics, Flow
+from ..dynamics import Coefficients, Dynamics, Flow, Memory
 from ..spd import ConstantSpd, Spd
 from ..thrusters import Thrusters
 from .base import Effect, Plant
 
-Memory = tuple[Array, ...]
-"""One array (m, *batch) for each effect that has a memory, in the model's order."""
 Random = tuple[Array, ...]
 """One array (s, *batch) for each effect with a random state, in the model's order."""
 
@@ -37,9 +35,9 @@ def times(M: Array, x: Array) -> Array:
 class Extended(Dynamics):
     """`base` with `effects`, at the level of its thrusters.
 
-    As a `Dynamics` it takes a wrench, splits it over the thrusters with the least effort, and has
-    no memory: lag, delay and random states act in `predict.advance` and `rollout` alone, which
-    take thruster commands.
+    As a `Dynamics` it takes a wrench and splits it over the thrusters with the least effort; lag
+    and delay act in `integrate.rollout`. Random states (waves, coloured pushes) act where thruster
+    forces are commanded: in `rollout`, and in the plant of a diagram.
     """
 
     base: Dynamics
@@ -148,6 +146,27 @@ class Extended(Dynamics):
         rigid = self.base.rigid_inertia[0, 0]
         drag = self.base.drag_wrench
         return Plant(self.positions, self.directions, mass, jnp.asarray(weight), rigid, drag)
+
+    @property
+    def remembers(self) -> bool:
+        return any(effect.memory_size for effect in self.effects)
+
+    def commanded(self, F_Bo_B: Float[Array, "6 *batch"]) -> Memory:
+        return self.remember(jnp.tensordot(self.inverse, F_Bo_B, 1))
+
+    def arriving(
+        self,
+        memory: Memory,
+        F_Bo_B: Float[Array, "6 *batch"],
+        V_WB_B: Float[Array, "6 *batch"],
+        dt: Any,
+        substeps: int,
+    ) -> tuple[Memory, Float[Array, "6 *batch S"]]:
+        level = jnp.tensordot(self.inverse, F_Bo_B, 1)
+        memory, levels = self.actuate(memory, level, dt, substeps)
+        memory, felt = self.feel(memory, V_WB_B, dt)
+        F = self.allocate(levels)
+        return memory, F if felt is None else F + felt[..., None]
 
     def _any(self, hook: str) -> bool:
         return any(effect.acts(hook) for effect in self.effects)
@@ -259,7 +278,7 @@ class Extended(Dynamics):
     ) -> Float[Array, "6 *#batch"]:
         """dV/dt under thruster forces that memory effects have passed, and a random push."""
         V_r, turning = self._through_water(X_WB, V_WB_B)
-        F = self.together(self.allocate(self.thrust(level, V_r, voltage)))
+        F = self.push(level, X_WB, V_WB_B, voltage)
         F = F if push is None else F + push
         _, wrench = self.base.balance(X_WB, V_r, F)
         wrench = wrench + self.extra_wrench(X_WB, V_r, self._extra_inertia())
@@ -267,6 +286,10 @@ class Extended(Dynamics):
         return acceleration if turning is None else acceleration + turning
 
     # ---------------------------------------------------------------------------- memories
+
+    def for_steps_of(self, dt: float) -> "Extended":
+        """The same, its effects with memories that suffice at steps of `dt` s."""
+        return self.with_effects(tuple(e.for_steps_of(dt) for e in self.effects))
 
     def remember(self, command: Float[Array, "n *batch"]) -> Memory:
         """Memories that have seen a command for ever."""
@@ -301,6 +324,33 @@ class Extended(Dynamics):
             kept.append(new)
             i += 1
         return tuple(kept), total
+
+    # ------------------------------------------------------------------------ step by step
+
+    @property
+    def body(self) -> "Extended":
+        """The same without effects on the actuation: it takes the wrench that thrusters make."""
+        hooks = ("actuate", "thrust", "together")
+        rest = (e for e in self.effects if not any(e.acts(hook) for hook in hooks))
+        return self.with_effects(tuple(rest))
+
+    def carried(self, command: Float[Array, "n *batch"]) -> tuple[Memory, Random]:
+        """What a simulation carries from step to step: at rest, under `command` (N) for ever."""
+        batch = command.shape[1:]
+        return self.remember(command), tuple(
+            jnp.zeros((e.pushes, *batch), command.dtype) for e in self.effects if e.pushes
+        )
+
+    def push(
+        self,
+        level: Float[Array, "n *#batch"],
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        voltage: Float[Array, "1 *#batch"] | None = None,
+    ) -> Float[Array, "6 *#batch"]:
+        """The thrusters' wrench on the body, of forces that memory effects have passed."""
+        V_r, _ = self._through_water(X_WB, V_WB_B)
+        return self.together(self.allocate(self.thrust(level, V_r, voltage)))
 
     def observe(
         self,
@@ -350,16 +400,14 @@ class Extended(Dynamics):
         from .predict import advance
 
         inertia = self.inertia()
-        state = tuple(
-            jnp.zeros((e.pushes, *V_WB_B.shape[1:]), V_WB_B.dtype) for e in self.effects if e.pushes
-        )
+        memory, state = self.carried(command[0])
 
         def body(carry: Any, given: Any) -> Any:
             memory, state, X, V = carry
             u, noise, volts = given
             push = None
             if noise is not None:
-                state, push = self._stir(state, X, V, noise, dt)
+                state, push = self.stir(state, X, V, noise, dt)
             memory, X, V, _ = advance(self, inertia, memory, X, V, u, dt, 1, volts, push)
             if noise is not None:
                 h = jnp.asarray(dt, V.dtype)
@@ -369,10 +417,10 @@ class Extended(Dynamics):
             return (memory, state, X, V), (X, V)
 
         volts = None if voltage is None else voltage[:, None]
-        start = (self.remember(command[0]), state, X_WB, V_WB_B)
+        start = (memory, state, X_WB, V_WB_B)
         return jax.lax.scan(body, start, (command, w, volts))[1]
 
-    def _stir(self, state: Random, X: Array, V: Array, w: Array, dt: float) -> tuple[Random, Array]:
+    def stir(self, state: Random, X: Array, V: Array, w: Array, dt: float) -> tuple[Random, Array]:
         """Random states after a step, and their wrench, drag of moving water included."""
         h = jnp.asarray(dt, V.dtype)
         moved, push, at, i = [], jnp.zeros_like(V), 6, 0

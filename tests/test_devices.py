@@ -49,14 +49,20 @@ def learned() -> np.ndarray:
 
 
 def test_two_devices_learn_what_one_does(tmp_path):
-    """With the noise they draw: that of a window is a matter of its place in the batch."""
+    """With the noise they draw: that of a window is a matter of its place in the batch.
+
+    And the step is compiled once, though its start lies on one device.
+    """
     out = tmp_path / "two.npy"
     code = (
         "import sys, jax, numpy; jax.config.update('jax_num_cpu_devices', 2);"
         "jax.config.update('jax_enable_x64', True); import test_devices as t;"
         "objective = t.CONFIG.objective.build(t.START, t.simulated(t.START, 8));"
         "assert [t.usable_devices(objective, n) for n in (6, 7, 8)] == [2, 1, 2];"
-        "numpy.save(sys.argv[1], t.learned())"
+        "import spinndrift.training.fit as f; made, Step = [], f.TrainStep;"
+        "f.TrainStep = lambda *given: made.append(Step(*given)) or made[-1];"
+        "numpy.save(sys.argv[1], t.learned());"
+        "assert [step.traces for step in made] == [1]"
     )
     here = Path(__file__).parent
     kept = os.environ | compiled_environment()

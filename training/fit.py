@@ -29,6 +29,7 @@ from .step import (
     TrainStep,
     learning_rate,
     mean_over_devices,
+    on_all,
     optimizer,
     partition,
     usable_devices,
@@ -282,8 +283,9 @@ class Run:
         """Loss on the validation windows; infinite without them, or if it is not finite."""
         if self.validation is None:
             return float("inf")
-        model, objective = self._model(params), self.state.objective
+        objective = self.state.objective
         devices = usable_devices(objective, self.validation.place.size)
+        model = self._model(on_all(params, devices))
         value = float(
             _validation_loss(model, objective, self.validation, self.config.seed, devices)
         )

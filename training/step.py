@@ -100,10 +100,9 @@ class TrainStep:
             batch = data.take(indices)
             return update(frozen, params, moments, objective, batch, seed, number, rate)
 
-        everywhere = NamedSharding(_mesh(devices), Spec()) if devices > 1 else None
-        self._step = jax.jit(
-            step, donate_argnums=(0, 1), compiler_options=QUICK_COMPILE, in_shardings=everywhere
-        )
+        self._devices = devices
+        self._placed: dict[str, tuple[Any, Any]] = {}
+        self._step = jax.jit(step, donate_argnums=(0, 1), compiler_options=QUICK_COMPILE)
 
     def __call__(
         self,
@@ -121,7 +120,13 @@ class TrainStep:
         `params` and `moments` are donated: use the returned ones.
         """
         numbers = _numbers(indices, seed, number, rate)
-        return self._step(params, moments, self._frozen, objective, data, *numbers)
+        given, numbers = on_all(((params, moments), numbers), self._devices)
+        shared = {"frozen": self._frozen, "objective": objective, "data": data}
+        for name, tree in shared.items():
+            if name not in self._placed or self._placed[name][0] is not tree:
+                self._placed[name] = tree, on_all(tree, self._devices)
+            shared[name] = self._placed[name][1]
+        return self._step(*given, *shared.values(), *numbers)
 
 
 class EnsembleStep:
@@ -228,6 +233,16 @@ def mean_over_devices(of_part: Callable[..., Any], devices: int) -> Callable[...
         here, mesh=_mesh(devices), in_specs=(parts, Spec()), out_specs=Spec(), check_vma=False
     )
     return lambda batch, *whole: mean(batch, whole)
+
+
+def on_all(arrays: Any, devices: int) -> Any:
+    """A tree of arrays on each of some devices, as programs for so many return theirs.
+
+    A program is compiled anew for arrays that lie elsewhere.
+    """
+    if devices == 1:
+        return arrays
+    return jax.device_put(arrays, NamedSharding(_mesh(devices), Spec()))
 
 
 def _mesh(devices: int) -> Mesh:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -33,6 +33,8 @@ _HALVINGS = 4
 """Steps that may fail before a fit ends."""
 _WORSE = 20.0
 """Nats by which one-step errors may become less likely: the filter weighs them otherwise."""
+_LATEST, _STEPS = 0.25, (6, 16)
+"""Delay (s) of commands that is told from a longer one, and least and most steps that hold it."""
 _LIGHTEST = 0.1
 """Share of the believed mass along any direction below which a step is too long."""
 
@@ -310,7 +312,10 @@ def _key(entry: tuple) -> tuple[str, str, str]:
 def _library(data: Data, effects: Sequence[Effect]) -> tuple[Library, np.ndarray]:
     low, high = data.X[:, 4:].min(axis=(0, 2)) - 0.3, data.X[:, 4:].max(axis=(0, 2)) + 0.3
     walls = (low[0], high[0], low[1], high[1])
-    options = {"proximity": {"floor": float(low[2]), "walls": tuple(map(float, walls))}}
+    options: dict[str, dict[str, Any]] = {
+        "proximity": {"floor": float(low[2]), "walls": tuple(map(float, walls))},
+        "actuation_delay": {"steps": int(np.clip(np.ceil(_LATEST / data.dt - 1e-6) + 1, *_STEPS))},
+    }
     left_out = set(_RANDOM) | (set() if data.has_voltage else {"voltage_sag"})
     kinds = [k for k in KINDS.values() if k.family != "disturbance" and k.name not in left_out]
     own = [e for e in effects if e.name not in {k.name for k in kinds}]

@@ -80,11 +80,13 @@ class Extended(Dynamics):
 
     def coefficients(self, V_WB_B: Float[Array, "6 *#batch"]) -> Coefficients:
         c = self.base.coefficients(V_WB_B)
-        return c._replace(mass=self._mass(c.mass), diffusion=self._diffusion(V_WB_B, c.diffusion))
+        return c._replace(
+            mass=self._mass(c.mass), diffusion=self.scaled_diffusion(V_WB_B, c.diffusion)
+        )
 
     def mass_and_diffusion(self, V_WB_B: Float[Array, "6 *#batch"]) -> tuple[Spd, Array]:
         mass, b = self.base.mass_and_diffusion(V_WB_B)
-        return self._mass(mass), self._diffusion(V_WB_B, b)
+        return self._mass(mass), self.scaled_diffusion(V_WB_B, b)
 
     @property
     def brownian_size(self) -> int:
@@ -185,7 +187,10 @@ class Extended(Dynamics):
         extra = self._extra_inertia() if extra is None else extra
         return mass if extra is None else ConstantSpd(mass.matrix() + extra)
 
-    def _diffusion(self, V: Array, b: Array) -> Array:
+    def scaled_diffusion(
+        self, V: Float[Array, "6 *#batch"], b: Float[Array, "6 *#batch"]
+    ) -> Float[Array, "6 *#batch"]:
+        """The diffusion in place of b, with the effects on it."""
         for effect in self.effects:
             if effect.acts("diffusion"):
                 V, b = se3.align(V, b)
@@ -411,7 +416,7 @@ class Extended(Dynamics):
             memory, X, V, _ = advance(self, inertia, memory, X, V, u, dt, 1, volts, push)
             if noise is not None:
                 h = jnp.asarray(dt, V.dtype)
-                b = self._diffusion(V, self.base.mass_and_diffusion(V)[1])
+                b = self.scaled_diffusion(V, self.base.mass_and_diffusion(V)[1])
                 b, dW = se3.align(b, self.correlate(V, jnp.sqrt(h) * noise[:6]))
                 V = V + times(inertia.inverse, b * dW)
             return (memory, state, X, V), (X, V)
@@ -420,10 +425,20 @@ class Extended(Dynamics):
         start = (memory, state, X_WB, V_WB_B)
         return jax.lax.scan(body, start, (command, w, volts))[1]
 
-    def stir(self, state: Random, X: Array, V: Array, w: Array, dt: float) -> tuple[Random, Array]:
-        """Random states after a step, and their wrench, drag of moving water included."""
-        h = jnp.asarray(dt, V.dtype)
-        moved, push, at, i = [], jnp.zeros_like(V), 6, 0
+    def stir(
+        self,
+        state: Random,
+        X_WB: Float[Array, "7 *#batch"],
+        V_WB_B: Float[Array, "6 *#batch"],
+        w: Float[Array, "k *#batch"],
+        dt: float | Float[Array, ""],
+    ) -> tuple[Random, Float[Array, "6 *#batch"]]:
+        """Random states after a step, and their wrench, drag of moving water included.
+
+        `w` holds `noise_size` unit Gaussians, the first six of which are left for b dW.
+        """
+        h = jnp.asarray(dt, V_WB_B.dtype)
+        moved, push, at, i = [], jnp.zeros_like(V_WB_B), 6, 0
         water = None
         for effect in self.effects:
             if not effect.pushes:
@@ -431,12 +446,12 @@ class Extended(Dynamics):
             new = effect.advance(state[i], w[at : at + effect.noise_size], h)
             moved.append(new)
             at, i = at + effect.noise_size, i + 1
-            push = push + effect.push(new, X)
+            push = push + effect.push(new, X_WB)
             if effect.acts("drift_of_water"):
-                v = effect.drift_of_water(new, X)
+                v = effect.drift_of_water(new, X_WB)
                 water = v if water is None else water + v
         if water is not None:
-            v_c = se3.rotate_inverse(X, water)
-            V_r = V - jnp.concatenate([v_c, jnp.zeros_like(v_c)])
-            push = push + self.base.drag_wrench(V_r) - self.base.drag_wrench(V)
+            v_c = se3.rotate_inverse(X_WB, water)
+            V_r = V_WB_B - jnp.concatenate([v_c, jnp.zeros_like(v_c)])
+            push = push + self.base.drag_wrench(V_r) - self.base.drag_wrench(V_WB_B)
         return tuple(moved), push

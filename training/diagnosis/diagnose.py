@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from ...models.checks import check_numbers, require
 from ...models.dynamics import Dynamics
+from ...models.effects.base import Effect
 from ...models.effects.extended import Extended
 from ...models.effects.library import Library
 from ...models.effects.thrust import AxisThrust
@@ -20,7 +21,7 @@ from . import result, telling
 from .blackbox import train
 from .checks import limits, problems, unexcited
 from .data import Data
-from .gain import Contender, judge, told
+from .gain import Contender, judge, told, white_part
 from .hypotheses import Fit
 from .identify import identify, with_coefficients
 from .laws import Law
@@ -153,7 +154,7 @@ class Diagnoser:
             ]
         more, stirring = telling.law_causes(passing, bench, final)
         causes += more
-        gain = self._gain(bench, found, fitted, rows, passing, bool(causes))
+        gain = self._gain(bench, found, fitted, rows, passing, tuple(stirring), bool(causes))
         d = bench.data
         diagnosis = result.Diagnosis(
             version=result.VERSION,
@@ -256,6 +257,7 @@ class Diagnoser:
         fitted: Look,
         rows: list[int],
         laws: list[Law],
+        stirring: tuple[Effect, ...],
         extended: bool,
     ) -> dict[str, result.ModelGain]:
         """Base, base refitted, extended model and black box on data left out of their fits.
@@ -279,7 +281,12 @@ class Diagnoser:
             best = [law for law in laws if law.name == laws[0].name and len(law.heldout) == R]
             for law in best:
                 won += law.heldout
-            contenders["extended"] = Contender(bench.without_each(fitted, rows), won=won)
+            white = white_part([law for law in laws if law.name == laws[0].name], bench)
+            # the level is estimated for every contender
+            laws_of_it = tuple(e for e in stirring if e.name != "disturbance_level")
+            contenders["extended"] = Contender(
+                bench.without_each(fitted, rows), won=won, stirring=laws_of_it, white=white
+            )
         contenders["black_box"] = Contender(
             still, train(found.base.predictions, bench.data, self.rng)
         )

@@ -5,7 +5,7 @@ that it is judged on; of one scenario runs are left out in turn, of one run bloc
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,13 +15,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...models import se3
-from ...models.effects.base import Effect
+from ...models.effects.base import AXES, Effect
 from ...models.effects.extended import Extended, times
 from ...models.effects.predict import advance
 from ..metrics import BANDS, order_statistics
 from . import result
 from .blackbox import BlackBox, arguments
 from .innovations import Arrays, as_arrays, difference, predict, settle, substeps
+from .laws import Law
 from .looking import Bench
 from .noise import estimate, filtered, make_filter, mean_jacobian
 
@@ -29,6 +30,8 @@ GROUPS = {"position": slice(0, 3), "rotation": slice(3, 6), "velocity": slice(6,
 HORIZONS = (0.5, 1.0, 2.0, 4.0)
 SAMPLES = 39
 _PIECES = 60
+_FOR_EVER = 1e9
+"""A step (s) after which random states are as likely as they are in the long run."""
 _DRAWS = 400
 
 
@@ -40,6 +43,10 @@ class Contender:
     box: BlackBox | None = None
     won: Float[np.ndarray, " R"] | float = 0.0
     """Nats by piece that laws of the disturbance win besides, on pieces left out."""
+    stirring: tuple[Effect, ...] = ()
+    """Effects that have these laws; simulations start in their stationary state."""
+    white: Float[np.ndarray, "6"] = field(default_factory=lambda: np.ones(6))
+    """Share of the estimated diffusion that is none of theirs (`white_part`)."""
 
 
 class Judged(NamedTuple):
@@ -88,10 +95,29 @@ def judge(
         score[own] = -(z**2).sum(axis=(0, 1)) / 2 - (kalman.log_det * weight).sum(axis=0)
         score[own] -= 6 * np.log(2 * np.pi) * weight.sum(axis=0)
     kept = _spread(data.fold, _PIECES)
-    levels = record[:, kept], diffusion[:, kept]
+    levels = record[:, kept], diffusion[:, kept] * contender.white[:, None]
     kinds = {bench.library.entries[i][:2] for i in in_use}
     kinds |= {bench.library.entries[i][:2] for i in np.flatnonzero(np.any(theta != 0, axis=1))}
     return _simulated(bench, contender, levels, kept, horizon, seed, score + contender.won, kinds)
+
+
+def white_part(laws: Sequence[Law], bench: Bench) -> Float[np.ndarray, "6"]:
+    """Share of each axis' estimated diffusion that remains beside laws that are a part of it.
+
+    Blows come within single steps and count as diffusion; one that grows with the speed was
+    estimated as the mean over all speeds. Slow pushes are no part of the estimate.
+    """
+    share, data = np.ones(6), bench.data
+    speed2 = (data.V[:-1, :3] ** 2).sum(axis=1)
+    for law in laws:
+        p = law.parameters
+        if law.name == "disturbance_impacts":
+            square = (1 - p["share"]) * p["rest"] ** 2 + p["share"] * p["size"] ** 2
+            share[AXES.index(law.where)] = p["rest"] / np.sqrt(square)
+        elif law.name == "disturbance_state_dependence":
+            grown = ((1 + p["growth"] * speed2) * data.weight).sum() / data.weight.sum()
+            share[AXES.index(law.where)] = 1 / np.sqrt(grown)
+    return share
 
 
 def _spread(fold: np.ndarray, most: int) -> np.ndarray:
@@ -128,7 +154,7 @@ def _simulated(
         box = eqx.tree_at(lambda b: b.weights, box, box.weights[..., kept])
     e = np.asarray(
         _errors(
-            bench.model, used, arrays, box, jnp.asarray(levels[1]),
+            bench.model, used, contender.stirring, arrays, box, jnp.asarray(levels[1]),
             jnp.asarray(levels[0]), jax.random.key(seed), every, substeps(data.longest) // 2,
         ),
         np.float64,
@@ -171,6 +197,7 @@ def horizons(longest: float, every: int, dt: float) -> list[int]:
 def _errors(
     model: Extended,
     effects: tuple[Effect, ...],
+    stirring: tuple[Effect, ...],
     arrays: Arrays,
     box: BlackBox | None,
     diffusion: Float[Array, "6 R"],
@@ -182,16 +209,21 @@ def _errors(
     """Recorded less simulated: lane 0 without noise, the others with it and that of the records."""
     X, V, u, voltage, step = arrays
     model = model.with_effects(effects)
+    random = model.with_effects(stirring)
     inertia = model.inertia()
     R, S = V.shape[2], 1 + SAMPLES
+    more = random.noise_size - 6
     noisy = (jnp.arange(S)[None, :, None] > 0).astype(V.dtype)
     record = record[:, None] * noisy
     b = diffusion[:, None] * noisy
 
+    stir = jax.vmap(random.stir, -1, -1)  # columns take steps of their own
+
     def kicked(V: Array, w: Array) -> Array:
         M = inertia.inverse
         M = M.reshape(M.shape + (1,) * (4 - M.ndim))
-        return V + jnp.sum(M * (b * w)[None], axis=1)
+        own = random.scaled_diffusion(V, b) if stirring else b
+        return V + jnp.sum(M * (own * w)[None], axis=1)
 
     def read(X: Array, V: Array, w: Array) -> tuple[Array, Array]:
         n = record * w
@@ -199,10 +231,10 @@ def _errors(
         return se3.retract(X, n[:6]), V + n[6:]
 
     def body(carry: Any, given: Any) -> Any:
-        memory, x, v, rate = carry
+        memory, pushes, x, v, rate = carry
         n, X0, V0, X1, V1, command, before, volts, h = given
         dt = h[None, None]
-        draw = jax.random.normal(jax.random.fold_in(key, n), (30, S, R), V.dtype)
+        draw = jax.random.normal(jax.random.fold_in(key, n), (30 + 2 * more, S, R), V.dtype)
         start = read(X0[:, None], V0[:, None], draw[:12])
         fresh = model.infer(*start, rate)
         starts = n % every == 0
@@ -212,18 +244,25 @@ def _errors(
             wide = jnp.broadcast_to(command[:, None], (len(command), S, R))
             late = jnp.broadcast_to(before[:, None], wide.shape)
             push = times(inertia.matrix, box.acceleration(x, v, wide, late))
+        if stirring:
+            w = draw[24:] * noisy  # of which six are left for b dW
+            drawn, _ = random.stir(pushes, x, v, w[: 6 + more], _FOR_EVER)
+            pushes = tuple(jnp.where(starts, a, b) for a, b in zip(drawn, pushes, strict=True))
+            pushes, stirred = stir(pushes, x, v, w[more:], jnp.broadcast_to(h, (R,)))
+            push = stirred if push is None else push + stirred
         memory, x, v, a = advance(
             model, inertia, memory, x, v, command[:, None], dt, coarse, volts[None, None], push
         )
         v = kicked(v, jnp.sqrt(dt) * draw[12:18])
         seen = model.observe(x, v, a)
-        e = difference(*read(*seen, draw[18:]), X1[:, None], V1[:, None])
-        return (memory, x, v, a), e.astype(jnp.float32)
+        e = difference(*read(*seen, draw[18:30]), X1[:, None], V1[:, None])
+        return (memory, pushes, x, v, a), e.astype(jnp.float32)
 
     zero = jnp.zeros((1, S, R), V.dtype)
     rate = ((V[1] - V[0]) / step[:1])[:, None] + zero
     memory = settle(model, u[0][:, None] + zero, step[:1, None], coarse)
-    start = (memory, X[0][:, None] + zero, V[0][:, None] + zero, rate)
+    pushes = random.carried(u[0][:, None] + zero)[1]
+    start = (memory, pushes, X[0][:, None] + zero, V[0][:, None] + zero, rate)
     before = jnp.concatenate([u[:1], u[:-1]])
     xs = (jnp.arange(len(u)), X[:-1], V[:-1], X[1:], V[1:], u, before, voltage, step)
     return jax.lax.scan(body, start, xs)[1]

@@ -116,13 +116,14 @@ def respond(
     def collect() -> None:
         some, z = running.popleft()
         seen = np.moveaxis(z.result(), 2, 0)
-        found[1 + some] = seen[1 : 1 + len(some)].reshape(len(some), steps, -1)
+        found[1 + some] = seen[1 : 1 + len(some)].reshape(-1, *found.shape[1:])
         found[0] = seen[0].reshape(steps, -1)
 
     for instruments in (False, True):
         rows = np.flatnonzero(of_instruments == instruments)
         size = LANES if len(rows) > FEW else FEW
-        for first in range(0, len(rows), size):
+        alone = not len(probes) and not instruments  # the base is asked for in any case
+        for first in range(0, max(len(rows), alone), size):
             some = rows[first : first + size]
             chunk = np.zeros((size + 1, library.size))
             chunk[1 : 1 + len(some)] = probes[some]

@@ -13,7 +13,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from ..models import integrate, se3
 from ..models.dynamics import Dynamics, Flow
-from ..models.effects.extended import Extended
+from ..models.effects.extended import FOR_EVER, Extended
 from ..models.thruster_curves import NEUTRAL
 from ..models.thrusters import Thrusters
 from .jit import VectorFunction, value_or_none, value_or_zeros
@@ -40,9 +40,9 @@ class LearnedPlant(LeafSystem):
     A model with effects (`models.effects.extended.Extended`) is simulated with all of them: those
     on thrusters act on their forces one by one, with the voltage under load (a `F_Bo_B` counts as
     thruster forces of least effort, a disturbance does not pass them); memories and random states
-    are a part of the state, and `noise` takes what random states need besides. `thruster_lag`
-    stands in place of the thrusters' own lag. `X_WB_seen` and `V_WB_B_seen` are pose and twist as
-    effects on instruments show them.
+    are a part of the state, and `noise` takes what random states need besides, which starts them in
+    their stationary law. `thruster_lag` stands in place of the thrusters' own lag. `X_WB_seen` and
+    `V_WB_B_seen` are pose and twist as effects on instruments show them.
 
     .. pydrake_system::
 
@@ -151,7 +151,7 @@ class LearnedPlant(LeafSystem):
         self._carries = [part.size for part in parts]
         if not parts:
             return []
-        start = np.concatenate([np.asarray(part) for part in parts])
+        start = np.concatenate([*(np.asarray(part) for part in parts), np.zeros(1)])
         self.DeclareDiscreteState(BasicVector(start.tolist()))
         return [start.size]
 
@@ -228,8 +228,8 @@ class LearnedPlant(LeafSystem):
         """One period of a model with effects under thruster forces `level` (N)."""
         h = self.period / self.substeps
         structure = jax.tree.structure(effects.carried(level))
-        ends = list(accumulate(self._carries))[:-1]
-        parts = jnp.split(kept, ends) if self._carries else []
+        parts = jnp.split(kept, list(accumulate(self._carries))) if self._carries else [kept]
+        *parts, started = parts
         memory, random = jax.tree.unflatten(structure, parts)
         memory, levels = effects.actuate(memory, level, self.period, self.substeps)
         memory, felt = effects.feel(memory, V, self.period)
@@ -239,11 +239,12 @@ class LearnedPlant(LeafSystem):
             V_r = V
             if (flow := water[s]) is not None:
                 V_r = V - jnp.concatenate([se3.rotate_inverse(X, flow.v_WC_W), jnp.zeros(3)])
-            random, push = effects.stir(random, X, V, noise[s], h)
+            dt = h if s or not self._carries else jnp.where(started[0] > 0, h, FOR_EVER)
+            random, push = effects.stir(random, X, V, noise[s], dt)
             F = effects.push(levels[..., s], X, V_r, volts) + push + F_other
             X, V = integrate.step(body, X, V, F, h, h**0.5 * noise[s, :6], flow)
         left = jax.tree.leaves((memory, random))
-        return X, V, (jnp.concatenate(left),) if left else ()
+        return X, V, (jnp.concatenate([*left, jnp.ones(1)]),) if left else ()
 
     def pure(self) -> Pure:
         """The update as a pure function."""

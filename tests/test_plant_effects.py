@@ -103,7 +103,7 @@ def test_thrust_effects_act_on_thrusters_alone():
 
 
 def test_random_states_live_in_the_plant():
-    """A coloured push after one step of given Gaussians is its law's."""
+    """A coloured push starts in its stationary law and goes on by its own, of given Gaussians."""
     sigma, tau, h = 2.0, 0.5, 0.1
     colour = kind("disturbance_colour").of("sway", std=sigma, time_constant=tau)
     plant = LearnedPlant(extended(colour), h, 1)
@@ -112,8 +112,12 @@ def test_random_states_live_in_the_plant():
     noise = np.zeros(12)
     noise[7] = 1.5  # six of b dW, then one for each axis of the push
     V = fly(plant, h, noise=noise)["V_WB_B"]
-    push = sigma * np.sqrt(1 - np.exp(-2 * h / tau)) * 1.5
-    np.testing.assert_allclose(V, [0, push / MASS * h, 0, 0, 0, 0], rtol=1e-12, atol=1e-15)
+    first = sigma * 1.5
+    np.testing.assert_allclose(V, [0, first / MASS * h, 0, 0, 0, 0], rtol=1e-12, atol=1e-15)
+    V = fly(plant, 2 * h, noise=noise)["V_WB_B"]
+    decay = np.exp(-h / tau)
+    second = decay * first + sigma * np.sqrt(1 - decay**2) * 1.5
+    np.testing.assert_allclose(V[1], (first + second) / MASS * h, rtol=1e-12)
 
 
 def test_instruments_show_what_effects_on_them_make_of_the_state():

@@ -15,6 +15,8 @@ from .base import Effect, Plant
 
 Random = tuple[Array, ...]
 """One array (s, *batch) for each effect with a random state, in the model's order."""
+FOR_EVER = 1e9
+"""A step (s) after which a random state is drawn from its stationary law (`Extended.stir`)."""
 
 
 class Inertia(NamedTuple):
@@ -399,8 +401,9 @@ class Extended(Dynamics):
     ) -> tuple[Float[Array, "T 7 *batch"], Float[Array, "T 6 *batch"]]:
         """States at dt, 2 dt, … under thruster commands (N), each held for a step.
 
-        `w` holds `noise_size` unit Gaussians a step; without it the motion is noise-free. Values of
-        the effects must have no batch axes, or ones that broadcast against the state's.
+        `w` holds `noise_size` unit Gaussians a step, of which the first draw random states from
+        their stationary law; without it the motion is noise-free. Values of the effects must have
+        no batch axes, or ones that broadcast against the state's.
         """
         from .predict import advance
 
@@ -409,10 +412,10 @@ class Extended(Dynamics):
 
         def body(carry: Any, given: Any) -> Any:
             memory, state, X, V = carry
-            u, noise, volts = given
+            u, noise, volts, since = given
             push = None
             if noise is not None:
-                state, push = self.stir(state, X, V, noise, dt)
+                state, push = self.stir(state, X, V, noise, since)
             memory, X, V, _ = advance(self, inertia, memory, X, V, u, dt, 1, volts, push)
             if noise is not None:
                 h = jnp.asarray(dt, V.dtype)
@@ -422,8 +425,9 @@ class Extended(Dynamics):
             return (memory, state, X, V), (X, V)
 
         volts = None if voltage is None else voltage[:, None]
+        since = jnp.full(len(command), dt, V_WB_B.dtype).at[0].set(FOR_EVER)
         start = (memory, state, X_WB, V_WB_B)
-        return jax.lax.scan(body, start, (command, w, volts))[1]
+        return jax.lax.scan(body, start, (command, w, volts, since))[1]
 
     def stir(
         self,

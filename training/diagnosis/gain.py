@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from ...models import se3
 from ...models.effects.base import AXES, Effect
-from ...models.effects.extended import Extended, times
+from ...models.effects.extended import FOR_EVER, Extended, times
 from ...models.effects.predict import advance
 from ..metrics import BANDS, order_statistics
 from . import result
@@ -30,8 +30,6 @@ GROUPS = {"position": slice(0, 3), "rotation": slice(3, 6), "velocity": slice(6,
 HORIZONS = (0.5, 1.0, 2.0, 4.0)
 SAMPLES = 39
 _PIECES = 60
-_FOR_EVER = 1e9
-"""A step (s) after which random states are as likely as they are in the long run."""
 _DRAWS = 400
 
 
@@ -246,7 +244,7 @@ def _errors(
             push = times(inertia.matrix, box.acceleration(x, v, wide, late))
         if stirring:
             w = draw[24:] * noisy  # of which six are left for b dW
-            drawn, _ = random.stir(pushes, x, v, w[: 6 + more], _FOR_EVER)
+            drawn, _ = random.stir(pushes, x, v, w[: 6 + more], FOR_EVER)
             pushes = tuple(jnp.where(starts, a, b) for a, b in zip(drawn, pushes, strict=True))
             pushes, stirred = stir(pushes, x, v, w[more:], jnp.broadcast_to(h, (R,)))
             push = stirred if push is None else push + stirred

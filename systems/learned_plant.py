@@ -1,9 +1,7 @@
 """The vehicle as a discrete-time system around any model of its dynamics."""
 
-from collections.abc import Callable, Sequence
-from itertools import accumulate
+from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -11,9 +9,10 @@ from numpy.typing import ArrayLike
 from pydrake.common import RandomDistribution
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from ..models import integrate, se3
+from ..models import integrate
 from ..models.dynamics import Dynamics, Flow
-from ..models.effects.extended import FOR_EVER, Extended
+from ..models.effects.extended import Extended
+from ..models.effects.stepping import Stepper
 from ..models.thruster_curves import NEUTRAL
 from ..models.thrusters import Thrusters
 from .jit import VectorFunction, value_or_none, value_or_zeros
@@ -94,12 +93,10 @@ class LearnedPlant(LeafSystem):
         self._F_disturbance = self.DeclareVectorInputPort("F_disturbance_Bo_B", 6)
         self._flow = self.DeclareVectorInputPort("flow_W", 6)
         gaussian = RandomDistribution.kGaussian
-        if isinstance(dynamics, Extended):
-            dynamics = dynamics.for_steps_of(period)
         model = integrate.cast(dynamics, jnp.float64)
-        self._model = model if isinstance(model, Extended) else None
-        self._gaussians = 6 if self._model is None else self._model.noise_size
-        draws = self._gaussians * substeps
+        extended = isinstance(model, Extended)
+        self._effects = effects = Stepper(model, period, substeps) if extended else None
+        draws = substeps * (6 if effects is None else effects.gaussians)
         self._noise = self.DeclareVectorInputPort("noise", draws, gaussian)
         self._X = self.DeclareDiscreteState(BasicVector(X0.tolist()))
         self._V = self.DeclareDiscreteState(BasicVector(V0.tolist()))
@@ -113,7 +110,10 @@ class LearnedPlant(LeafSystem):
         self._thrusters = None if thrusters is None else integrate.cast(thrusters, jnp.float64)
         bank = self._declare_thrusters(self._thrusters) if self._thrusters is not None else []
 
-        carried = self._declare_carried()
+        carried = []
+        if effects is not None and effects.start.size:
+            self.DeclareDiscreteState(BasicVector(np.array(effects.start, float).tolist()))
+            carried = [effects.start.size]
 
         sizes = [7, 6, 6, 6, draws, *bank, *carried]
         results = [7, 6, 6, 1, *bank[2:], *carried]
@@ -123,13 +123,11 @@ class LearnedPlant(LeafSystem):
 
     def _declare_seen(self) -> None:
         """Add the ports that show the state as effects on instruments have it."""
-        model = self._model
-        self._instruments = model is not None and any(e.acts("measure") for e in model.effects)
-        if not self._instruments:
+        if self._effects is None or not self._effects.reads:
             self.DeclareStateOutputPort("X_WB_seen", self._X)
             self.DeclareStateOutputPort("V_WB_B_seen", self._V)
             return
-        see = VectorFunction(self._seen, [7, 6, 6], [7, 6])
+        see = VectorFunction(self._effects.model.observe, [7, 6, 6], [7, 6])
         for name, size, part in (("X_WB_seen", 7, slice(0, 7)), ("V_WB_B_seen", 6, slice(7, 13))):
 
             def show(context: Context, output: BasicVector, part: slice = part) -> None:
@@ -137,23 +135,6 @@ class LearnedPlant(LeafSystem):
                 output.SetFromVector(see.flat(*(state.value(i) for i in range(3)))[part])
 
             self.DeclareVectorOutputPort(name, size, show, {self.xd_ticket()})
-
-    def _seen(self, X: Array, V: Array, A: Array) -> tuple[Array, Array]:
-        assert self._model is not None
-        return self._model.observe(X, V, A)
-
-    def _declare_carried(self) -> list[int]:
-        """Add the state of effects with memory or chance; its size, if there is any."""
-        self._carries: list[int] = []
-        if self._model is None:
-            return []
-        parts = jax.tree.leaves(self._model.carried(jnp.zeros(self._model.inverse.shape[0])))
-        self._carries = [part.size for part in parts]
-        if not parts:
-            return []
-        start = np.concatenate([*(np.asarray(part) for part in parts), np.zeros(1)])
-        self.DeclareDiscreteState(BasicVector(start.tolist()))
-        return [start.size]
 
     def _declare_thrusters(self, thrusters: Thrusters) -> list[int]:
         """Add the thrusters' ports and state; sizes of pwm, of voltage, and of the state."""
@@ -178,8 +159,8 @@ class LearnedPlant(LeafSystem):
         period, substeps, thrusters = self.period, self.substeps, self._thrusters
         h = period / substeps
 
-        effects = self._model
-        lags = effects is None or all(e.name != "thruster_lag" for e in effects.effects)
+        effects = self._effects
+        lags = effects is None or not effects.lags
 
         def turn(pwm: Array, voltage: Array, bank: Array) -> tuple[Array, Array]:
             """The thrusters' mean forces over the period and their state at its end."""
@@ -210,52 +191,27 @@ class LearnedPlant(LeafSystem):
                     X, V = integrate.step(model, X, V, F, h, h**0.5 * noise[s], water[s])
                 carried = ()
             else:
-                level = effects.inverse @ F if force is None else effects.inverse @ F + force
+                level = effects.model.inverse @ F
+                level = level if force is None else level + force
                 volts = bank[0][-1:] / self._nominal if bank else None
-                kept = more[-1] if self._carries else jnp.zeros(0)
-                X, V, carried = self._stirred(
-                    effects, X, V, kept, level, volts, F_disturbance, noise, water
-                )
+                kept = more[-1] if effects.start.size else jnp.zeros(0)
+                X, V, kept = effects(X, V, kept, level, volts, F_disturbance, noise, water)
+                carried = (kept,) if effects.start.size else ()
             finite = jnp.all(jnp.isfinite(jnp.concatenate([X, V])))
             return X, V, (V - start) / period, finite.astype(V.dtype), *bank, *carried
 
         return advance
 
-    def _stirred(
-        self, effects: Extended, X: Array, V: Array, kept: Array, level: Array,
-        volts: Array | None, F_disturbance: Array, noise: Array, water: Sequence[Flow | None],
-    ) -> tuple[Array, Array, tuple[Array, ...]]:  # fmt: skip
-        """One period of a model with effects under thruster forces `level` (N)."""
-        h = self.period / self.substeps
-        structure = jax.tree.structure(effects.carried(level))
-        parts = jnp.split(kept, list(accumulate(self._carries))) if self._carries else [kept]
-        *parts, started = parts
-        memory, random = jax.tree.unflatten(structure, parts)
-        memory, levels = effects.actuate(memory, level, self.period, self.substeps)
-        memory, felt = effects.feel(memory, V, self.period)
-        F_other = F_disturbance if felt is None else F_disturbance + felt
-        body = effects.body
-        for s in range(self.substeps):
-            V_r = V
-            if (flow := water[s]) is not None:
-                V_r = V - jnp.concatenate([se3.rotate_inverse(X, flow.v_WC_W), jnp.zeros(3)])
-            dt = h if s or not self._carries else jnp.where(started[0] > 0, h, FOR_EVER)
-            random, push = effects.stir(random, X, V, noise[s], dt)
-            F = effects.push(levels[..., s], X, V_r, volts) + push + F_other
-            X, V = integrate.step(body, X, V, F, h, h**0.5 * noise[s, :6], flow)
-        left = jax.tree.leaves((memory, random))
-        return X, V, (jnp.concatenate([*left, jnp.ones(1)]),) if left else ()
-
     def pure(self) -> Pure:
         """The update as a pure function."""
         still = {"F_Bo_B": np.zeros(6), "F_disturbance_Bo_B": np.zeros(6)}
-        still["noise"] = np.zeros(self._gaussians * self.substeps)
+        still["noise"] = np.zeros(self._noise.size())
         outputs = {name: shown(i) for i, name in enumerate(("X_WB", "V_WB_B", "A_WB_B"))}
+        effects = self._effects
         for i, name in enumerate(("X_WB_seen", "V_WB_B_seen")):
-            seen = shown(i)
-            if self._instruments:
-                seen = lambda state, _, i=i: self._seen(*state[:3])[i]  # noqa: E731
-            outputs[name] = seen
+            outputs[name] = shown(i)
+            if effects is not None and effects.reads:
+                outputs[name] = lambda state, _, i=i: effects.model.observe(*state[:3])[i]
         outputs["state"] = lambda state, _: jnp.concatenate(state[:2])
         if self._thrusters is not None:
             n = self._neutral.size
@@ -324,6 +280,8 @@ class LearnedPlant(LeafSystem):
         names = ["X_WB", "V_WB_B", "F_Bo_B", "F_disturbance_Bo_B", "noise"]
         if self._thrusters is not None:
             names += ["pwm", "voltage", "thruster_force"]
+        if self._effects is not None and self._effects.start.size:
+            names.append("effects")
         told = dict(zip([*names, "flow_W"], parts, strict=False))
         bad = [name for name, part in told.items() if not np.all(np.isfinite(part))]
         cause = (

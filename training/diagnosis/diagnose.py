@@ -37,6 +37,8 @@ Refit = Literal["none", "scales", "linear", "command", "all"]
 _MOST_UNKNOWN = 2
 _RESAMPLED, _OF_A_STEP = 0.02, 0.1
 """Nats a sample that a law, and share of a step that a time must have, in resampled data."""
+_FINEST = 0.02
+"""Steps (s) of data that the extended model will be used on at least: delays are told by them."""
 _OF_NAMES = 1e-3
 """Share of what all names win that a law must win besides."""
 _LAW_MARGIN = 5.0
@@ -186,7 +188,7 @@ class Diagnoser:
             bench.model.base,
             (*bench.library.used(final.theta), *stirring),
             bench.vehicle.thrusters(),
-        )
+        ).for_steps_of(_FINEST)
         return Finding(
             diagnosis, extended, bench.library, final.theta, d, base, final, found.fits, laws
         )

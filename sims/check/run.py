@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from ...models.errors import UserError
 from ...models.files import atomic_path
 from ..progress import Update
@@ -14,6 +16,8 @@ from .judging import judge
 from .rivals import compete, pysindy
 
 _DONE, _RIVALS = "judged.json", "rivals.json"
+_KEPT = 25
+"""Cases after which compiled programs are given back: a process can map only so many of them."""
 
 
 def run_cases(
@@ -32,7 +36,7 @@ def run_cases(
     Raises:
         UserError: a case can't be read, or was judged with another alpha; pysindy is not there.
     """
-    found = []
+    found, fresh = [], 0
     if rivals:
         pysindy()  # now, not after the first case
     for number, case in enumerate(cases):
@@ -43,6 +47,9 @@ def run_cases(
             def tell(fraction: float, remark: str = "", n: int = number, case: Case = case) -> None:
                 progress((n + fraction) / len(cases), f"{case.name}: {remark}")
 
+            fresh += 1
+            if fresh % _KEPT == 0:
+                jax.clear_caches()
             judged, finding = judge(case, alpha, tell)
             finding.diagnosis.save(folder / "diagnosis.json")
             _write(at, {"alpha": alpha, **judged.plain()})

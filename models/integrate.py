@@ -89,7 +89,7 @@ def rollout(
         F, dW_step, push_step = inputs
         F, late = shaped(F), None
         if dynamics.remembers:
-            memory, late = dynamics.arriving(memory, F, V, dt, count)
+            memory, late = dynamics.arriving(memory, jnp.broadcast_to(F, V.shape), V, dt, count)
         for s in range(count):
             F_s = F if late is None else late[..., s]
             F_s = F_s if push_step is None else F_s + push_step[s]
@@ -97,7 +97,9 @@ def rollout(
         return (X, V, memory), (X, V)
 
     body = jax.checkpoint(advance) if remat else advance
-    memory = dynamics.commanded(shaped(F_Bo_B[0])) if dynamics.remembers else ()
+    memory = ()
+    if dynamics.remembers:
+        memory = dynamics.commanded(jnp.broadcast_to(shaped(F_Bo_B[0]), V_WB_B.shape))
     _, (Xs, Vs) = jax.lax.scan(body, (X_WB, V_WB_B, memory), (F_Bo_B, dW, push))
     return Xs, Vs
 

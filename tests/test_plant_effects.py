@@ -1,5 +1,6 @@
 """Effects of an extended model act in the plant, in rollouts and in the planner."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +15,7 @@ from thruster_examples import prompt_thrusters
 from spinndrift.models import integrate, se3
 from spinndrift.models.effects.extended import Extended
 from spinndrift.models.effects.library import kind
+from spinndrift.models.effects.unknown import Unknown
 from spinndrift.models.rigid_body import FossenDynamics
 from spinndrift.systems.compiled import CompiledSimulator
 from spinndrift.systems.learned_plant import LearnedPlant
@@ -84,6 +86,19 @@ def test_rollouts_remember(name):
     )
     more = 2 * PUSH / MASS * BEHIND[name]((count - 4) * dt)
     np.testing.assert_allclose(V[-1, 0], PUSH / MASS * count * dt + more, rtol=1e-9)
+
+
+def test_one_command_serves_many_states_that_remember():
+    """Rollouts of a batch under one wrench are those of each state alone."""
+    memory = Unknown.neutral(kind="memory", acts_on="surge", numbers=(0.5, 0.3))
+    memory = eqx.tree_at(lambda e: e.values, memory, jnp.array([-2.0, -3.0, 1.0]))
+    model, rng = extended(LAG, LATE, memory), np.random.default_rng(0)
+    F = jnp.asarray(rng.normal(size=(8, 6)))
+    V = jnp.asarray(rng.normal(size=(6, 3)))
+    X = jnp.broadcast_to(se3.identity(jnp.float64)[:, None], (7, 3))
+    together = integrate.rollout(model, X, V, F, 0.05, substeps=2)[1]
+    alone = [integrate.rollout(model, X[:, i], V[:, i], F, 0.05, substeps=2)[1] for i in range(3)]
+    np.testing.assert_allclose(together, np.stack(alone, axis=-1), rtol=1e-10, atol=1e-12)
 
 
 def test_thrust_effects_act_on_thrusters_alone():

@@ -41,7 +41,7 @@ class ActuationDelay(Effect):
 
     def for_steps_of(self, dt: float) -> "ActuationDelay":
         values = np.asarray(self.values, float)
-        longest = float(np.max(values[:1] + np.concatenate([np.zeros(1), values[1:]])))
+        longest = float(values[0] + max(values[1:].max(), 0.0))
         return dataclasses.replace(self, steps=max(math.ceil(longest / dt - 1e-9), 0) + 1)
 
     def actuate(

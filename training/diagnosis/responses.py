@@ -127,7 +127,8 @@ def respond(
             some = rows[first : first + size]
             chunk = np.zeros((size + 1, library.size))
             chunk[1 : 1 + len(some)] = probes[some]
-            effects = _values(library, theta, chunk, instruments)
+            lanes = library.filled((theta + chunk).T[:, :, None])
+            effects = _of_family(lanes, believed, instruments)
             arguments = predictions, arrays, filters, size + 1, instruments
             call = _threads().submit(run, model, effects, believed, *arguments)
             running.append((some, call))
@@ -138,12 +139,10 @@ def respond(
     return found
 
 
-def _values(
-    library: Library, theta: np.ndarray, chunk: np.ndarray, instruments: bool
+def _of_family(
+    lanes: tuple[Effect, ...], alike: tuple[Effect, ...], instruments: bool
 ) -> tuple[Effect, ...]:
-    """Effects whose values differ from lane to lane where the chunk asks for it."""
-    lanes = library.filled((theta + chunk).T[:, :, None])
-    alike = library.filled(theta[:, None, None])
+    """Effects whose values differ from lane to lane, those of the other family alike in all."""
     return tuple(
         a if (a.family == "measurement") == instruments else b
         for a, b in zip(lanes, alike, strict=True)

@@ -29,8 +29,7 @@ from .write import STATE, write_folder
 
 FRESH = 7_000_000
 """Added to a case's seed for the runs that the diagnosis never sees."""
-EVERY = 20
-"""Samples of a window of forecasts: 1 s at 20 Hz."""
+WINDOW = 1.0  # s, of forecasts
 SCALES = {
     "tiny": (Plan(scenarios=5, runs=1, seconds=6.0), 1),
     "small": (Plan(scenarios=10, runs=3, seconds=10.0), 10),
@@ -42,8 +41,13 @@ DATA: dict[str, Callable[[Plan], Plan]] = {
     "closed": lambda plan: replace(plan, loop="closed"),
     "uneven": lambda plan: replace(plan, even=False),
     "minute": Plan.short,
+    "slow": lambda plan: replace(plan, rate=10.0),
+    "fast": lambda plan: replace(plan, rate=50.0),
+    "long": lambda plan: replace(plan, scenarios=10, runs=1, seconds=60.0, loop="closed"),
+    "pwm": lambda plan: replace(plan, form="pwm"),
 }
-"""How it is recorded: commands played, a pilot in closed loop, uneven time steps, 60 s in all."""
+"""How it is recorded: commands played, a pilot in closed loop, uneven time steps, 60 s in all, at
+10 or 50 Hz, a pilot's runs of a minute each, commands as PWM with each run's voltage."""
 NOMINAL = (*(float(b) for b in disturbance.NOMINAL_DIFFUSION),)
 
 
@@ -85,7 +89,7 @@ class Blind:
             "data": self.data,
             "causes": [told(e) for e in case.effects],
             "diffusion": list(NOMINAL),
-            "every": EVERY,
+            "every": every(case),
             "problems": problems,
             "limits": limits,
         }
@@ -111,6 +115,11 @@ def has_mean(effect: Effect) -> bool:
     return not isinstance(effect, scatter) and not effect.cause.startswith("disturbance")
 
 
+def every(case: Case) -> int:
+    """Samples of a window."""
+    return round(WINDOW * case.plan.rate)
+
+
 def label(effect: Effect) -> str:
     return getattr(effect, "kind", "") or effect.cause
 
@@ -118,9 +127,9 @@ def label(effect: Effect) -> str:
 def write_oracle(folder: Path, case: Case, truth: Any) -> None:
     """A file a run: what the true model expects to be recorded, from each window's first record."""
     folder.mkdir(parents=True)
-    steps = truth.t.shape[0] - 1
-    starts = range(0, steps - EVERY + 1, EVERY)
-    seen = predict(case, truth, list(starts), EVERY)
+    steps, window = truth.t.shape[0] - 1, every(case)
+    starts = range(0, steps - window + 1, window)
+    seen = predict(case, truth, list(starts), window)
     for b in range(truth.t.shape[1]):
         X, V = [truth.X[:1, :, b]], [truth.V[:1, :, b]]
         for k in range(len(starts)):

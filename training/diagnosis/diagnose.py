@@ -15,12 +15,15 @@ from ...models.effects.base import Effect
 from ...models.effects.extended import Extended
 from ...models.effects.library import Library
 from ...models.effects.thrust import AxisThrust
+from ...models.errors import UserError
 from ...models.recording import Recording
 from ...models.vehicle import Vehicle
 from . import result, telling
 from .blackbox import train
 from .checks import limits, problems, unexcited
 from .data import Data
+from .disturbance import LEVEL, OF_OTHERS, all_laws, best_law, is_apart
+from .disturbance import told as told_laws
 from .gain import Contender, judge, told, white_part
 from .hypotheses import Fit
 from .identify import identify, with_coefficients
@@ -28,19 +31,18 @@ from .laws import Law
 from .looking import Bench, Look
 from .naming import Hypothesis, parameters_of
 from .ratios import ratios
-from .search import RIVALS, Found, Search, best_law, refitted
+from .search import Found, Search, refitted
 from .unknowns import accept, seek, structure
-from .waves import all_laws, is_apart
 
 Progress = Callable[[float, str], None]
 Refit = Literal["none", "scales", "linear", "command", "all"]
 _MOST_UNKNOWN = 2
+_RIVALS = 0.25
+"""Share of what the best law wins below which names leave it to structure without a name."""
 _RESAMPLED, _OF_A_STEP = 0.02, 0.1
 """Nats a sample that a law, and share of a step that a time must have, in resampled data."""
 _FINEST = 0.02
 """Steps (s) of data that the extended model will be used on at least: delays are told by them."""
-_OF_NAMES = 1e-3
-"""Share of what all names win that a law must win besides."""
 _LAW_MARGIN = 5.0
 """Nats above the threshold of names that a law must win: it is tried on a grid on every axis."""
 
@@ -124,7 +126,7 @@ class Diagnoser:
         self.progress(0.02, "one-step predictions")
         if config.refit == "all":
             bench = self.bench = with_coefficients(bench)
-        base = first = bench.look(bench.believed)
+        base = first = self._believed(bench)
         nuisance = refitted(bench, config.refit)
         if nuisance:
             first = self._refitted(bench)
@@ -142,11 +144,11 @@ class Diagnoser:
         if self.resampled:  # interpolation makes the noise uneven
             least += _RESAMPLED * bench.data.steps
         # what the names leave of their own is no law
-        least = max(least, _OF_NAMES * sum(choice.fit.heldout_gain for choice, _ in found.accepted))
+        least = max(least, OF_OTHERS * sum(choice.fit.heldout_gain for choice, _ in found.accepted))
         laws = [] if final.noise.estimated else all_laws(bench, final, least)
         passing = [law for law in laws if law.heldout_gain > least and is_apart(law, bench)]
-        structured = [law for law in passing if law.name != "disturbance_level"]
-        passing = structured or passing
+        groups = told_laws(passing, bench, final)
+        shaped = [law for group in groups for law in group if law.name != LEVEL]
         tested = len(found.fits) + len(laws)
         causes, stirring = [], []
         if joint is not None:
@@ -154,9 +156,12 @@ class Diagnoser:
                 telling.cause(*a, bench, final, joint, tested, structures.get(a[0].hypothesis))
                 for a in found.accepted
             ]
-        more, stirring = telling.law_causes(passing, bench, final)
-        causes += more
-        gain = self._gain(bench, found, fitted, rows, passing, tuple(stirring), bool(causes))
+        for group in groups:
+            rivals = [law for law in passing if law.name != group[0].name]
+            law_cause, effect = telling.law_cause(group, rivals, bench, final)
+            causes.append(law_cause)
+            stirring.append(effect)
+        gain = self._gain(bench, found, fitted, rows, shaped, tuple(stirring), bool(causes))
         d = bench.data
         diagnosis = result.Diagnosis(
             version=result.VERSION,
@@ -192,6 +197,16 @@ class Diagnoser:
         return Finding(
             diagnosis, extended, bench.library, final.theta, d, base, final, found.fits, laws
         )
+
+    def _believed(self, bench: Bench) -> Look:
+        try:
+            return bench.look(bench.believed)
+        except FloatingPointError as error:
+            raise UserError(
+                f"{error} within a step of {bench.data.longest:.3g} s from recorded states: the "
+                "believed model is unstable on these data; check units of commands and twists, or "
+                "give a --vehicle or --model that is near"
+            ) from error
 
     def _refitted(self, bench: Bench) -> Look:
         """The belief with the coefficients fitted that are asked for."""
@@ -235,21 +250,22 @@ class Diagnoser:
         found.fits = found.left
         best = 0.0 if choice is None else choice.fit.heldout_gain
         law = best_law(bench, found.first)
-        if RIVALS * law < max(best, found.threshold + _LAW_MARGIN):
-            search.run(found)
+        if _RIVALS * law < max(best, found.threshold + _LAW_MARGIN):
+            bench = search.run(found).bench
         for number in range(_MOST_UNKNOWN):
             self.progress(0.52 + 0.1 * number, "structure without a name")
             seen = seek(bench, nuisance, found, config.alpha, self.rng)
             taken = {h[1] for h in found.hypotheses if h[0] == "unknown"}
             if seen is None or seen.matched.group.effect.acts_on in taken:
                 if number == 0 and not found.accepted:
-                    search.run(found)
+                    bench = search.run(found).bench
                 break
             bench = accept(bench, nuisance, found, seen, self.rng)
             nuisance = refitted(bench, config.refit)
             where = found.hypotheses[-1][1]
             structures["unknown", where] = structure(bench, where, found.current.theta, seen)
-            self._names(bench, nuisance, 0.55 + 0.1 * number, 0.6 + 0.1 * number).run(found)
+            again = self._names(bench, nuisance, 0.55 + 0.1 * number, 0.6 + 0.1 * number)
+            bench = again.run(found).bench
         return bench, nuisance, structures
 
     def _gain(
@@ -280,12 +296,11 @@ class Diagnoser:
         contenders["refitted"] = Contender(bench.without_each(look, belief))
         if extended:
             won = np.zeros(R)
-            best = [law for law in laws if law.name == laws[0].name and len(law.heldout) == R]
-            for law in best:
-                won += law.heldout
-            white = white_part([law for law in laws if law.name == laws[0].name], bench)
+            for law in laws:
+                won += law.heldout if len(law.heldout) == R else 0.0
+            white = white_part(laws, bench)
             # the level is estimated for every contender
-            laws_of_it = tuple(e for e in stirring if e.name != "disturbance_level")
+            laws_of_it = tuple(e for e in stirring if e.name != LEVEL)
             contenders["extended"] = Contender(
                 bench.without_each(fitted, rows), won=won, stirring=laws_of_it, white=white
             )

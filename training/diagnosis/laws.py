@@ -36,6 +36,7 @@ class Law:
 
 Told = tuple[np.ndarray, dict[str, float], Callable[[np.ndarray], np.ndarray]]
 """Held-out gain by piece, the best numbers, and the loss as a function of their logarithms."""
+_GROWTHS = np.geomspace(0.05, 1000.0, 48)
 _KAPPAS = (0.004, 0.01, 0.02, 0.04, 0.08, 0.15, 0.3)
 
 
@@ -92,7 +93,7 @@ def speed_dependence(
     fold: Int[np.ndarray, " R"],
 ) -> Told:
     """Gain of the variance s² (1 + k |v|²) over a constant one."""
-    growth = np.concatenate([[0.0], np.geomspace(0.05, 200.0, 40)])
+    growth = np.concatenate([[0.0], _GROWTHS])
 
     def at(k: float) -> np.ndarray:
         shape = 1 + k * speed**2
@@ -102,6 +103,25 @@ def speed_dependence(
     losses = np.array([at(k) for k in growth])
     held, best = _held_out(losses, fold)
     return losses[0] - held, {"growth": float(growth[best])}, lambda logs: at(np.exp(logs[0]))
+
+
+def growth_alone(
+    z: Float[np.ndarray, "N R"],
+    speed: Float[np.ndarray, "N R"],
+    weight: Float[np.ndarray, "N R"],
+    rest: float,
+) -> float:
+    """Nats by which growth from the variance rest², of one free number, is better than any s².
+
+    As 1 + k |v|² or as (1 + k |v|)², whichever is better.
+    """
+
+    def loss(s2: np.ndarray) -> float:
+        return float(((z**2 / s2 + np.log(s2)) / 2 * weight).sum())
+
+    alone = loss(np.full_like(z, (z**2 * weight).sum() / weight.sum()))
+    shapes = [1 + k * speed**2 for k in _GROWTHS] + [(1 + k * speed) ** 2 for k in _GROWTHS]
+    return alone - min(loss(rest**2 * shape) for shape in shapes)
 
 
 def colour(

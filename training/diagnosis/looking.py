@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ...models.dynamics import Dynamics
 from ...models.effects.base import AXES, XYZ, Effect
@@ -16,6 +16,7 @@ from ...models.effects.library import KINDS, Library
 from ...models.recording import Recording
 from ...models.rigid_body import FossenDynamics
 from ...models.vehicle import Vehicle
+from .beside import Beside
 from .data import Data, make_data
 from .gram import gram
 from .hypotheses import Design, Evidence, Fit
@@ -31,6 +32,8 @@ _RANDOM = ("waves", "current_varying")
 _DRAG = ("linear_drag", "quadratic_drag")
 _HALVINGS = 4
 """Steps that may fail before a fit ends."""
+_WILD = 1e3
+"""m, rad, m/s, rad/s, and slopes, beyond which a prediction over one step has diverged."""
 _WORSE = 20.0
 """Nats by which one-step errors may become less likely: the filter weighs them otherwise."""
 _LATEST, _STEPS = 0.25, (6, 16)
@@ -40,13 +43,17 @@ _LIGHTEST = 0.1
 
 
 class Look(NamedTuple):
-    """All that one set of parameters shows; `z` are the whitened innovations as they are."""
+    """All that one set of parameters shows; `z` are the whitened innovations as they are.
+
+    `evidence` is beside the bench's random structure, `plain` without it.
+    """
 
     theta: Float[np.ndarray, " p"]
     predictions: Predictions
     noise: Noise
     kalman: Filter
     evidence: Evidence
+    plain: Evidence
     z: Float[np.ndarray, "N 12 R"]
     loss: float
 
@@ -62,6 +69,7 @@ class Bench:
         library: every effect that may explain a difference.
         believed: θ of the belief: zero but for effects that it holds already (p,).
         bounds: ranges of parameters that are narrower than those of their effects.
+        beside: a random structure beside which parameters are fitted and causes judged.
     """
 
     data: Data
@@ -70,6 +78,7 @@ class Bench:
     library: Library
     believed: Float[np.ndarray, " p"]
     bounds: Mapping[tuple[str, str, str], tuple[float, float]] = field(default_factory=dict)
+    beside: Beside | None = None
 
     @classmethod
     def of(
@@ -185,9 +194,14 @@ class Bench:
         design = Design.of(self.library, theta, chosen)
         z = respond(self.model, self.library, theta, design.probes, self.data, p, kalman)
         data = self.data
-        evidence = Evidence(self.library, theta, design, gram(z), data.cluster, data.fold)
+
+        def evidence(products: np.ndarray) -> Evidence:
+            return Evidence(self.library, theta, design, products, data.cluster, data.fold)
+
+        plain = evidence(gram(z))
+        judged = plain if self.beside is None else evidence(self.beside.products(z))
         own_z = z[0].reshape(len(data.u), 12, -1) * np.sqrt(kalman.memory)[:, None]
-        return Look(theta, p, noise, kalman, evidence, own_z, float(evidence.total[0, 0]) / 2)
+        return Look(theta, p, noise, kalman, judged, plain, own_z, float(judged.total[0, 0]) / 2)
 
     def polish(
         self,
@@ -200,11 +214,12 @@ class Bench:
         """Gauss–Newton on the parameters chosen, with exact predictions at every step.
 
         A step that makes one-step errors clearly larger is halved; so is the way to the start from
-        `origin`, if one is given. The fit returned is at the θ returned: its errors are joint,
-        clustered by run.
+        `origin`, if one is given. Drag stays passive. The fit returned is at the θ returned: its
+        errors are joint, clustered by run.
         """
         chosen = list(chosen)
         low, high = self.limits(chosen)
+        low = np.maximum(low, np.minimum(self.passive(chosen), self.believed[chosen]))
         theta = theta.copy()
         theta[chosen] = np.clip(theta[chosen], low, high)
         best: tuple[np.ndarray, Look, Fit] | None = None
@@ -275,7 +290,8 @@ class Bench:
         """θ of each piece, the parameters chosen refitted without the pieces it is left out with.
 
         One Gauss–Newton step from the fit to all data, which is exact to first order in what a
-        fold weighs; values stay in their admissible range.
+        fold weighs; values stay in their admissible range, and steps whose predictions diverge are
+        halved.
         """
         data, chosen = self.data, list(chosen)
         theta = np.repeat(look.theta[:, None], len(data.fold), axis=1)
@@ -290,7 +306,22 @@ class Bench:
             change = -np.linalg.solve(T[np.ix_(columns, columns)] + prior, T[columns, 0])
             values = np.clip(look.theta[chosen] + change, low, high)
             theta[np.ix_(chosen, data.fold == label)] = values[:, None]
+        for share in (*(0.5 for _ in range(_HALVINGS)), 1.0):
+            wild = np.isin(data.fold, data.fold[self._wild(theta)])
+            if not wild.any():
+                break
+            theta[:, wild] += share * (look.theta[:, None] - theta[:, wild])
         return theta
+
+    def _wild(self, theta: Float[np.ndarray, "p R"]) -> Bool[np.ndarray, " R"]:
+        """Pieces whose predictions diverge, each under its own θ."""
+        p = predict(self.model, self.library, theta, self.data)
+        here = self.data.weight > 0
+        sizes = (
+            np.abs(np.asarray(a)).max(axis=(1, *range(2, a.ndim - 1)))
+            for a in (p.error, p.jacobian)
+        )
+        return np.any([np.any(~(size < _WILD) & here, axis=0) for size in sizes], axis=0)
 
 
 def mass(

@@ -18,9 +18,11 @@ from jaxtyping import Float, Int
 
 FLOOR = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4] * 3 + [1e-5] * 3)
 """Least standard deviation of a record: m, rad, m/s, rad/s."""
-_SMOOTH, _SMOOTH_OF_ALL, _NEAR = 4, 8, 3.0
+_SMOOTH, _SMOOTH_OF_ALL, _NEAR, _ALIKE = 4, 8, 3.0, 0.1
 """States count as estimated from so many axes of the twist without errors of their own, or from so
-many of pose and twist whose errors are within so many times the least."""
+many of pose and twist whose errors are within so many times the least, if neighbouring errors of
+these axes are correlated that much. States that are known exactly have none of that correlation,
+nor has what noise hides."""
 _LONGEST = 0.98
 """Largest correlation of neighbouring errors that is believed."""
 _EVEN, _NODES = 1e-6, 8
@@ -112,8 +114,9 @@ def estimate(
         C.append(np.einsum("nir,njr->ij", a, b) / max(w.sum(), 1.0))
     R = np.diag(-np.linalg.solve(A, C[1] - C[2]))
     variance = np.maximum(R, FLOOR**2)
-    near = R <= (_NEAR * FLOOR) ** 2
-    if np.sum(R[6:] <= FLOOR[6:] ** 2) >= _SMOOTH or np.sum(near) >= _SMOOTH_OF_ALL:
+    alike = np.diag(C[1]) > _ALIKE * np.diag(C[0])
+    none, near = (alike & ((times * FLOOR) ** 2 >= R) for times in (1.0, _NEAR))
+    if np.sum(none[6:]) >= _SMOOTH or np.sum(near) >= _SMOOTH_OF_ALL:
         return _of_estimates(C[0], C[1], variance, A, mass, dt)
     C0 = C[0] - (C[2] + C[2].T) / 2
     Q = C0 - np.diag(variance) - A * variance @ A.T

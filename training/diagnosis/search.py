@@ -1,18 +1,20 @@
 """Which causes are there together: forward selection with exact refits, and checks backwards."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from ...models.effects.library import Library, kind
+from .beside import Beside
+from .disturbance import SLOW, laws_of, won_by
 from .hypotheses import Fit
 from .identify import coefficients
-from .laws import Law, find_laws, run_constants
 from .looking import Bench, Look
 from .naming import Choice, Hypothesis, admissible, choose, margin, parameters_of
 from .noise import Filter
+from .waves import beside_laws
 
 BELIEFS = ("added_mass", "linear_drag", "quadratic_drag", "net_buoyancy")
 """Coefficients that a user would expect fitted."""
@@ -22,8 +24,6 @@ REFITS = {"none": (), "scales": ("thrust_scale",), "linear": BELIEFS, "command":
 _TIMES = ("thruster_lag", "actuation_delay", "clock_offset")
 _CLOSE = 0.7
 _TAKEN_BACK = 2
-RIVALS = 0.25
-"""Share of what the best law wins on data left out that no imitation of random structure wins."""
 _OF_A_LAW = 0.02
 """Share of what the best law wins that a name must win where the law wins more."""
 _OF_ESTIMATES = 0.05
@@ -66,31 +66,6 @@ def refitted(bench: Bench, refit: str) -> list[int]:
     return [i for i, e in enumerate(bench.library.entries) if e.cause in REFITS[refit]]
 
 
-def laws_of(bench: Bench, look: Look) -> list[Law]:
-    """Laws of the disturbance in what is left, largest gain first.
-
-    None where states were estimated: errors of an estimator are no disturbance.
-    """
-    if look.noise.estimated:
-        return []
-    data = bench.data
-    speed = np.linalg.norm(data.V[:-1, :3], axis=1)
-    found = find_laws(look.z.astype(float), speed, data.weight, data.fold, data.dt)
-    rows = bench.library.at("current_steady", "W")
-    evidence = look.evidence
-    if set(rows) <= set(evidence.design.owner.tolist()) and len(evidence.runs) > 2:
-        columns = [evidence.column(i) for i in rows]
-        sizes = np.array([bench.library.entries[i].parameter.probes[0] for i in rows])
-        gain, values, loss = run_constants(evidence.runs, columns, sizes, evidence.fold)
-        found.append(Law("current_varying", "W", values, gain, loss))
-    return sorted(found, key=lambda law: -law.heldout_gain)
-
-
-def best_law(bench: Bench, look: Look) -> float:
-    """What the best law of the disturbance wins on data left out (nats)."""
-    return max((law.heldout_gain for law in laws_of(bench, look)), default=0.0)
-
-
 class Search:
     """Forward selection on a bench; `rng` draws what noise alone can win."""
 
@@ -117,8 +92,8 @@ class Search:
         self.shortest = shortest
         self._asked: tuple[Look, tuple[Choice | None, dict[Hypothesis, Fit]]] | None = None
 
-    def run(self, found: Found) -> Found:
-        """Add causes until none passes; all accepted are refitted together.
+    def run(self, found: Found) -> "Search":
+        """Add causes to `found` until none passes; all accepted are refitted together.
 
         Where exact fits take back what was added `_TAKEN_BACK` times in a row, what names promise
         is not to be had: the rest of them is not tried.
@@ -138,7 +113,7 @@ class Search:
             taken_back = taken_back + 1 if choice.hypothesis in found.dropped else 0
             if taken_back == _TAKEN_BACK:
                 break
-        return found
+        return self
 
     def next(self, found: Found) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
         """The name that explains most of what is left, and the fits of all names.
@@ -146,10 +121,37 @@ class Search:
         It is kept until another fit is current: causes are added and dropped with a new one.
         """
         if self._asked is None or self._asked[0] is not found.current:
-            self._asked = (found.current, self._next(found))
+            answer = self._next(found)
+            self._asked = (found.current, answer)
         return self._asked[1]
 
     def _next(self, found: Found) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
+        """Where a law wins more than the best name, names must hold between runs by themselves.
+
+        Where that law lasts, so that names imitate it, they are judged beside it: what it wins on
+        all axes counts.
+        """
+        if self.bench.beside is not None:
+            self._judge_beside(None, found)
+        choice, fits = self._chosen(found)
+        laws = laws_of(self.bench, found.current)
+        if choice is None or not laws:
+            return choice, fits
+        lasting = max(won_by(name, laws) for name in SLOW)
+        law = max(lasting, laws[0].heldout_gain)
+        if law < choice.fit.heldout_gain:
+            return choice, fits
+        if law == lasting:
+            self._judge_beside(beside_laws(self.bench, found.current, laws), found)
+        return self._chosen(found, _OF_A_LAW * law, strict=True)
+
+    def _judge_beside(self, structure: Beside | None, found: Found) -> None:
+        self.bench = replace(self.bench, beside=structure)
+        found.current = self.bench.look(found.current.theta)
+
+    def _chosen(
+        self, found: Found, least: float = 0.0, strict: bool = False
+    ) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
         bench, current, taken = self.bench, found.current, found.hypotheses
         beside = self.nuisance + parameters_of(bench.library, taken)
         open_names = [h for h in self.names if h not in taken and h not in found.dropped]
@@ -161,22 +163,17 @@ class Search:
             if np.all(np.abs(times) < self.shortest):
                 del fits[h]
         gains = {c.hypothesis[0]: f.heldout_gain for c, f in found.accepted}
+        if current.noise.estimated:
+            least = max(least, _OF_ESTIMATES * bench.data.steps)
 
-        def chosen(strict: bool, least: float) -> Choice | None:
-            return choose(
-                bench.library, current.theta, fits, max(found.threshold, least), self.alpha,
-                gains, strict,
-            )  # fmt: skip
+        def chosen() -> Choice | None:
+            needed = max(found.threshold, least)
+            return choose(bench.library, current.theta, fits, needed, self.alpha, gains, strict)
 
-        least = _OF_ESTIMATES * bench.data.steps if current.noise.estimated else 0.0
-        choice = chosen(False, least)
+        choice = chosen()
         if choice is not None and self._about_thrust(choice):
             fits |= self._single_thrusters(current, beside, [*taken, *found.dropped])
-            choice = chosen(False, least)
-        law = best_law(bench, current)
-        if choice is not None and RIVALS * law > choice.fit.heldout_gain:
-            # random structure is imitated by names: they must hold between runs by themselves
-            choice = chosen(True, max(_OF_A_LAW * law, least))
+            choice = chosen()
         return choice, fits
 
     def _about_thrust(self, choice: Choice) -> bool:

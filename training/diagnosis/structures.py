@@ -12,6 +12,7 @@ folds. Groups are added one at a time, each beside those before (orthogonal matc
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import equinox as eqx
@@ -21,8 +22,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...models import se3
+from ...models.dynamics import Flow
 from ...models.effects.base import AXES
-from ...models.effects.extended import Extended
+from ...models.effects.extended import Extended, times
 from ...models.effects.unknown import MOTION, TWIST, Unknown, powers
 from .looking import Bench, Look
 from .responses import through
@@ -43,7 +45,7 @@ class Group:
 
     Attributes:
         effect: that has these columns as its terms (of a memory: with the first node's numbers).
-        action: `wrench`, `thruster`, `force`, `swell` or `flow` (all three in W).
+        action: `wrench`, `thruster`, `force` or `flow` (both in W).
         variables: inputs, in the words of recordings.
         columns: of the wrench (N, component of the action, k, R) for a range of pieces.
         nodes: columns of each alternative.
@@ -102,11 +104,17 @@ def _through(
 class Screen:
     """Responses of groups beside the columns of what is accepted, on some of the pieces."""
 
-    def __init__(self, bench: Bench, look: Look, beside: Float[np.ndarray, "m N12 R"] | None):
+    def __init__(
+        self,
+        bench: Bench,
+        look: Look,
+        beside: Float[np.ndarray, "m N12 R"] | None,
+        pieces: int = PIECES,
+    ):
         self.bench, self.look = bench, look
         data = bench.data
         labels = np.unique(data.fold)
-        each = max(1, PIECES // len(labels))
+        each = max(1, pieces // len(labels))
         chosen: list[int] = []
         for label in labels:
             own = np.flatnonzero(data.fold == label)
@@ -129,8 +137,10 @@ class Screen:
 
     def responses(self, group: Group) -> Float[np.ndarray, "k N12 R"]:
         """Changes of the whitened innovations by each column of a group."""
-        phi = group.columns(self.kept)
-        a = self.accelerations(group, phi)  # (N, 6, k, R)
+        return self.passed(self.accelerations(group, group.columns(self.kept)))
+
+    def passed(self, a: Float[np.ndarray, "N 6 k R"]) -> Float[np.ndarray, "k N12 R"]:
+        """Changes of the whitened innovations by accelerations dV/dt."""
         parts = []
         for first in range(0, a.shape[2], LANES):
             some = a[:, :, first : first + LANES]
@@ -150,15 +160,7 @@ class Screen:
             unit = np.eye(len(model.inverse))[:, int(group.effect.acts_on) - 1]
             wrench = self.inverse @ np.asarray(model.allocate(jnp.asarray(unit)))
             return wrench[:, None, None] * phi
-        if group.action == "swell":
-            base = self.bench.model.base
-            displaced = float(base.displaced_mass)
-            total = float(np.mean(np.diag(self.bench.mass(self.look.theta))[:3]))
-            lever = np.asarray(base.p_BoCb_B) * displaced / total
-            turn = np.cross(np.eye(3), lever)  # rows: e_i × r
-            F = self._of_world(self.inverse[:, :3] - self.inverse[:, 3:] @ turn.T)
-        else:
-            F = self._of_world(self.inverse[:, :3]) if group.action == "force" else self._of_flow
+        F = self._of_world(self.inverse[:, :3]) if group.action == "force" else self.water[0]
         return np.einsum("nijr,njkr->nikr", F, phi)
 
     def _of_world(self, inverse: Float[np.ndarray, "6 3"]) -> Float[np.ndarray, "N 6 3 R"]:
@@ -167,12 +169,13 @@ class Screen:
         turned = se3.rotate_inverse(jnp.asarray(X)[:, None], jnp.asarray(unit))
         return np.einsum("ij,jknr->nikr", inverse, np.asarray(turned))
 
-    @property
-    def _of_flow(self) -> Float[np.ndarray, "N 6 3 R"]:
-        """∂V'/∂(velocity of the water in W), by central differences of the model's drift."""
+    @cached_property
+    def water(self) -> tuple[Float[np.ndarray, "N 6 3 R"], Float[np.ndarray, "N 6 3 R"]]:
+        """dV/dt for velocity (m/s) and for acceleration (m/s²) of the water in W, one each."""
         d = self.bench.data
         X, V, u = (jnp.asarray(a[..., self.kept].swapaxes(0, 1)) for a in (d.X[:-1], d.V[:-1], d.u))
-        return np.moveaxis(np.asarray(_flow_gradient(self.bench.model, X, V, u)), 2, 0)
+        both = np.moveaxis(np.asarray(_of_water(self.bench.model, X, V, u)), 2, 0)
+        return both[:, :, :3], both[:, :, 3:]
 
     # ------------------------------------------------------------------------------ matching
 
@@ -294,22 +297,17 @@ class Screen:
 
 
 @eqx.filter_jit
-def _flow_gradient(model: Extended, X: Array, V: Array, u: Array) -> Float[Array, "6 3 N R"]:
-    inertia = model.inertia()
+def _of_water(model: Extended, X: Array, V: Array, u: Array) -> Float[Array, "6 6 N R"]:
+    F = model.allocate(u)
+    inverse = model.inertia().inverse
 
-    def drift(v_W: Array) -> Array:
-        v = se3.rotate_inverse(X, v_W)
-        zero = jnp.zeros_like(v)
-        V_r = V - jnp.concatenate([v, zero])
-        turning = jnp.concatenate([-se3.cross(V[3:], v), zero])
-        return model.drift(inertia, X, V_r, u) + turning
+    def drift(both: Array) -> Array:
+        return times(inverse, model.balance(X, V, F, Flow(both[:3], both[3:]))[1])
 
-    still = jnp.zeros_like(X[4:])
-    columns = []
-    for i in range(3):
-        e = still.at[i].set(1)
-        columns.append(jax.jvp(drift, (still,), (e,))[1])
-    return jnp.stack(columns, axis=1)
+    still = jnp.zeros((6, *X.shape[1:]), X.dtype)
+    unit = jnp.broadcast_to(jnp.eye(6, dtype=X.dtype)[:, :, None, None], (6, *still.shape))
+    columns = jax.vmap(lambda e: jax.jvp(drift, (still,), (e,))[1])(unit)
+    return jnp.moveaxis(columns, 0, 1)
 
 
 # ------------------------------------------------------------------------------- the groups

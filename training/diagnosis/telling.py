@@ -94,15 +94,12 @@ def residual(bench: Bench, look: Look) -> dict[str, result.AxisResidual]:
 # ------------------------------------------------------------------------------------- laws
 
 
-def law_causes(
-    laws: Sequence[Law], bench: Bench, look: Look
-) -> tuple[list[result.Cause], list[Effect]]:
-    """The best law as a cause, axis by axis, and the effect that has it."""
-    if not laws:
-        return [], []
-    top = laws[0]
-    same = [law for law in laws if law.name == top.name]
-    same.sort(key=lambda law: law.where in AXES[3:])  # newtons before newton metres
+def law_cause(
+    laws: Sequence[Law], rivals: Sequence[Law], bench: Bench, look: Look
+) -> tuple[result.Cause, Effect]:
+    """Laws of one name as a cause, axis by axis, and the effect that has them."""
+    same = sorted(laws, key=lambda law: law.where in AXES[3:])  # newtons before newton metres
+    top = max(laws, key=lambda law: law.heldout_gain)
     parameters: dict[str, result.Value] = {}
     cls = kind(top.name)
     values = np.zeros(cls.size())
@@ -110,17 +107,16 @@ def law_causes(
         for name, told in _law_values(law, bench, look).items():
             parameters[name if number == 0 else f"{name}_{law.where}"] = told
             values[cls.index(law.where, name)] = told.value
-    rivals = [result.Rival(r.name, r.where, r.heldout_gain) for r in laws if r.name != top.name]
     named = result.Cause(
         name=top.name,
         where=", ".join(law.where for law in same),
         parameters=parameters,
         evidence=result.Support(float(np.exp(-top.heldout_gain)), top.heldout_gain),
-        rivals=rivals[:4],
+        rivals=[result.Rival(r.name, r.where, r.heldout_gain) for r in rivals[:4]],
         indistinguishable_from=[],
         next_experiment=next_experiment(top.name, "disturbance", [r.name for r in rivals]),
     )
-    return [named], [cls(jnp.asarray(values))]
+    return named, cls(jnp.asarray(values))
 
 
 def _law_values(law: Law, bench: Bench, look: Look) -> dict[str, result.Value]:

@@ -7,16 +7,17 @@ import scipy.stats
 from jaxtyping import Float
 
 from . import result
+from .disturbance import best_law
 from .hypotheses import Design, Fit
 from .looking import Bench, Look
 from .naming import Choice, admissible, parameters_of
 from .responses import respond
-from .search import Found, best_law
+from .search import Found
 from .structures import Matched, Screen, described, groups, refined
 
 BEATS = 1.5
 """Times the best name's gain that structure without a name must win."""
-_TOGETHER, _OF_A_LAW = 1.1, 0.5
+_TOGETHER, _OF_A_LAW = 1.1, 1.0
 """Times what all names win together; share of what the best law wins."""
 
 

@@ -1,167 +1,181 @@
-"""Laws that ask for more than the innovations alone: swell, and a level other than believed."""
+"""Swell, currents that differ from run to run, and judging causes beside either or slow pushes."""
 
-import jax.numpy as jnp
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float
 
 from ...models.effects.base import AXES
-from ...models.effects.unknown import Unknown
-from .data import Data
+from .beside import Beside
 from .laws import Law, estimated, run_constants
 from .looking import Bench, Look
-from .noise import Noise, estimate, filtered, make_filter, mean_jacobian
-from .search import laws_of
-from .structures import Group, Screen
+from .structures import Screen
 
 _OMEGAS = np.arange(0.6, 5.3, 0.2)
 """Frequencies that are tried (rad/s); runs of ten seconds tell 0.6 rad/s apart."""
+_WAYS = 12
+"""Directions that are tried; a quarter of them with every frequency."""
+_EACH = np.full(4, 0.05)
+"""Amplitudes that are tried: 1/8 to 64 times as much (m/s)."""
 _FINER = (-0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15)
-_SHORTEST, _SMALLEST = 3.0, 0.1
-"""Steps that a colour must last, share by which a level must differ."""
 _GRAVITY = 9.80665
+_LEAST = 5.0
+"""Nats that a slow push on an axis must win to be taken into account."""
+_BENDS = 4
+"""Cosines that bend a current over a piece, besides a constant."""
 
 
-def all_laws(bench: Bench, look: Look, least: float) -> list[Law]:
-    """Laws of what is left, waves and level included, largest gain first."""
-    found = laws_of(bench, look)
-    coloured = {law.where: law.heldout_gain for law in found if law.name == "disturbance_colour"}
-    if max(coloured.values()) > least:
+def beside_laws(bench: Bench, look: Look, laws: Sequence[Law]) -> Beside:
+    """The random structure that wins most: slow pushes by axis, a current, or swell."""
+    slow = [law for law in laws if law.name == "disturbance_colour" and law.heldout_gain > _LEAST]
+    pushes = sum(law.heldout_gain for law in slow)
+    current = max((law.heldout_gain for law in laws if law.name == "current_varying"), default=0.0)
+    if current > pushes:
+        whole = Screen(bench, look, None, len(bench.data.fold))
+        v = _flow(bench, whole.kept)
+        return _drawn(whole, v, np.zeros_like(v), _bends())
+    if slow:
         waves = find_waves(bench, look)
-        # turning follows from swell in ways of its own: pushes decide
-        if waves.heldout_gain > sum(max(coloured[axis], 0.0) for axis in AXES[:3]):
-            found.append(waves)
-    found += find_levels(bench, look)
-    return sorted(found, key=lambda law: -law.heldout_gain)
+        if waves.heldout_gain > sum(law.heldout_gain for law in slow if law.where in AXES[:3]):
+            whole = Screen(bench, look, None, len(bench.data.fold))
+            swell = Swell(waves.parameters["frequency"], waves.parameters["direction"])
+            return _drawn(whole, *swell.water(bench, whole.kept), _EACH)
+    numbers = {}
+    for law in slow:
+        tau, kappa = np.exp(estimated(law, bench.data.cluster)[0])
+        rho = np.exp(-bench.data.dt / tau)
+        numbers[AXES.index(law.where)] = float(rho), float(min(kappa, 0.99))
+    return Beside.slowly(look.z.astype(float), numbers)
 
 
-def is_apart(law: Law, bench: Bench) -> bool:
-    """Whether a law differs from what the noise levels alone can be in error."""
-    if law.name == "disturbance_colour" and law.loss is not None:
-        return float(np.exp(estimated(law, bench.data.cluster)[0][0])) > _SHORTEST * bench.data.dt
-    if law.name == "disturbance_level":
-        return abs(law.parameters["change"]) > _SMALLEST
-    return True
+def _drawn(screen: Screen, v: np.ndarray, a: np.ndarray, spread: np.ndarray) -> Beside:
+    """Motion of the water drawn for each piece, its terms' standard deviations in proportion."""
+    J = _responses(screen, v, a)
+    G = _products(screen, J)
+    std = run_constants(G, list(range(1, len(J) + 1)), spread, screen.fold)[1]["std"] / spread[0]
+    return Beside(drawn=J, precision=1 / (max(std, 1e-9) * spread) ** 2)
 
 
-# ------------------------------------------------------------------------------------- waves
+def _responses(screen: Screen, v: np.ndarray, a: np.ndarray) -> Float[np.ndarray, "k N12 R"]:
+    """Whitened responses to velocities and accelerations of the water in W (N, 3, k, R)."""
+    by_v, by_a = screen.water
+    return screen.passed(
+        np.einsum("nijr,njkr->nikr", by_v, v) + np.einsum("nijr,njkr->nikr", by_a, a)
+    )
+
+
+def _products(screen: Screen, J: np.ndarray) -> Float[np.ndarray, "R m m"]:
+    columns = np.concatenate([screen.z[:1], J]).astype(np.float64)
+    return np.einsum("iar,jar->rij", columns, columns, optimize=True)
+
+
+def _times(bench: Bench, kept: np.ndarray) -> Float[np.ndarray, "N R"]:
+    """Middles of the steps since the begin of each piece (s)."""
+    return (bench.data.times[:-1] + bench.data.step / 2)[:, kept]
+
+
+def _flow(bench: Bench, kept: np.ndarray) -> Float[np.ndarray, "N 3 k R"]:
+    """East and north flow of 1 m/s: a constant and `_BENDS` cosines of time each."""
+    t = _times(bench, kept) / np.maximum(bench.data.times[-1, kept], 1e-9)
+    found = np.zeros((len(t), 3, 2 * (_BENDS + 1), len(kept)))
+    for k in range(_BENDS + 1):
+        for way in range(2):
+            found[:, way, 2 * k + way] = np.cos(np.pi * k * t) * (np.sqrt(2) if k else 1)
+    return found
+
+
+def _bends() -> np.ndarray:
+    """Standard deviations of the flow's terms: mean-reverting within the length of a piece."""
+    t = (np.arange(64) + 0.5) / 64
+    C = np.exp(-np.abs(t[:, None] - t))
+    phi = np.stack([np.cos(np.pi * k * t) * (np.sqrt(2) if k else 1) for k in range(_BENDS + 1)])
+    return np.repeat(np.sqrt(np.diag(phi @ C @ phi.T)) / 64, 2)
+
+
+@dataclass(frozen=True)
+class Swell:
+    """Swell of one frequency ω (rad/s) and one direction ψ (rad), for each piece four amplitudes.
+
+    Water moves along ψ with cos θ and sin θ and up with cos θ and sin θ, θ = k (x cos ψ + y sin ψ)
+    - ω t, fading with exp(k z), ω² = g k (Airy; Faltinsen 1990, table 2.1, deep water).
+    """
+
+    frequency: float
+    direction: float
+
+    def water(
+        self, bench: Bench, kept: np.ndarray
+    ) -> tuple[Float[np.ndarray, "N 3 4 R"], Float[np.ndarray, "N 3 4 R"]]:
+        """Velocities of 1 m/s at the surface and accelerations, in W."""
+        omega, k = self.frequency, self.frequency**2 / _GRAVITY
+        east, north = np.cos(self.direction), np.sin(self.direction)
+        X = bench.data.X[:-1][..., kept]
+        theta = k * (east * X[:, 4] + north * X[:, 5]) - omega * _times(bench, kept)
+        fade = np.exp(k * np.minimum(X[:, 6], 0.0))
+        v, a = np.zeros((2, len(theta), 3, 4, len(kept)))
+        for number, (now, rate) in enumerate(
+            ((np.cos(theta), np.sin(theta)), (np.sin(theta), -np.cos(theta)))
+        ):
+            for way, share in ((0, east), (1, north)):
+                v[:, way, number], a[:, way, number] = (
+                    share * fade * now,
+                    share * omega * fade * rate,
+                )
+            v[:, 2, 2 + number], a[:, 2, 2 + number] = fade * now, omega * fade * rate
+        return v, a
 
 
 def find_waves(bench: Bench, look: Look) -> Law:
-    """Swell of one frequency, its phase and size drawn anew for each piece of a run.
+    """Swell of one frequency and direction, its amplitudes drawn anew for each piece of a run.
 
-    A force in W along each direction with cos ωt and sin ωt, six amplitudes a piece, of one
-    variance: z ~ N(0, I + σ² J Jᵀ). ω from a grid, then a finer one. The pressure of accelerated
-    water acts at the centre of buoyancy, the force of its added mass at Bo.
+    They have one variance: z ~ N(0, I + σ² J Jᵀ). Frequency and direction from a grid, then from
+    finer ones.
     """
     screen = Screen(bench, look, None)
 
-    def tried(omegas: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        groups = [_swell(bench, omega) for omega in omegas]
-        J = [screen.responses(group) for group in groups]
-        z = screen.z[:1]
+    def tried(swells: list[Swell]) -> list[tuple[np.ndarray, np.ndarray]]:
+        water = [swell.water(bench, screen.kept) for swell in swells]
+        J = _responses(screen, *(np.concatenate(w, axis=2) for w in zip(*water, strict=True)))
         found = []
-        for own in J:
-            columns = np.concatenate([z, own]).astype(np.float64)
-            G = np.einsum("iar,jar->rij", columns, columns, optimize=True)
-            found.append((G, run_constants(G, list(range(1, 7)), np.ones(6), screen.fold)[0]))
+        for first in range(0, len(J), 4):
+            G = _products(screen, J[first : first + 4])
+            found.append((G, run_constants(G, [1, 2, 3, 4], _EACH, screen.fold)[0]))
         return found
 
-    first = tried(_OMEGAS)
-    centre = _OMEGAS[int(np.argmax([gain.sum() for _, gain in first]))]
-    omegas = np.array([centre + step for step in _FINER])
-    second = tried(omegas)
-    gains = np.array([gain.sum() for _, gain in second])
-    best = int(np.argmax(gains))
-    G, heldout = second[best]
-    std = run_constants(G, list(range(1, 7)), np.ones(6), screen.fold)[1]["std"]
-    omega, error = _peak(omegas, gains)
-    # amplitudes of each piece, least squares; the horizontal ones' main direction
-    a = -np.linalg.solve(G[:, 1:, 1:] + np.eye(6) / max(std, 1e-3) ** 2, G[:, 1:, :1])[..., 0]
-    east, north = a[:, 0:2].ravel(), a[:, 2:4].ravel()
-    angle = 0.5 * np.arctan2(2 * (east @ north), east @ east - north @ north)
-    along = np.cos(angle) * east + np.sin(angle) * north
-    mass = bench.mass(look.theta)
-    heavy = float(np.mean(np.diag(mass)[:2]))
-    depth = float(bench.data.X[:, 6].mean())
-    fade = np.exp(omega**2 * min(depth, 0.0) / _GRAVITY)
-    speed = float(np.sqrt(np.mean(along**2)) / (heavy * omega) / fade)
-    values = {"speed": speed, "frequency": float(omega), "direction": float(angle)}
-    unsure = {"speed": 0.3 * speed, "frequency": error, "direction": 0.2}
+    def totals(swells: list[Swell]) -> np.ndarray:
+        return np.array([gain.sum() for _, gain in tried(swells)])
+
+    ways = np.arange(_WAYS) * 2 * np.pi / _WAYS
+    few = [Swell(omega, way) for omega in _OMEGAS for way in ways[:: _WAYS // 4]]
+    best = few[int(np.argmax(totals(few)))]
+    several = [Swell(best.frequency, way) for way in ways]
+    gains = totals(several)
+    middle = int(np.argmax(gains))
+    near = [(middle + k) % _WAYS for k in (-1, 0, 1)]
+    direction, unsure = _peak(ways[middle] + 2 * np.pi / _WAYS * np.array([-1, 0, 1]), gains[near])
+    finer = [Swell(best.frequency + step, direction) for step in _FINER]
+    gains = totals(finer)
+    omega, error = _peak(np.array([swell.frequency for swell in finer]), gains)
+    best = Swell(omega, direction)
+    G, heldout = tried([best])[0]
+    std = run_constants(G, [1, 2, 3, 4], _EACH, screen.fold)[1]["std"]
+    a = -np.linalg.solve(G[:, 1:, 1:] + np.eye(4) / max(std, 1e-3) ** 2, G[:, 1:, 0][..., None])
+    speeds = np.sqrt(np.mean(a[:, :2, 0] ** 2, axis=1))
+    speed = float(np.sqrt(np.mean(speeds**2)))
+    spread = float(np.std(speeds**2) / np.sqrt(len(speeds)) / (2 * max(speed, 1e-9)))
+    turned = float(np.angle(np.exp(1j * direction)))
+    values = {"speed": speed, "frequency": omega, "direction": turned}
+    unsure = {"speed": spread, "frequency": error, "direction": unsure}
     share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
     return Law("waves", "W", values, heldout * share, errors=unsure)
 
 
-def _peak(omegas: np.ndarray, gains: np.ndarray) -> tuple[float, float]:
+def _peak(at: np.ndarray, gains: np.ndarray) -> tuple[float, float]:
     """The top of a parabola through the gains, and its width where half a nat is lost."""
-    a, b, _ = np.polyfit(omegas - omegas.mean(), gains, 2)
+    a, b, _ = np.polyfit(at - at.mean(), gains, 2)
     if a >= 0:
-        return float(omegas[int(np.argmax(gains))]), float(np.ptp(omegas))
-    top = float(np.clip(-b / (2 * a), -0.3, 0.3))
-    return float(omegas.mean() + top), float(1 / np.sqrt(-2 * a))
-
-
-def _swell(bench: Bench, omega: float) -> Group:
-    d = bench.data
-
-    def columns(kept: np.ndarray) -> np.ndarray:
-        t = (d.times[:-1] + d.step / 2)[:, kept]
-        found = np.zeros((len(t), 3, 6, len(kept)))
-        for way in range(3):
-            found[:, way, 2 * way] = np.cos(omega * t)
-            found[:, way, 2 * way + 1] = np.sin(omega * t)
-        return found
-
-    effect = Unknown.neutral(kind="depth", acts_on="W", numbers=(0.0, 1.0))
-    return Group(effect, "swell", ("t",), columns, (tuple(range(6)),))
-
-
-# ------------------------------------------------------------------------------------- level
-
-
-def find_levels(bench: Bench, look: Look) -> list[Law]:
-    """White disturbance stronger or weaker than the belief says, axis by axis.
-
-    The gain is that of the level estimated on the other folds over the believed one, all other
-    levels being estimated; the error of the level by the jackknife over folds. A belief without a
-    level has none to differ from.
-    """
-    believed = np.asarray(bench.model.base.mass_and_diffusion(jnp.zeros(6))[1])
-    if not np.any(believed > 0):
-        return []
-    data = bench.data
-    error, jacobian = np.asarray(look.predictions.error), np.asarray(look.predictions.jacobian)
-    mass, labels = bench.mass(look.theta), np.unique(data.fold)
-    inverse = np.linalg.inv(mass)
-    gain = np.zeros((6, len(data.fold)))
-    levels = np.zeros((len(labels), 6))
-    for k, label in enumerate(labels):
-        own = data.fold == label
-        rest = data.weight * (~own if not own.all() else 1)
-        A = mean_jacobian(jacobian, rest)
-        noise = estimate(error, rest, A, mass, data.dt)
-        levels[k] = noise.diffusion
-        score = _score(error, jacobian, data, own, noise, A, inverse)
-        for i in np.flatnonzero(believed > 0):
-            b = noise.diffusion.copy()
-            b[i] = believed[i]
-            other = type(noise)(noise.record, b)
-            gain[i, own] = score - _score(error, jacobian, data, own, other, A, inverse)
-    found, n = [], len(labels)
-    for i in np.flatnonzero(believed > 0):
-        spread = np.sqrt((n - 1) / n * np.sum((levels[:, i] - levels[:, i].mean()) ** 2))
-        change = float(look.noise.diffusion[i] / believed[i] - 1)
-        error_of = {"change": float(spread / believed[i])}
-        law = Law("disturbance_level", AXES[i], {"change": change}, gain[i], errors=error_of)
-        found.append(law)
-    return found
-
-
-def _score(
-    error: np.ndarray, jacobian: np.ndarray, data: Data, own: np.ndarray, noise: Noise,
-    A: np.ndarray, inverse: np.ndarray,
-) -> Float[np.ndarray, " R"]:  # fmt: skip
-    """Log density of the innovations of some pieces, up to a constant."""
-    kalman = make_filter(noise, A, inverse, data.dt, data.step[:, own])
-    w = data.weight[:, own]
-    z = filtered(error[:, :, own], jacobian[..., own], kalman) * w[:, None]
-    return -(z**2).sum(axis=(0, 1)) / 2 - (kalman.log_det * w).sum(axis=0)
+        return float(at[int(np.argmax(gains))]), float(np.ptp(at))
+    reach = float(np.ptp(at)) / 2
+    top = float(np.clip(-b / (2 * a), -reach, reach))
+    return float(at.mean() + top), float(1 / np.sqrt(-2 * a))

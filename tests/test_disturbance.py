@@ -1,0 +1,141 @@
+"""Laws of the disturbance: which are told, and causes judged beside those that last."""
+
+import numpy as np
+import pytest
+from hidden.draw import draw
+from hidden.scenarios import Plan
+
+from spinndrift.models.recording_csv import read_csv
+from spinndrift.models.vehicle import load_vehicle
+from spinndrift.training.diagnosis.beside import Beside
+from spinndrift.training.diagnosis.diagnose import Diagnoser
+from spinndrift.training.diagnosis.disturbance import all_laws, is_apart, laws_of, told
+from spinndrift.training.diagnosis.noise import estimate
+from spinndrift.training.diagnosis.search import Found, Search
+from spinndrift.training.diagnosis.waves import find_waves
+
+VEHICLE = load_vehicle("bluerov2_heavy")
+LEVELS = np.array([1.0] * 3 + [0.03] * 3)
+
+
+@pytest.fixture(scope="module")
+def bench_of(tmp_path_factory):
+    """A bench of a hidden cause, and its cause; the belief states the level that was hidden."""
+
+    def made(name, size, **plan):
+        folder = tmp_path_factory.mktemp(name) / "data"
+        case = draw(3, names=(name,), size=size, plan=Plan(runs=2, seconds=6.0, **plan))
+        case.write(folder)
+        diagnoser = Diagnoser(read_csv(folder), VEHICLE, VEHICLE.dynamics(LEVELS))
+        return diagnoser.bench, case.effects[0]
+
+    return made
+
+
+def test_what_is_drawn_anew_is_integrated_out():
+    """Products beside it are those under the dense covariance I + J S Jᵀ."""
+    rng = np.random.default_rng(0)
+    z, J = rng.standard_normal((4, 36, 5)), rng.standard_normal((3, 36, 5))
+    variance = np.array([0.5, 2.0, 10.0])
+    G = Beside(drawn=J, precision=1 / variance).products(z)
+    for r in range(5):
+        dense = np.eye(36) + J[..., r].T @ np.diag(variance) @ J[..., r]
+        np.testing.assert_allclose(
+            G[r], z[..., r] @ np.linalg.solve(dense, z[..., r].T), rtol=1e-9, atol=1e-9
+        )
+
+
+def test_a_slow_push_is_taken_out_of_all_that_it_moves():
+    """White after, in its own innovation and where it leaks, and columns lose what z loses."""
+    rng = np.random.default_rng(1)
+    N, R, rho, q = 400, 40, 0.95, 0.2
+    m = np.zeros((N, R))
+    for n in range(N - 1):
+        m[n + 1] = rho * m[n] + q * rng.standard_normal(R)
+    z = rng.standard_normal((N, 12, R))
+    z[:, 8] += m
+    z[:, 2] += 0.5 * m
+    P = q * q  # variance of what is predicted: the Riccati equation of one state
+    for _ in range(500):
+        P = rho**2 * P / (P + 1) + q * q
+    beside = Beside.slowly(z, {2: (rho, P / (P + 1))})
+    white = beside._unslowed(z.reshape(1, -1, R)).reshape(N, 12, R)
+    for axis, share in ((8, 0.05), (2, 0.5)):
+        before, after = (np.mean(a[1:, axis] * a[:-1, axis]) for a in (z, white))
+        assert before > 0.05
+        assert abs(after) < share * before
+    assert np.mean(white[50:] ** 2) == pytest.approx(1, abs=0.02)
+    doubled = beside._unslowed(np.stack([z, 2 * z]).reshape(2, -1, R))
+    np.testing.assert_allclose(doubled[1], 2 * doubled[0])
+
+
+@pytest.mark.parametrize("name", ["disturbance_colour", "waves", "current_varying"])
+def test_no_name_imitates_a_large_random_structure(bench_of, name):
+    """Three times a realistic size: names win thousands of nats, and none beside the structure."""
+    bench, _ = bench_of(name, 3.0)
+    look = bench.look(bench.believed)
+    assert laws_of(bench, look)[0].heldout_gain > 1000
+    search = Search(bench, [], 0.01, 6, np.random.default_rng(0), lambda fraction, remark: None)
+    found = Found(look, look, look)
+    best = max(f.heldout_gain for f in search._chosen(found)[1].values())
+    choice, fits = search.next(found)
+    assert best > 100
+    assert choice is None
+    assert max(f.heldout_gain for f in fits.values()) < 0.3 * best
+
+
+@pytest.mark.parametrize("loop", ["open", "closed"])
+def test_swell_is_measured(bench_of, loop):
+    """Frequency, direction and size of a wave, with a pilot who works against it and without."""
+    bench, wave = bench_of("waves", 1.0, loop=loop)
+    law = find_waves(bench, bench.look(bench.believed, []))
+    assert law.errors is not None
+    omega = 2 * np.pi / wave.period
+    assert law.parameters["frequency"] == pytest.approx(omega, abs=0.03)
+    turn = np.angle(np.exp(1j * (law.parameters["direction"] - wave.direction)))
+    assert abs(turn) < 0.15
+    # a wave of one amplitude has its root mean square
+    speed = wave.amplitude * omega / np.sqrt(2)
+    assert law.parameters["speed"] == pytest.approx(speed, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    "name", ["disturbance_level", "disturbance_state_dependence", "disturbance_impacts"]
+)
+@pytest.mark.parametrize("size", [1.0, 3.0])
+def test_levels_and_what_comes_and_goes_are_told_apart(bench_of, name, size):
+    bench, _ = bench_of(name, size)
+    look = bench.look(bench.believed)
+    assert not look.noise.estimated
+    laws = [w for w in all_laws(bench, look, 12.0) if w.heldout_gain > 12 and is_apart(w, bench)]
+    groups = told(laws, bench, look)
+    assert [group[0].name for group in groups] == [name]
+    assert all(law.name == name for law in groups[0])
+
+
+def test_states_known_exactly_are_not_taken_for_estimates(bench_of):
+    """No errors of records at all: whoever simulates may write down what he simulated."""
+    rng = np.random.default_rng(2)
+    bench, _ = bench_of("disturbance_level", 1.0)
+    A = np.eye(12)
+    A[:6, 6:] = 0.05 * np.eye(6)
+    mass = bench.mass(bench.believed)
+    w = np.linalg.solve(mass, LEVELS[:, None] * rng.standard_normal((6, 200 * 30)))
+    error = np.concatenate([0.025 * w, w]).reshape(12, 200, 30).swapaxes(0, 1) * np.sqrt(0.05)
+    noise = estimate(error, np.ones((200, 30)), A, mass, 0.05)
+    assert not noise.estimated
+    np.testing.assert_allclose(noise.diffusion, LEVELS, rtol=0.05)
+
+
+def test_drag_stays_passive_and_wild_steps_are_tamed(bench_of):
+    bench, _ = bench_of("quadratic_drag", 1.0)
+    row = bench.library.at("quadratic_drag", "pitch")
+    believed = bench.believes("quadratic_drag", "pitch")
+    far = bench.believed.copy()
+    far[row] = -2 * believed
+    theta = bench.polish(far, row, rounds=1)[0]
+    assert -believed <= theta[row][0] < 0
+    assert not bench._wild(np.repeat(bench.believed[:, None], len(bench.data.fold), 1)).any()
+    heavy = np.repeat(bench.believed[:, None], len(bench.data.fold), 1)
+    heavy[bench.library.at("linear_drag", "yaw"), 3] = -3000.0
+    assert np.flatnonzero(bench._wild(heavy)).tolist() == [3]

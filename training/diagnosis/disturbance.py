@@ -1,0 +1,205 @@
+"""Laws of the disturbance in what is left: which there are, and which are told."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ...models.effects.base import AXES
+from .data import Data
+from .gain import white_part
+from .laws import Law, estimated, find_laws, growth_alone, run_constants
+from .looking import Bench, Look
+from .noise import Noise, estimate, filtered, make_filter, mean_jacobian
+from .waves import find_waves
+
+_BLOW = 4.0
+"""Standard deviations beyond which an error is a blow's."""
+_SHORTEST, _SMALLEST = 3.0, 0.1
+"""Steps that a colour must last, share by which a level must differ."""
+LEVEL, SLOW = "disturbance_level", ("waves", "disturbance_colour", "current_varying")
+OF_OTHERS = 1e-3
+"""Share of what others win that a law must win besides: they leave some of their own."""
+
+
+def laws_of(bench: Bench, look: Look) -> list[Law]:
+    """Laws of the disturbance in what is left, largest gain first.
+
+    None where states were estimated: errors of an estimator are no disturbance.
+    """
+    if look.noise.estimated:
+        return []
+    data = bench.data
+    speed = np.linalg.norm(data.V[:-1, :3], axis=1)
+    found = find_laws(look.z.astype(float), speed, data.weight, data.fold, data.dt)
+    rows = bench.library.at("current_steady", "W")
+    evidence = look.plain
+    if set(rows) <= set(evidence.design.owner.tolist()) and len(evidence.runs) > 2:
+        columns = [evidence.column(i) for i in rows]
+        sizes = np.array([bench.library.entries[i].parameter.probes[0] for i in rows])
+        gain, values, loss = run_constants(evidence.runs, columns, sizes, evidence.fold)
+        found.append(Law("current_varying", "W", values, gain, loss))
+    return sorted(found, key=lambda law: -law.heldout_gain)
+
+
+def won_by(name: str, laws: Sequence[Law]) -> float:
+    """What a law wins on all axes together (nats)."""
+    return sum((max(law.heldout_gain, 0.0) for law in laws if law.name == name), 0.0)
+
+
+def best_law(bench: Bench, look: Look) -> float:
+    """What the best law of the disturbance wins on data left out (nats)."""
+    return max((law.heldout_gain for law in laws_of(bench, look)), default=0.0)
+
+
+def all_laws(bench: Bench, look: Look, least: float) -> list[Law]:
+    """Laws of what is left, waves and level included, largest gain first."""
+    found = laws_of(bench, look)
+    coloured = {law.where: law.heldout_gain for law in found if law.name == "disturbance_colour"}
+    if max(coloured.values()) > least:
+        waves = find_waves(bench, look)
+        # turning follows from swell in ways of its own: pushes decide
+        if waves.heldout_gain > sum(max(coloured[axis], 0.0) for axis in AXES[:3]):
+            found.append(waves)
+    found += find_levels(bench, look)
+    return sorted(found, key=lambda law: -law.heldout_gain)
+
+
+def told(laws: Sequence[Law], bench: Bench, look: Look) -> list[list[Law]]:
+    """Which of the laws that pass are told, in groups of one name each, largest first.
+
+    Of laws with a structure one name is told. Levels differ with any of them: a slow one disturbs
+    the estimate of b, one that comes and goes is a part of it. A level stands beside a slow one
+    that wins less; beside growth with the speed if that alone explains less than the level alone,
+    beside blows if it holds between them, and each time if it is the larger part of the change.
+    Then a structure must win more than what the level leaves of its own.
+    """
+    levels = [law for law in laws if law.name == LEVEL]
+    shaped = [law for law in laws if law.name != LEVEL]
+    if not shaped:
+        return [levels] if levels else []
+    shaped = [law for law in shaped if law.name == shaped[0].name]
+    if shaped[0].name == "disturbance_state_dependence" and _grows_alone(
+        levels, shaped, look, bench
+    ):
+        grows = {law.where for law in shaped}
+        levels = [law for law in levels if law.where not in grows]
+    kept = []
+    for law in levels:
+        rest = _level_beside(law, shaped, bench, look)
+        if rest is not None and is_apart(rest, bench):
+            kept.append(rest)
+    if not kept:
+        return [shaped]
+    least = OF_OTHERS * sum(law.heldout_gain for law in kept)
+    beside = [law for law in shaped if law.heldout_gain > least]
+    both = [kept, beside] if beside else [kept]
+    return sorted(both, key=lambda group: -group[0].heldout_gain)
+
+
+def _level_beside(law: Law, shaped: Sequence[Law], bench: Bench, look: Look) -> Law | None:
+    """A level with what is left of its change beside laws of one name, if it stands."""
+    i, name = AXES.index(law.where), shaped[0].name
+    if name in SLOW:
+        return law if law.heldout_gain > shaped[0].heldout_gain else None
+    own = [other for other in shaped if other.where == law.where]
+    if not own:
+        return law
+    all_of_it = 1 + law.parameters["change"]
+    if name == "disturbance_impacts":
+        rest = all_of_it * _without_blows(bench, look)[i] / look.noise.diffusion[i]
+    else:
+        rest = all_of_it * float(white_part(own, bench)[i])
+    if abs(np.log(rest)) < abs(np.log(all_of_it / rest)):
+        return None
+    return replace(law, parameters={"change": float(rest - 1)})
+
+
+def _grows_alone(levels: Sequence[Law], shaped: Sequence[Law], look: Look, bench: Bench) -> bool:
+    """Whether growth with the speed from the believed levels wins more than levels without it."""
+    data = bench.data
+    speed = np.linalg.norm(data.V[:-1, :3], axis=1)
+    grows, gain = {law.where for law in shaped}, 0.0
+    for law in levels:
+        if law.where in grows:
+            z = look.z[:, 6 + AXES.index(law.where)].astype(float)
+            gain += growth_alone(z, speed, data.weight, 1 / (1 + law.parameters["change"]))
+    return gain > 0
+
+
+def _without_blows(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
+    """Diffusion estimated from the steps without a blow at their begin, at their end or before."""
+    data = bench.data
+    error, jacobian = np.asarray(look.predictions.error), np.asarray(look.predictions.jacobian)
+    exists = data.weight > 0
+    spread = 1.4826 * np.median(np.abs(error[:, 6:].swapaxes(1, 2)[exists]), axis=0)
+    hit = np.any(np.abs(error[:, 6:]) > _BLOW * spread[:, None], axis=1)
+    near = hit.copy()
+    near[1:] |= hit[:-1]
+    near[:-1] |= hit[1:]
+    weight = data.weight * ~near
+    A = mean_jacobian(jacobian, weight)
+    return estimate(error, weight, A, bench.mass(look.theta), data.dt).diffusion
+
+
+def is_apart(law: Law, bench: Bench) -> bool:
+    """Whether a law differs from what the noise levels alone can be in error."""
+    if law.name == "disturbance_colour" and law.loss is not None:
+        return float(np.exp(estimated(law, bench.data.cluster)[0][0])) > _SHORTEST * bench.data.dt
+    if law.name == LEVEL:
+        return abs(law.parameters["change"]) > _SMALLEST
+    return True
+
+
+# ------------------------------------------------------------------------------------- level
+
+
+def find_levels(bench: Bench, look: Look) -> list[Law]:
+    """White disturbance stronger or weaker than the belief says, axis by axis.
+
+    The gain is that of the level estimated on the other folds over the believed one, all other
+    levels being estimated; the error of the level by the jackknife over folds. A belief without a
+    level has none to differ from.
+    """
+    believed = np.asarray(bench.model.base.mass_and_diffusion(jnp.zeros(6))[1])
+    if not np.any(believed > 0):
+        return []
+    data = bench.data
+    error, jacobian = np.asarray(look.predictions.error), np.asarray(look.predictions.jacobian)
+    mass, labels = bench.mass(look.theta), np.unique(data.fold)
+    inverse = np.linalg.inv(mass)
+    gain = np.zeros((6, len(data.fold)))
+    levels = np.zeros((len(labels), 6))
+    for k, label in enumerate(labels):
+        own = data.fold == label
+        rest = data.weight * (~own if not own.all() else 1)
+        A = mean_jacobian(jacobian, rest)
+        noise = estimate(error, rest, A, mass, data.dt)
+        levels[k] = noise.diffusion
+        score = _score(error, jacobian, data, own, noise, A, inverse)
+        for i in np.flatnonzero(believed > 0):
+            b = noise.diffusion.copy()
+            b[i] = believed[i]
+            other = type(noise)(noise.record, b)
+            gain[i, own] = score - _score(error, jacobian, data, own, other, A, inverse)
+    found, n = [], len(labels)
+    for i in np.flatnonzero(believed > 0):
+        spread = np.sqrt((n - 1) / n * np.sum((levels[:, i] - levels[:, i].mean()) ** 2))
+        change = float(look.noise.diffusion[i] / believed[i] - 1)
+        error_of = {"change": float(spread / believed[i])}
+        law = Law(LEVEL, AXES[i], {"change": change}, gain[i], errors=error_of)
+        found.append(law)
+    return found
+
+
+def _score(
+    error: np.ndarray, jacobian: np.ndarray, data: Data, own: np.ndarray, noise: Noise,
+    A: np.ndarray, inverse: np.ndarray,
+) -> Float[np.ndarray, " R"]:  # fmt: skip
+    """Log density of the innovations of some pieces, up to a constant."""
+    kalman = make_filter(noise, A, inverse, data.dt, data.step[:, own])
+    w = data.weight[:, own]
+    z = filtered(error[:, :, own], jacobian[..., own], kalman) * w[:, None]
+    return -(z**2).sum(axis=(0, 1)) / 2 - (kalman.log_det * w).sum(axis=0)

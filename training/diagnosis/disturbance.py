@@ -13,7 +13,7 @@ from .gain import white_part
 from .laws import Law, estimated, find_laws, growth_alone, run_constants
 from .looking import Bench, Look
 from .noise import Noise, estimate, filtered, make_filter, mean_jacobian
-from .waves import find_waves
+from .waves import are_waves, find_waves
 
 _BLOW = 4.0
 """Standard deviations beyond which an error is a blow's."""
@@ -57,11 +57,10 @@ def best_law(bench: Bench, look: Look) -> float:
 def all_laws(bench: Bench, look: Look, least: float) -> list[Law]:
     """Laws of what is left, waves and level included, largest gain first."""
     found = laws_of(bench, look)
-    coloured = {law.where: law.heldout_gain for law in found if law.name == "disturbance_colour"}
-    if max(coloured.values()) > least:
+    slow = [law for law in found if law.name == "disturbance_colour"]
+    if max((law.heldout_gain for law in slow), default=0.0) > least:
         waves = find_waves(bench, look)
-        # turning follows from swell in ways of its own: pushes decide
-        if waves.heldout_gain > sum(max(coloured[axis], 0.0) for axis in AXES[:3]):
+        if are_waves(waves, slow):
             found.append(waves)
     found += find_levels(bench, look)
     return sorted(found, key=lambda law: -law.heldout_gain)

@@ -1,6 +1,6 @@
 """Swell, currents that differ from run to run, and judging causes beside either or slow pushes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ...models.effects.base import AXES
 from .beside import Beside
-from .laws import Law, estimated, run_constants
+from .laws import Law, Told, estimated, run_constants
 from .looking import Bench, Look
 from .structures import Screen
 
@@ -16,12 +16,18 @@ _OMEGAS = np.arange(0.6, 5.3, 0.2)
 """Frequencies that are tried (rad/s); runs of ten seconds tell 0.6 rad/s apart."""
 _WAYS = 12
 """Directions that are tried; a quarter of them with every frequency."""
-_EACH = np.full(4, 0.05)
-"""Amplitudes that are tried: 1/8 to 64 times as much (m/s)."""
+_FIRST = 0.05
+"""Speeds that are tried: 1/8 to 64 times as much (m/s)."""
+_PARTS = np.array([0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 1.9])
+"""Frequencies of a sea, as shares of the one with most energy."""
+_ABOUT = (0.85, 0.95, 1.0, 1.05)
+"""Shares of the frequency of the best single one that a sea is tried with."""
 _FINER = (-0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15)
 _GRAVITY = 9.80665
 _LEAST = 5.0
 """Nats that a slow push on an axis must win to be taken into account."""
+_TIMES = 2.0
+"""How many times what slow forces win waves must win."""
 _BENDS = 4
 """Cosines that bend a current over a piece, besides a constant."""
 
@@ -36,17 +42,28 @@ def beside_laws(bench: Bench, look: Look, laws: Sequence[Law]) -> Beside:
         v = _flow(bench, whole.kept)
         return _drawn(whole, v, np.zeros_like(v), _bends())
     if slow:
-        waves = find_waves(bench, look)
-        if waves.heldout_gain > sum(law.heldout_gain for law in slow if law.where in AXES[:3]):
+        swell, waves = _found(bench, look)
+        if are_waves(waves, slow):
             whole = Screen(bench, look, None, len(bench.data.fold))
-            swell = Swell(waves.parameters["frequency"], waves.parameters["direction"])
-            return _drawn(whole, *swell.water(bench, whole.kept), _EACH)
+            return _drawn(whole, *swell.water(bench, whole.kept), swell.spread)
     numbers = {}
     for law in slow:
         tau, kappa = np.exp(estimated(law, bench.data.cluster)[0])
         rho = np.exp(-bench.data.dt / tau)
         numbers[AXES.index(law.where)] = float(rho), float(min(kappa, 0.99))
     return Beside.slowly(look.z.astype(float), numbers)
+
+
+def are_waves(waves: Law, slow: Sequence[Law]) -> bool:
+    """Whether waves explain more than slow pushes by axis do.
+
+    They move all axes at once by four numbers; pushes that only revert are half explained at most.
+    """
+    forces, all_axes = (
+        sum(max(law.heldout_gain, 0.0) for law in slow if law.where in axes)
+        for axes in (AXES[:3], AXES)
+    )
+    return waves.heldout_gain > max(_TIMES * forces, all_axes)
 
 
 def _drawn(screen: Screen, v: np.ndarray, a: np.ndarray, spread: np.ndarray) -> Beside:
@@ -95,80 +112,117 @@ def _bends() -> np.ndarray:
 
 @dataclass(frozen=True)
 class Swell:
-    """Swell of one frequency ω (rad/s) and one direction ψ (rad), for each piece four amplitudes.
+    """Waves from one direction ψ (rad), for each piece and frequency four amplitudes.
 
     Water moves along ψ with cos θ and sin θ and up with cos θ and sin θ, θ = k (x cos ψ + y sin ψ)
     - ω t, fading with exp(k z), ω² = g k (Airy; Faltinsen 1990, table 2.1, deep water).
+
+    Attributes:
+        frequency: ω where there is most energy (rad/s).
+        direction: ψ.
+        sea: whether there are the frequencies of a wind sea, and not one alone.
     """
 
     frequency: float
     direction: float
+    sea: bool = False
+
+    @property
+    def spread(self) -> Float[np.ndarray, " k"]:
+        """Standard deviations of the amplitudes that are tried first, all together `_FIRST`."""
+        share = np.sqrt(_sea() / _sea().sum()) if self.sea else np.ones(1)
+        return _FIRST * np.repeat(share, 4)
 
     def water(
         self, bench: Bench, kept: np.ndarray
-    ) -> tuple[Float[np.ndarray, "N 3 4 R"], Float[np.ndarray, "N 3 4 R"]]:
+    ) -> tuple[Float[np.ndarray, "N 3 k R"], Float[np.ndarray, "N 3 k R"]]:
         """Velocities of 1 m/s at the surface and accelerations, in W."""
-        omega, k = self.frequency, self.frequency**2 / _GRAVITY
-        east, north = np.cos(self.direction), np.sin(self.direction)
-        X = bench.data.X[:-1][..., kept]
-        theta = k * (east * X[:, 4] + north * X[:, 5]) - omega * _times(bench, kept)
-        fade = np.exp(k * np.minimum(X[:, 6], 0.0))
-        v, a = np.zeros((2, len(theta), 3, 4, len(kept)))
-        for number, (now, rate) in enumerate(
-            ((np.cos(theta), np.sin(theta)), (np.sin(theta), -np.cos(theta)))
-        ):
-            for way, share in ((0, east), (1, north)):
-                v[:, way, number], a[:, way, number] = (
-                    share * fade * now,
-                    share * omega * fade * rate,
-                )
-            v[:, 2, 2 + number], a[:, 2, 2 + number] = fade * now, omega * fade * rate
+        X, t = bench.data.X[:-1][..., kept], _times(bench, kept)
+        ahead = np.cos(self.direction) * X[:, 4] + np.sin(self.direction) * X[:, 5]
+        motions = []
+        for omega in self.frequency * (_PARTS if self.sea else np.ones(1)):
+            k = omega**2 / _GRAVITY
+            c, s = np.cos(k * ahead - omega * t), np.sin(k * ahead - omega * t)
+            fade = np.exp(k * np.minimum(X[:, 6], 0.0))
+            motions += [(fade * c, omega * fade * s), (fade * s, -omega * fade * c)]
+        v, a = np.zeros((2, *t.shape[:1], 3, 2 * len(motions), len(kept)))
+        for number, motion in enumerate(motions):
+            along = 4 * (number // 2) + number % 2
+            for all_of_it, part in zip((v, a), motion, strict=True):
+                all_of_it[:, 0, along] = np.cos(self.direction) * part
+                all_of_it[:, 1, along] = np.sin(self.direction) * part
+                all_of_it[:, 2, along + 2] = part
         return v, a
 
 
-def find_waves(bench: Bench, look: Look) -> Law:
-    """Swell of one frequency and direction, its amplitudes drawn anew for each piece of a run.
+def _sea() -> Float[np.ndarray, " k"]:
+    """Energy of the motion at the surface in `_PARTS` of a wind sea's peak frequency.
 
-    They have one variance: z ~ N(0, I + σ² J Jᵀ). Frequency and direction from a grid, then from
-    finer ones.
+    ω² times the spectrum of Hasselmann et al. (1973) with γ = 3.3, over the ranges between.
+    """
+    x = _PARTS
+    peak = 3.3 ** np.exp(-(((x - 1) / np.where(x <= 1, 0.07, 0.09)) ** 2) / 2)
+    return x**-3.0 * np.exp(-1.25 * x**-4.0) * peak * np.gradient(x)
+
+
+def find_waves(bench: Bench, look: Look) -> Law:
+    """Waves from one direction, of one frequency or of a sea, amplitudes anew for each piece."""
+    return _found(bench, look)[1]
+
+
+def _found(bench: Bench, look: Look) -> tuple[Swell, Law]:
+    """The waves that win most, z ~ N(0, I + σ² J Jᵀ).
+
+    Frequency and direction from a grid, then from finer ones; then a sea of about that frequency.
     """
     screen = Screen(bench, look, None)
 
-    def tried(swells: list[Swell]) -> list[tuple[np.ndarray, np.ndarray]]:
+    def tried(swells: list[Swell]) -> list[Told]:
+        """What is told by each; all are alike in their number of frequencies."""
         water = [swell.water(bench, screen.kept) for swell in swells]
         J = _responses(screen, *(np.concatenate(w, axis=2) for w in zip(*water, strict=True)))
-        found = []
-        for first in range(0, len(J), 4):
-            G = _products(screen, J[first : first + 4])
-            found.append((G, run_constants(G, [1, 2, 3, 4], _EACH, screen.fold)[0]))
+        found, spread = [], swells[0].spread
+        for own in np.split(J, len(swells)):
+            G = _products(screen, own)
+            columns = list(range(1, len(own) + 1))
+            found.append(run_constants(G, columns, spread, screen.fold))
         return found
 
-    def totals(swells: list[Swell]) -> np.ndarray:
-        return np.array([gain.sum() for _, gain in tried(swells)])
+    def gains(swells: list[Swell]) -> np.ndarray:
+        return np.array([told[0].sum() for told in tried(swells)])
 
     ways = np.arange(_WAYS) * 2 * np.pi / _WAYS
     few = [Swell(omega, way) for omega in _OMEGAS for way in ways[:: _WAYS // 4]]
-    best = few[int(np.argmax(totals(few)))]
-    several = [Swell(best.frequency, way) for way in ways]
-    gains = totals(several)
-    middle = int(np.argmax(gains))
-    near = [(middle + k) % _WAYS for k in (-1, 0, 1)]
-    direction, unsure = _peak(ways[middle] + 2 * np.pi / _WAYS * np.array([-1, 0, 1]), gains[near])
-    finer = [Swell(best.frequency + step, direction) for step in _FINER]
-    gains = totals(finer)
-    omega, error = _peak(np.array([swell.frequency for swell in finer]), gains)
+    best = few[int(np.argmax(gains(few)))]
+    won = gains([Swell(best.frequency, way) for way in ways])
+    middle = int(np.argmax(won))
+    near = won[[(middle + k) % _WAYS for k in (-1, 0, 1)]]
+    apart = 2 * np.pi / _WAYS * np.array([-1.0, 0.0, 1.0])
+    direction, unsure = _peak(ways[middle] + apart, near)
+    finer = best.frequency + np.array(_FINER)
+    omega, error = _peak(finer, gains([Swell(w, direction) for w in finer]))
     best = Swell(omega, direction)
-    G, heldout = tried([best])[0]
-    std = run_constants(G, [1, 2, 3, 4], _EACH, screen.fold)[1]["std"]
-    a = -np.linalg.solve(G[:, 1:, 1:] + np.eye(4) / max(std, 1e-3) ** 2, G[:, 1:, 0][..., None])
-    speeds = np.sqrt(np.mean(a[:, :2, 0] ** 2, axis=1))
-    speed = float(np.sqrt(np.mean(speeds**2)))
-    spread = float(np.std(speeds**2) / np.sqrt(len(speeds)) / (2 * max(speed, 1e-9)))
-    turned = float(np.angle(np.exp(1j * direction)))
-    values = {"speed": speed, "frequency": omega, "direction": turned}
-    unsure = {"speed": spread, "frequency": error, "direction": unsure}
+    heldout, values, loss = tried([best])[0]
+    # slow swell looks nearly alike from ahead and from astern
+    both = (direction, direction + np.pi)
+    seas = [Swell(share * omega, way, True) for share in _ABOUT for way in both]
+    for sea, told in zip(seas, tried(seas), strict=True):
+        if told[0].sum() > heldout.sum():
+            best, (heldout, values, loss), error = sea, told, 0.05 * sea.frequency
+    speed, spread = _size(values["std"], loss, best.spread[0] / _FIRST)
+    turned = float(np.angle(np.exp(1j * best.direction)))
+    numbers = {"speed": speed, "frequency": best.frequency, "direction": turned}
+    errors = {"speed": spread, "frequency": error, "direction": unsure}
     share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
-    return Law("waves", "W", values, heldout * share, errors=unsure)
+    return best, Law("waves", "W", numbers, heldout * share, errors=errors)
+
+
+def _size(std: float, loss: Callable[[np.ndarray], np.ndarray], part: float) -> tuple[float, float]:
+    """Most likely speed of which `part` has the standard deviation `std`, and its error."""
+    logs = np.log(max(std, 1e-9)) + np.linspace(-0.4, 0.4, 9)
+    top, error = _peak(logs, -np.array([loss(np.array([at])).sum() for at in logs]))
+    speed = float(np.exp(top)) / part
+    return speed, speed * float(error)
 
 
 def _peak(at: np.ndarray, gains: np.ndarray) -> tuple[float, float]:

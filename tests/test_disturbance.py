@@ -8,6 +8,9 @@ from hidden.draw import draw
 from hidden.effects_environment import Waves
 from hidden.scenarios import Plan
 
+from spinndrift.models.effects import Extended
+from spinndrift.models.effects.drag import LinearDrag
+from spinndrift.models.errors import UserError
 from spinndrift.models.recording_csv import read_csv
 from spinndrift.models.vehicle import load_vehicle
 from spinndrift.training.diagnosis.beside import Beside
@@ -183,3 +186,13 @@ def test_drag_stays_passive_and_wild_steps_are_tamed(bench_of):
     heavy = np.repeat(bench.believed[:, None], len(bench.data.fold), 1)
     heavy[bench.library.at("linear_drag", "yaw"), 3] = -3000.0
     assert np.flatnonzero(bench._wild(heavy)).tolist() == [3]
+
+
+def test_a_belief_that_diverges_on_the_data_is_told(tmp_path):
+    """Drag that drives the vehicle, a thousand times too large: a sentence, and no traceback."""
+    draw(3, "null", plan=Plan(runs=1, seconds=3.0)).write(tmp_path / "data")
+    drag = LinearDrag.neutral()
+    drag = replace(drag, values=drag.values.at[0].set(-1e6))
+    belief = Extended.create(VEHICLE.dynamics(), (drag,), VEHICLE.thrusters())
+    with pytest.raises(UserError, match="unstable on these data"):
+        Diagnoser(read_csv(tmp_path / "data"), VEHICLE, belief).run()

@@ -18,7 +18,7 @@ from spinndrift.training.diagnosis.diagnose import Diagnoser
 from spinndrift.training.diagnosis.disturbance import SLOW, all_laws, is_apart, laws_of, told
 from spinndrift.training.diagnosis.noise import estimate
 from spinndrift.training.diagnosis.search import Found, Search
-from spinndrift.training.diagnosis.waves import find_waves
+from spinndrift.training.diagnosis.waves import beside_laws, find_waves
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 LEVELS = np.array([1.0] * 3 + [0.03] * 3)
@@ -88,6 +88,18 @@ def test_no_name_imitates_a_large_random_structure(bench_of, name):
     assert best > 100
     assert choice is None
     assert max(f.heldout_gain for f in fits.values()) < 0.3 * best
+
+
+def test_water_is_drawn_for_every_piece(bench_of):
+    """Scenarios of unequal numbers of runs: none of their pieces is left out."""
+    bench, _ = bench_of("current_varying", 1.0)
+    scenario = np.where(np.arange(20) < 15, 0, np.arange(20))
+    bench = replace(bench, data=replace(bench.data, scenario=scenario))
+    look = bench.look(bench.believed)
+    beside = beside_laws(bench, look, [w for w in laws_of(bench, look) if "current" in w.name])
+    assert beside.drawn is not None
+    assert beside.drawn.shape[2] == 20
+    assert replace(bench, beside=beside).look(bench.believed, []).loss < look.loss
 
 
 @pytest.mark.parametrize("loop", ["open", "closed"])

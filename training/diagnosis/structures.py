@@ -109,12 +109,13 @@ class Screen:
         bench: Bench,
         look: Look,
         beside: Float[np.ndarray, "m N12 R"] | None,
-        pieces: int = PIECES,
+        whole: bool = False,
     ):
+        """On all pieces if `whole`, else on so many of each fold that `PIECES` are not exceeded."""
         self.bench, self.look = bench, look
         data = bench.data
         labels = np.unique(data.fold)
-        each = max(1, pieces // len(labels))
+        each = len(data.fold) if whole else max(1, PIECES // len(labels))
         chosen: list[int] = []
         for label in labels:
             own = np.flatnonzero(data.fold == label)

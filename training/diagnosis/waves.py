@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from ...models.effects.base import AXES
 from .beside import Beside
+from .gram import gram
 from .laws import Law, Told, estimated, run_constants
 from .looking import Bench, Look
 from .structures import Screen
@@ -38,13 +39,13 @@ def beside_laws(bench: Bench, look: Look, laws: Sequence[Law]) -> Beside:
     pushes = sum(law.heldout_gain for law in slow)
     current = max((law.heldout_gain for law in laws if law.name == "current_varying"), default=0.0)
     if current > pushes:
-        whole = Screen(bench, look, None, len(bench.data.fold))
+        whole = Screen(bench, look, None, whole=True)
         v = _flow(bench, whole.kept)
         return _drawn(whole, v, np.zeros_like(v), _bends())
     if slow:
         swell, waves = _found(bench, look)
         if are_waves(waves, slow):
-            whole = Screen(bench, look, None, len(bench.data.fold))
+            whole = Screen(bench, look, None, whole=True)
             return _drawn(whole, *swell.water(bench, whole.kept), swell.spread)
     numbers = {}
     for law in slow:
@@ -83,8 +84,7 @@ def _responses(screen: Screen, v: np.ndarray, a: np.ndarray) -> Float[np.ndarray
 
 
 def _products(screen: Screen, J: np.ndarray) -> Float[np.ndarray, "R m m"]:
-    columns = np.concatenate([screen.z[:1], J]).astype(np.float64)
-    return np.einsum("iar,jar->rij", columns, columns, optimize=True)
+    return gram(np.concatenate([screen.z[:1], J]).astype(np.float64))
 
 
 def _times(bench: Bench, kept: np.ndarray) -> Float[np.ndarray, "N R"]:

@@ -29,6 +29,7 @@ from spinndrift.training.predict import predict
 from spinndrift.training.step import (
     QUICK_COMPILE,
     TrainStep,
+    first_moments,
     mean_over_devices,
     partition,
     usable_devices,
@@ -105,7 +106,7 @@ def step_case(model: Spinn, **settings: Any) -> Callable[[], Any]:
     params, static = partition(model)
     step = TrainStep(config, params, static, cores())
     kept = jax.tree.map(jnp.array, params)
-    state = [(kept, step.optimizer.init(kept))]
+    state = [(kept, first_moments(config, kept))]
     built, data = objective.build(model, windows()), Batch.of(windows())
 
     def run() -> Any:

@@ -25,7 +25,7 @@ from spinndrift.training.objective import Batch
 from spinndrift.training.pretrain import coefficient_error, pretrain
 from spinndrift.training.run_folder import RunFolder
 from spinndrift.training.start import estimate_diffusion
-from spinndrift.training.step import TrainStep, learning_rate, partition
+from spinndrift.training.step import TrainStep, first_moments, learning_rate, partition
 
 TRUTH = Diagonal.of(mass=10.0, drag=8.0, diffusion=1.0)
 START = Diagonal.of(mass=14.0, drag=5.0, diffusion=2.0)
@@ -76,7 +76,7 @@ def test_the_step_is_traced_once_and_returns_what_it_takes(windows):
     step = TrainStep(CONFIG, params, static)
     objective = OBJECTIVE.build(START, windows)
     params = jax.tree.map(jnp.array, params)
-    moments = step.optimizer.init(params)
+    moments = first_moments(CONFIG, params)
     data = Batch.of(windows)
     kinds = [(a.dtype, a.weak_type) for a in jax.tree.leaves((params, moments))]
     for number in range(3):

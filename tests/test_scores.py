@@ -7,7 +7,7 @@ import pytest
 
 from spinndrift.models import se3
 from spinndrift.training.kernels import ChordalKernel, GeodesicKernel, VelocityKernel
-from spinndrift.training.scores import kernel_score, shifts, time_pairs
+from spinndrift.training.scores import kernel_score, partners, shifts, time_pairs
 
 N, P, W = 2, 8, 4000
 SPREAD = jnp.asarray([0.1, 0.2, 0.3, 0.1, 0.2, 0.3])
@@ -192,3 +192,10 @@ def test_the_scores_gradient_is_finite_where_all_samples_coincide():
         jax.grad(lambda X: jnp.sum(kernel_score(kernel, X, X[:, :, 0], FIRST, SECOND)))
     )(X)
     assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize(("count", "kept"), [(5, None), (8, None), (8, 2)])
+def test_partners_are_the_samples_turned_by_each_shift(count, kept):
+    samples = jax.random.normal(jax.random.key(9), (2, 3, count, 4))
+    turned = [jnp.roll(samples, -s, axis=-2) for s, _ in shifts(count, kept)]
+    np.testing.assert_array_equal(partners(samples, kept), jnp.stack(turned, axis=-3))

@@ -27,10 +27,10 @@ from .run_folder import RunFolder, TrainState
 from .step import (
     Report,
     TrainStep,
+    first_moments,
     learning_rate,
     mean_over_devices,
     on_all,
-    optimizer,
     partition,
     usable_devices,
 )
@@ -116,7 +116,7 @@ class Run:
         # the step donates its inputs: never the caller's own arrays
         self.state = TrainState(
             params=jax.tree.map(jnp.array, params),
-            moments=optimizer(config).init(params),
+            moments=first_moments(config, params),
             objective=config.objective.build(model, windows),
             best=jax.tree.map(jnp.array, params),
         )

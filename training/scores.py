@@ -35,11 +35,18 @@ def shifts(samples: int, count: int | None = None) -> list[tuple[int, float]]:
 
 
 def partners(samples: Float[Array, "C L P W"], pair_shifts: int | None) -> Array:
-    """The samples' partners under each cyclic shift, (C, L, S, P, W), made of slices alone."""
-    P = samples.shape[-2]
-    twice = jnp.concatenate([samples, samples], axis=-2)
-    slices = [twice[..., s : s + P, :] for s, _ in shifts(P, pair_shifts)]
-    return jnp.stack(slices, axis=-3)
+    """The samples' partners under each cyclic shift, (C, L, S, P, W), without gather.
+
+    The samples repeated and laid in rows of P + 1: row s begins s places further round. (Shifts
+    sliced one by one are as many operations, which take long to compile.)
+    """
+    *lead, P, W = samples.shape
+    rows = len(shifts(P, pair_shifts)) + 1
+    needed = rows * (P + 1)
+    repeats = -(-needed // P)
+    repeated = jnp.broadcast_to(samples[..., None, :, :], (*lead, repeats, P, W))
+    flat = repeated.reshape(*lead, repeats * P, W)[..., :needed, :]
+    return flat.reshape(*lead, rows, P + 1, W)[..., 1:, :P, :]
 
 
 def time_pairs(

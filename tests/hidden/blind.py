@@ -24,6 +24,7 @@ from .effects import CAUSES, UNKNOWN
 from .faults import spoil
 from .oracle import predict
 from .scenarios import Plan
+from .simulator import Noise
 from .vehicle import Vehicle
 from .write import STATE, write_folder
 
@@ -45,10 +46,16 @@ DATA: dict[str, Callable[[Plan], Plan]] = {
     "fast": lambda plan: replace(plan, rate=50.0),
     "long": lambda plan: replace(plan, scenarios=10, runs=1, seconds=60.0, loop="closed"),
     "pwm": lambda plan: replace(plan, form="pwm"),
+    **dict.fromkeys(("calm", "exact", "coarse"), lambda plan: plan),
 }
 """How it is recorded: commands played, a pilot in closed loop, uneven time steps, 60 s in all, at
-10 or 50 Hz, a pilot's runs of a minute each, commands as PWM with each run's voltage."""
-NOMINAL = (*(float(b) for b in disturbance.NOMINAL_DIFFUSION),)
+10 or 50 Hz, a pilot's runs of a minute each, commands as PWM with each run's voltage; and `NOISE`."""
+NOISE = {
+    "calm": Noise(diffusion=tuple(0.05 * b for b in Noise().diffusion)),
+    "exact": Noise(velocity=0.0, rate=0.0, attitude=0.0, position=0.0),
+    "coarse": Noise(velocity=0.02, rate=0.004, attitude=0.007, position=0.02),
+}
+"""Hardly a disturbance, nothing but it, and instruments four times as noisy."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +95,7 @@ class Blind:
             "size": self.size,
             "data": self.data,
             "causes": [told(e) for e in case.effects],
-            "diffusion": list(NOMINAL),
+            "diffusion": list(case.noise.diffusion),
             "every": every(case),
             "problems": problems,
             "limits": limits,
@@ -234,13 +241,17 @@ def table(
 ) -> Iterator[Blind]:
     """Singles of every cause at each size, effects without a name, nulls, mixtures, faulty data.
 
-    Other `data` than the usual are there for singles of realistic size alone.
+    Other `data` than the usual are there for singles of realistic size and some nulls alone.
     """
     for variety in (d for d in data if d != "usual"):
+        given = {"plan": DATA[variety](plan), "noise": NOISE.get(variety)}
         for k, name in enumerate(CAUSES):
             for i in range(seeds):
-                case = draw(1000 * (i + 1) + k, names=(name,), plan=DATA[variety](plan))
+                case = draw(1000 * (i + 1) + k, names=(name,), **given)
                 yield Blind(f"{name}-{variety}-{i}", "single", case, data=variety)
+        for i in range(nulls // 5):
+            case = draw(51_000 + i, "null", **given)
+            yield Blind(f"null-{variety}-{i}", "null", case, data=variety)
     if "usual" not in data:
         return
     for size in sizes:

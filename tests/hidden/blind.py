@@ -49,7 +49,7 @@ DATA: dict[str, Callable[[Plan], Plan]] = {
     **dict.fromkeys(("calm", "exact", "coarse"), lambda plan: plan),
 }
 """How it is recorded: commands played, a pilot in closed loop, uneven time steps, 60 s in all, at
-10 or 50 Hz, a pilot's runs of a minute each, commands as PWM with each run's voltage; and `NOISE`."""
+10 or 50 Hz, a pilot's runs of a minute each, commands as PWM with each run's voltage; `NOISE`."""
 NOISE = {
     "calm": Noise(diffusion=tuple(0.05 * b for b in Noise().diffusion)),
     "exact": Noise(velocity=0.0, rate=0.0, attitude=0.0, position=0.0),

@@ -215,7 +215,7 @@ class MppiImpedance(Controller):
             SphereHull.cover(vehicle.size),
             self.goal.pose(),
             config=c,
-            tracking=self.tracking.gains.matrices(model) if c.tracked else None,
+            tracking=self.tracking.gains.matrices(model),
         )
         return self.tracking.build(station, Mppi(planner), c.layout, model, c.period)
 

@@ -55,6 +55,8 @@ class MppiConfig:
             noise leaves out (state estimate, obstacle positions).
         tracked: the noise paths are held to the plan by the tracking controller's gains, as the
             vehicle will be; false lets them stray over the whole horizon.
+        hold_attitude: sequences are sampled beyond the wrench with which the tracking controller's
+            gains turn the vehicle to the goal's attitude; false samples all of the wrench.
         shown_paths: sampled paths in the output for reports.
         threads: the sequences are rolled out in so many parts, each in a thread of its own.
     """
@@ -85,6 +87,7 @@ class MppiConfig:
     risk_weight: float = 300.0
     clearance_std: float = 0.08
     tracked: bool = True
+    hold_attitude: bool = True
     shown_paths: int = 48
     threads: int = 2
 

@@ -30,13 +30,19 @@ _WORST = 1e3
 
 
 class MppiState(eqx.Module):
-    """What one call hands to the next: the wrenches planned from the time of the last call on."""
+    """What one call hands to the next: the sequence chosen, from the time of the last call on.
+
+    What turns the vehicle to the goal's attitude comes on top of it (`MppiPlanner`).
+    """
 
     F_Bo_B: Float[Array, "horizon 6"]
 
 
 class MppiOutput(NamedTuple):
-    """The plan and what it was chosen from; times k dt with k = 0 … H count from the call."""
+    """The plan and what it was chosen from; times k dt with k = 0 … H count from the call.
+
+    `F_Bo_B` is all that the planned vehicle is given, what holds its attitude included.
+    """
 
     X_WB: Float[Array, "7 n"]
     V_WB_B: Float[Array, "6 n"]
@@ -94,6 +100,11 @@ class MppiPlanner(eqx.Module):
     will be: the two paths of a pair are drawn to their middle, which stands for the path without
     noise, by K_p log(g⁻¹ g_mid) + K_d (ξ_mid − ξ). Without them a path strays ever further, as the
     problem above has it, and the plan shuns gaps that the tracked vehicle passes safely.
+
+    With `tracking` gains and `hold_attitude`, what is sampled are wrenches beyond K_p and K_d of
+    the attitude alone, with which every path is turned to the goal's attitude, in all one wrench of
+    U. A hull that makes way is turned broadside by Munk's moment (Fossen 2011, section 6.3.1):
+    hardly any sequence of wrenches alone keeps its attitude over the horizon, least in a current.
 
     The noise of the sequences is that of the wrench which the body feels. Where the model's thrust
     is not what is commanded (a weak thruster, say), commands are sampled that together make it;
@@ -209,7 +220,7 @@ class MppiPlanner(eqx.Module):
         """
         X, V, bias = self._cast(X_WB, V_WB_B, F_bias_W)
         n = F_Bo_B.shape[2]
-        return self._rollouts(X, V, F_Bo_B, bias, dW, lambda X, V: (X[4:, :n],), before)
+        return self._rollouts(X, V, F_Bo_B, bias, dW, lambda X, V, F: (X[4:, :n],), before)
 
     def choose(
         self,
@@ -232,7 +243,13 @@ class MppiPlanner(eqx.Module):
         candidates = jnp.stack([mean, best, draw.nominal], axis=2)
         quiet = None if dW is None else jnp.concatenate([dW, jnp.zeros_like(dW[..., :1])], axis=3)
         tried = self._rollouts(
-            X, V, candidates, bias, quiet, lambda X, V: (X[:, -3:], V[:, -3:]), draw.before
+            X,
+            V,
+            candidates,
+            bias,
+            quiet,
+            lambda X, V, F: (X[:, -3:], V[:, -3:], F[:, -3:]),
+            draw.before,
         )
         if dW is not None:
             tried = Rolled(tried.cost[:-1], tried.clearance[:-1], tried.states)
@@ -242,14 +259,15 @@ class MppiPlanner(eqx.Module):
         plan = candidates[:, :, chosen]
         Xs = jnp.concatenate([X[:, None], tried.states[0][:, :, chosen].T], axis=1)
         Vs = jnp.concatenate([V[:, None], tried.states[1][:, :, chosen].T], axis=1)
-        valid = jnp.isfinite(candidate_cost[chosen]) & jnp.all(jnp.isfinite(plan))
+        given = tried.states[2][:, :, chosen].T
+        valid = jnp.isfinite(candidate_cost[chosen]) & jnp.all(jnp.isfinite(given))
         hold = jnp.broadcast_to(self.hold_wrench(jnp.zeros_like(bias))[None], plan.shape)
         stride = max(1, c.sequences // c.shown_paths)
         shown = slice(0, stride * min(c.shown_paths, c.sequences), stride)
         output = MppiOutput(
             X_WB=Xs,
             V_WB_B=Vs,
-            F_Bo_B=plan.T,
+            F_Bo_B=given,
             valid=valid,
             cost=candidate_cost[chosen],
             collision_probability=probability[chosen],
@@ -320,10 +338,31 @@ class MppiPlanner(eqx.Module):
         m, h = c.steps_of_model, c.dt / c.steps_of_model
         shape = (c.horizon * m, 6, c.realisations // 2)
         dW = jax.random.normal(key, shape, self.V_goal.dtype) * h**0.5
-        if self.tracking is None:
+        if not self._tracked:
             sampled = jnp.mean(jnp.cumsum(dW, axis=0) ** 2, axis=(0, 2))
             dW = dW * jnp.sqrt(h * (c.horizon * m + 1) / 2 / sampled)[None, :, None]
         return jnp.concatenate([dW, -dW], axis=2).reshape(c.horizon, m, 6, c.realisations)
+
+    @property
+    def _tracked(self) -> bool:
+        return self.tracking is not None and self.config.tracked
+
+    def _turned(self, F: Array, X: Array, V: Array, n: int) -> Array:
+        """Wrenches and what turns n sequences' vehicles to the goal's attitude, cut to U.
+
+        The two paths of a pair get the same, that of their middle: what draws them to it is not
+        planned (`_pull`).
+        """
+        if self.tracking is None or not self.config.hold_attitude:
+            return F
+        K_p, K_d = (gain[3:, 3:] for gain in self.tracking)
+        to_goal = se3.local(X, self.X_WG)[3:]
+        moment = K_p @ to_goal + K_d @ (self.V_goal[3:, None] - V[3:])
+        pairs = self.config.realisations // 2 * n
+        if moment.shape[1] > n:
+            first, second, rest = jnp.split(moment, [pairs, 2 * pairs], axis=1)
+            moment = jnp.concatenate([(first + second) / 2] * 2 + [rest], axis=1)
+        return self.limits.clip(F + jnp.concatenate([jnp.zeros_like(moment), moment]))
 
     def _pull(self, X: Array, V: Array, n: int) -> Array:
         """What tracking adds for n sequences: it draws each path to the middle of its pair."""
@@ -371,8 +410,9 @@ class MppiPlanner(eqx.Module):
         def advance(carry, inputs):
             X, V, cost, least, memory = carry
             F, dW, terminal = inputs
-            wrench, later = jnp.tile(F, (1, r)), _in_body(X, bias)
-            if self.tracking is not None and dW is not None:
+            planned, later = self._turned(jnp.tile(F, (1, r)), X, V, n), _in_body(X, bias)
+            wrench = planned
+            if self._tracked and dW is not None:
                 wrench = wrench + self._pull(X, V, n)
             wrenches = [wrench + later] * c.steps_of_model
             if self.dynamics.remembers:
@@ -386,7 +426,7 @@ class MppiPlanner(eqx.Module):
             near = jnp.maximum(1 - distance / c.margin, 0)
             cost = cost + (c.dt + terminal) * self._state_cost(X, V)
             cost = cost + c.dt * c.margin_weight * near * near
-            return (X, V, cost, jnp.minimum(least, distance), memory), keep(X, V)
+            return (X, V, cost, jnp.minimum(least, distance), memory), keep(X, V, planned)
 
         memory = ()
         if self.dynamics.remembers:

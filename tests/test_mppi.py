@@ -20,12 +20,13 @@ from spinndrift.models.errors import UserError
 from spinndrift.models.integrate import rollout
 from spinndrift.models.rigid_body import FossenDynamics
 from spinndrift.models.vehicle import load_vehicle
+from spinndrift.systems.impedance import ImpedanceGains
 from spinndrift.systems.mppi import FIGURES, Mppi, key_from_gaussians
 from spinndrift.systems.mppi_config import MppiConfig
 from spinndrift.systems.mppi_core import MppiPlanner, MppiState, command_of_felt
 from spinndrift.systems.obstacles import Cylinders, Pylon, SphereHull
 from spinndrift.systems.plan_samples import SampleLayout
-from spinndrift.systems.wrench_limits import BoxLimits
+from spinndrift.systems.wrench_limits import BoxLimits, ThrusterLimits
 
 HULL = SphereHull.cover((0.4, 0.4, 0.3), (1, 1))
 MASS = np.diag([20.0, 20.0, 20.0, 1.0, 1.0, 1.0])
@@ -206,6 +207,52 @@ def test_weights_sum_to_one_and_the_plan_is_the_models_own_path():
     np.testing.assert_allclose(plan.V_WB_B[:, 1:].T, V, atol=2e-5)
 
 
+def test_the_attitude_is_held_by_part_of_the_plans_own_wrench():
+    """The plan holds what the planned vehicle is given, within U, and leads where it says."""
+    gains = (np.diag([0.0, 0.0, 0.0, 4.0, 4.0, 4.0]), np.diag([0.0, 0.0, 0.0, 4.0, 4.0, 4.0]))
+    planner = among(0.5, pylons=[], tracking=gains)
+    turned = se3.exp(jnp.array([0.0, 0.0, 0.0, 0.3, -0.2, 1.5], jnp.float32))
+    _, plan = settle(planner, turned, NONE, 1)
+    hold, limit = np.asarray(planner.hold_wrench(NONE.astype("f4"))), np.asarray(LIMIT.limit)[:, None]
+    assert np.all(np.abs(plan.F_Bo_B) <= limit * (1 + 1e-6))
+    assert np.abs(plan.F_Bo_B[3:, 0] - hold[3:]).max() > 2  # from the first step
+    X, _ = rollout(
+        planner.dynamics, plan.X_WB[:, 0], plan.V_WB_B[:, 0], plan.F_Bo_B.T, 0.1, substeps=2
+    )
+    np.testing.assert_allclose(plan.X_WB[:, 1:].T, X, atol=2e-5)
+    np.testing.assert_allclose(plan.X_WB[:4, -1], [1, 0, 0, 0], atol=0.05)
+
+
+def test_in_a_current_a_held_attitude_keeps_sampled_vehicles_on_course():
+    """Munk's moment turns a hull that makes way against a current; 4 s of wrenches can't help."""
+    vehicle = load_vehicle("bluerov2_heavy")
+    current = kind("current_steady").of("W", east=-0.25, north=0.35)
+    start, zero = at(0.0).astype("f4"), jnp.zeros(6, jnp.float32)
+
+    @eqx.filter_jit
+    def ends(p):
+        F = p.sample(jax.random.key(2), p.init().F_Bo_B, zero)
+        return p._rollouts(start, zero, F, zero, None, lambda X, V, F: (X, F)).states
+
+    broadside = []
+    for held in (True, False):
+        planner = MppiPlanner(
+            Extended.create(vehicle.dynamics(), (current,), vehicle.thrusters()),
+            ThrusterLimits.create(vehicle.thrusters(), fraction=0.8),
+            Cylinders.create([]),
+            SphereHull.cover(vehicle.size),
+            at(3.0),
+            config=MppiConfig(realisations=1, hold_attitude=held),
+            tracking=ImpedanceGains().matrices(vehicle.dynamics()),
+        )
+        X, F = ends(planner)
+        turn = np.linalg.norm(np.asarray(se3.local(X[-1], start))[3:], axis=0)
+        broadside.append(np.mean(turn > np.pi / 4))
+        np.testing.assert_allclose(planner._cut(F), F, atol=1e-3)
+    assert broadside[0] < broadside[1] / 5
+    assert broadside[1] > 0.3
+
+
 def test_wrenches_stay_in_the_feasible_set():
     planner = among(goal=at(50.0))
     _, plan = settle(planner, at(0.0), NONE, 6)
@@ -262,7 +309,7 @@ def test_a_tracked_vehicle_may_pass_closer_than_one_left_to_the_noise():
         zero = jnp.zeros(6, jnp.float32)
         roll = jax.jit(
             lambda p, dW, F=F, zero=zero: p._rollouts(
-                at(0.0).astype("f4"), zero, F, zero, dW, lambda X, V: (X[4:],)
+                at(0.0).astype("f4"), zero, F, zero, dW, lambda X, V, F: (X[4:],)
             )
         )
         spreads.append(jnp.var(roll(planner, dW).states[0][60:, 0], axis=1).mean())

@@ -183,7 +183,7 @@ def test_the_planner_knows_that_commands_come_late():
     F = jnp.zeros((10, 6, 1), jnp.float32).at[:, 0].set(-4.0)
     before = jnp.asarray(SURGE, jnp.float32)
     roll = jax.jit(
-        lambda F, before: planner._rollouts(X, V, F, V, None, lambda X, V: (V[0],), before)
+        lambda F, before: planner._rollouts(X, V, F, V, None, lambda X, V, F: (V[0],), before)
     )
     speed = np.asarray(roll(F, before).states[0])[:, 0]
     expected = np.cumsum(np.repeat([PUSH, -4.0], [2, 8])) / MASS * 0.1

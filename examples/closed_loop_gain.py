@@ -73,7 +73,7 @@ def hidden_causes(seed: int = 1) -> dict[str, Hidden]:
     try:
         from hidden.blind import SCALES, told
         from hidden.draw import Case
-        from hidden.effects_actuation import ThrusterGain, ThrustScale
+        from hidden.effects_actuation import ActuationDelay, ThrusterGain, ThrusterLag, ThrustScale
         from hidden.effects_body import NetBuoyancy
         from hidden.effects_environment import CurrentSteady
     except ModuleNotFoundError as error:
@@ -86,6 +86,8 @@ def hidden_causes(seed: int = 1) -> dict[str, Hidden]:
         "weak_thrust": ThrustScale(scale=0.5),
         "current": CurrentSteady(east=-0.25, north=0.35),
         "ballast": NetBuoyancy(force=-20.0),
+        "lag": ThrusterLag(tau=0.4),
+        "delay": ActuationDelay(seconds=0.25),
     }
     found = {}
     for name, effect in effects.items():

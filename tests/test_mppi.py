@@ -213,7 +213,7 @@ def test_the_attitude_is_held_by_part_of_the_plans_own_wrench():
     planner = among(0.5, pylons=[], tracking=gains)
     turned = se3.exp(jnp.array([0.0, 0.0, 0.0, 0.3, -0.2, 1.5], jnp.float32))
     _, plan = settle(planner, turned, NONE, 1)
-    hold, limit = np.asarray(planner.hold_wrench(NONE.astype("f4"))), np.asarray(LIMIT.limit)[:, None]
+    hold, limit = planner.hold_wrench(NONE.astype("f4")), np.asarray(LIMIT.limit)[:, None]
     assert np.all(np.abs(plan.F_Bo_B) <= limit * (1 + 1e-6))
     assert np.abs(plan.F_Bo_B[3:, 0] - hold[3:]).max() > 2  # from the first step
     X, _ = rollout(

@@ -28,6 +28,7 @@ from spinndrift.training.diagnosis.noise import (
 from spinndrift.training.diagnosis.responses import respond
 from spinndrift.training.diagnosis.result import Diagnosis, schema
 from spinndrift.training.diagnosis.search import Found, Search
+from spinndrift.training.diagnosis.transition import Transition
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(runs=2, seconds=6.0)
@@ -49,7 +50,9 @@ def test_the_filter_whitens_a_linear_system(even):
     dt, N, R = 0.05, 60, 300
     step = np.full((N, R), dt) if even else dt * rng.choice([0.4, 0.8, 1.1, 1.6], (N, R))
     noise = Noise(np.full(12, 0.02), np.full(6, 1.0))
-    kalman = make_filter(noise, scipy.linalg.expm(J * dt), np.eye(6) / 10, dt, step)
+    kalman = make_filter(
+        noise, Transition.constant(scipy.linalg.expm(J * dt)), np.eye(6) / 10, dt, step
+    )
     assert kalman.keep.shape[-1] == (1 if even else R)
     moves = {}
     for h in np.unique(step):

@@ -18,6 +18,7 @@ from spinndrift.training.diagnosis.diagnose import Diagnoser
 from spinndrift.training.diagnosis.disturbance import SLOW, all_laws, is_apart, laws_of, told
 from spinndrift.training.diagnosis.noise import estimate
 from spinndrift.training.diagnosis.search import Found, Search
+from spinndrift.training.diagnosis.transition import Transition
 from spinndrift.training.diagnosis.waves import beside_laws, find_waves
 
 VEHICLE = load_vehicle("bluerov2_heavy")
@@ -181,7 +182,7 @@ def test_states_known_exactly_are_not_taken_for_estimates(bench_of):
     mass = bench.mass(bench.believed)
     w = np.linalg.solve(mass, LEVELS[:, None] * rng.standard_normal((6, 200 * 30)))
     error = np.concatenate([0.025 * w, w]).reshape(12, 200, 30).swapaxes(0, 1) * np.sqrt(0.05)
-    noise = estimate(error, np.ones((200, 30)), A, mass, 0.05)
+    noise = estimate(error, np.ones((200, 30)), Transition.constant(A), mass, 0.05)
     assert not noise.estimated
     np.testing.assert_allclose(noise.diffusion, LEVELS, rtol=0.05)
 

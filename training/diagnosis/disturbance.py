@@ -12,7 +12,8 @@ from .data import Data
 from .gain import white_part
 from .laws import Law, estimated, find_laws, growth_alone, run_constants
 from .looking import Bench, Look
-from .noise import Noise, estimate, filtered, make_filter, mean_jacobian
+from .noise import Noise, estimate, filtered, make_filter
+from .transition import Transition
 from .waves import are_waves, find_waves
 
 _BLOW = 4.0
@@ -139,8 +140,8 @@ def _without_blows(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
     near[1:] |= hit[:-1]
     near[:-1] |= hit[1:]
     weight = data.weight * ~near
-    A = mean_jacobian(jacobian, weight)
-    return estimate(error, weight, A, bench.mass(look.theta), data.dt).diffusion
+    steps = Transition.along(jacobian, weight)
+    return estimate(error, weight, steps, bench.mass(look.theta), data.dt).diffusion
 
 
 def is_apart(law: Law, bench: Bench) -> bool:
@@ -174,15 +175,15 @@ def find_levels(bench: Bench, look: Look) -> list[Law]:
     for k, label in enumerate(labels):
         own = data.fold == label
         rest = data.weight * (~own if not own.all() else 1)
-        A = mean_jacobian(jacobian, rest)
-        noise = estimate(error, rest, A, mass, data.dt)
+        steps = Transition.along(jacobian, rest)
+        noise = estimate(error, rest, steps, mass, data.dt)
         levels[k] = noise.diffusion
-        score = _score(error, jacobian, data, own, noise, A, inverse)
+        score = _score(error, jacobian, data, own, noise, steps, inverse)
         for i in np.flatnonzero(believed > 0):
             b = noise.diffusion.copy()
             b[i] = believed[i]
             other = type(noise)(noise.record, b)
-            gain[i, own] = score - _score(error, jacobian, data, own, other, A, inverse)
+            gain[i, own] = score - _score(error, jacobian, data, own, other, steps, inverse)
     found, n = [], len(labels)
     for i in np.flatnonzero(believed > 0):
         spread = np.sqrt((n - 1) / n * np.sum((levels[:, i] - levels[:, i].mean()) ** 2))
@@ -195,10 +196,10 @@ def find_levels(bench: Bench, look: Look) -> list[Law]:
 
 def _score(
     error: np.ndarray, jacobian: np.ndarray, data: Data, own: np.ndarray, noise: Noise,
-    A: np.ndarray, inverse: np.ndarray,
+    steps: Transition, inverse: np.ndarray,
 ) -> Float[np.ndarray, " R"]:  # fmt: skip
     """Log density of the innovations of some pieces, up to a constant."""
-    kalman = make_filter(noise, A, inverse, data.dt, data.step[:, own])
+    kalman = make_filter(noise, steps, inverse, data.dt, data.step[:, own])
     w = data.weight[:, own]
     z = filtered(error[:, :, own], jacobian[..., own], kalman) * w[:, None]
     return -(z**2).sum(axis=(0, 1)) / 2 - (kalman.log_det * w).sum(axis=0)

@@ -24,7 +24,8 @@ from .blackbox import BlackBox, arguments
 from .innovations import Arrays, as_arrays, difference, predict, settle, substeps
 from .laws import Law
 from .looking import Bench
-from .noise import estimate, filtered, make_filter, mean_jacobian
+from .noise import estimate, filtered, make_filter
+from .transition import Transition
 
 GROUPS = {"position": slice(0, 3), "rotation": slice(3, 6), "velocity": slice(6, 9)}
 HORIZONS = (0.5, 1.0, 2.0, 4.0)
@@ -84,10 +85,10 @@ def judge(
     for label in np.unique(data.fold):
         own = data.fold == label
         rest = data.weight * (~own if not own.all() else 1)
-        A = mean_jacobian(jacobian, rest)
-        noise = estimate(error, rest, A, mass, data.dt)
+        steps = Transition.along(jacobian, rest)
+        noise = estimate(error, rest, steps, mass, data.dt)
         record[:, own], diffusion[:, own] = noise.record[:, None], noise.diffusion[:, None]
-        kalman = make_filter(noise, A, np.linalg.inv(mass), data.dt, data.step[:, own])
+        kalman = make_filter(noise, steps, np.linalg.inv(mass), data.dt, data.step[:, own])
         weight = data.weight[:, own]
         z = filtered(error[:, :, own], jacobian[..., own], kalman) * weight[:, None]
         score[own] = -(z**2).sum(axis=(0, 1)) / 2 - (kalman.log_det * weight).sum(axis=0)

@@ -22,8 +22,9 @@ from .gram import gram
 from .hypotheses import Design, Evidence, Fit
 from .innovations import Predictions, predict
 from .naming import parameters_of
-from .noise import Filter, Noise, estimate, make_filter, mean_jacobian
+from .noise import Filter, Noise, estimate, make_filter
 from .responses import respond
+from .transition import Transition
 
 _RANDOM = ("waves", "current_varying")
 """Causes that are sought as laws: their motion differs from run to run."""
@@ -159,12 +160,10 @@ class Bench:
         error, weight = np.asarray(p.error), self.data.weight
         if not np.isfinite(error[:, :, weight.any(axis=0)]).all():
             raise FloatingPointError("predictions diverge")
-        A = mean_jacobian(np.asarray(p.jacobian), weight)
-        if not np.isfinite(A).all():
-            raise FloatingPointError("slopes of predictions overflow")
+        steps = Transition.along(np.asarray(p.jacobian), weight)
         mass = self.mass(theta)
-        noise = estimate(error, weight, A, mass, self.data.dt)
-        kalman = make_filter(noise, A, np.linalg.inv(mass), self.data.dt, self.data.step)
+        noise = estimate(error, weight, steps, mass, self.data.dt)
+        kalman = make_filter(noise, steps, np.linalg.inv(mass), self.data.dt, self.data.step)
         # correlated innovations tell less than as many independent ones
         less = kalman.whiten / np.sqrt(noise.memory)[:, None, None]
         return p, noise, replace(kalman, whiten=less, memory=noise.memory)

@@ -1,7 +1,8 @@
 """Diffusion and measurement noise, from what the errors of prediction have in common.
 
 With y = x + e, r_n = e_(n+1) - A e_n + w_n has the covariances C_0 = Q + R + A R Aᵀ, C_1 = -A R and
-none further on. A slow model error adds about the same to C_1 and C_2, so C_1 - C_2 is used.
+none further on. A slow model error adds about the same to C_1 and C_2, so C_1 - C_2 is the first
+guess, from which the most likely noise is sought (`likely_noise`).
 
 States that an autopilot has estimated have no errors of their own at each sample, but slow ones:
 then R comes out as none on most axes of the twist, or of all. All that steps show is taken for
@@ -16,6 +17,9 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float, Int
 
+from .likely_noise import most_likely
+from .transition import Transition
+
 FLOOR = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4] * 3 + [1e-5] * 3)
 """Least standard deviation of a record: m, rad, m/s, rad/s."""
 _SMOOTH, _SMOOTH_OF_ALL, _NEAR, _ALIKE = 4, 8, 3.0, 0.1
@@ -25,6 +29,9 @@ these axes are correlated that much. States that are known exactly have none of 
 nor has what noise hides."""
 _LONGEST = 0.98
 """Largest correlation of neighbouring errors that is believed."""
+_BELOW = 0.1
+"""Share of `FLOOR` that is the least when the most likely noise is sought: a floor of the order of
+what the process makes of a pose within a step would be taken from the process."""
 _EVEN, _NODES = 1e-6, 8
 """Share of a step by which equal ones may differ; nodes of interpolation between uneven ones."""
 
@@ -75,11 +82,6 @@ class Filter:
         return Filter(*parts, memory=self.memory)
 
 
-def mean_jacobian(jacobian: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, "12 12"]:
-    """A averaged over all steps that exist."""
-    return np.einsum("nijr,nr->ij", jacobian, weight) / weight.sum()
-
-
 def process_covariance(
     A: Float[np.ndarray, "12 12"],
     mass_inverse: Float[np.ndarray, "6 6"],
@@ -102,37 +104,47 @@ def process_covariance(
 def estimate(
     error: Float[np.ndarray, "N 12 R"],
     weight: Float[np.ndarray, "N R"],
-    A: Float[np.ndarray, "12 12"],
+    transition: Transition,
     mass: Float[np.ndarray, "6 6"],
     dt: float,
 ) -> Noise:
-    """Noise of records and process by moments."""
+    """Noise of records and process: the most likely, from a first guess by moments."""
     C = []
     for lag in range(3):
         w = weight[lag:] * weight[: len(weight) - lag]
         a, b = error[lag:] * w[:, None], error[: len(error) - lag]
         C.append(np.einsum("nir,njr->ij", a, b) / max(w.sum(), 1.0))
+    A, inverse = transition.mean, np.linalg.inv(mass)
     R = np.diag(-np.linalg.solve(A, C[1] - C[2]))
     variance = np.maximum(R, FLOOR**2)
+    units = np.stack([process_covariance(A, inverse, b, dt) for b in np.eye(6)])
+    unit = np.diag(units.sum(axis=0))[6:]
     alike = np.diag(C[1]) > _ALIKE * np.diag(C[0])
     none, near = (alike & ((times * FLOOR) ** 2 >= R) for times in (1.0, _NEAR))
     if np.sum(none[6:]) >= _SMOOTH or np.sum(near) >= _SMOOTH_OF_ALL:
-        return _of_estimates(C[0], C[1], variance, A, mass, dt)
+        return _of_estimates(C[0], C[1], variance, A, inverse, unit, dt)
     C0 = C[0] - (C[2] + C[2].T) / 2
-    Q = C0 - np.diag(variance) - A * variance @ A.T
-    unit = process_covariance(A, np.linalg.inv(mass), np.ones(6), dt)
-    wrench = np.diag(Q)[6:] / np.diag(unit)[6:]
-    least = 1e-4 * np.diag(C[0])[6:] / np.diag(unit)[6:]
-    return Noise(np.sqrt(variance), np.sqrt(np.maximum(wrench, least)))
+    Q = C0 - np.diag(variance) - transition.of(np.diag(variance))
+    least = 1e-8 * np.diag(C[0])[6:] / unit
+    wrench = np.maximum(np.diag(Q)[6:] / unit, 1e4 * least)
+    start = np.concatenate([variance, wrench])
+    bounds = np.concatenate([(_BELOW * FLOOR) ** 2, np.maximum(least, 1e-300)])
+    found = most_likely(error, weight, transition, units, np.maximum(start, bounds), bounds)
+    return Noise(np.maximum(np.sqrt(found[:12]), FLOOR), np.sqrt(found[12:]))
 
 
 def _of_estimates(
-    C0: np.ndarray, C1: np.ndarray, variance: np.ndarray, A: np.ndarray, mass: np.ndarray, dt: float
+    C0: np.ndarray,
+    C1: np.ndarray,
+    variance: np.ndarray,
+    A: np.ndarray,
+    inverse: np.ndarray,
+    unit: np.ndarray,
+    dt: float,
 ) -> Noise:
     """Noise of states that were estimated: all in the process, with its correlation."""
-    unit = process_covariance(A, np.linalg.inv(mass), np.ones(6), dt)
-    square = np.maximum(np.diag(C0)[6:] / np.diag(unit)[6:], 1e-300)
-    own = process_covariance(A, np.linalg.inv(mass), np.sqrt(square), dt)
+    square = np.maximum(np.diag(C0)[6:] / unit, 1e-300)
+    own = process_covariance(A, inverse, np.sqrt(square), dt)
     left = np.diag(C0 - np.diag(variance) - A * variance @ A.T - own)[:6]
     correlation = np.clip(np.diag(C1) / np.maximum(np.diag(C0), 1e-300), 0.0, _LONGEST)
     return Noise(
@@ -145,18 +157,18 @@ def _of_estimates(
 
 def make_filter(
     noise: Noise,
-    A: Float[np.ndarray, "12 12"],
+    transition: Transition,
     mass_inverse: Float[np.ndarray, "6 6"],
     dt: float,
     step: Float[np.ndarray, "N R"],
 ) -> Filter:
     """The Kalman filter that starts from the first record: gains of every step.
 
-    A is that of a step of `dt` s. Where all are equal, one filter serves all pieces.
+    The transition is that of a step of `dt` s. Where all are equal, one filter serves all pieces.
     """
     if np.ptp(step) <= _EVEN * dt:
         step = step[:, :1]
-    transition = _transitions(noise, A, mass_inverse, dt, step)
+    carried = _transitions(noise, transition.mean, mass_inverse, dt, step)
     R = np.diag(noise.record**2)
     eye = np.eye(12)
     count = step.shape[1]
@@ -166,8 +178,9 @@ def make_filter(
     log_det = np.zeros(step.shape)
     for n in range(len(step)):
         keep[n] = gap
-        now, Q = transition(step[n])
-        prior = now @ P @ now.swapaxes(1, 2) + Q
+        now, Q = carried(step[n])
+        spread = (step[n] / dt)[:, None, None] ** 2 * transition.added(P)
+        prior = now @ P @ now.swapaxes(1, 2) + spread + Q
         L = np.linalg.cholesky(prior + R)
         whiten[n] = np.linalg.inv(L)
         log_det[n] = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)

@@ -199,7 +199,7 @@ def _score(
     steps: Transition, inverse: np.ndarray,
 ) -> Float[np.ndarray, " R"]:  # fmt: skip
     """Log density of the innovations of some pieces, up to a constant."""
-    kalman = make_filter(noise, steps, inverse, data.dt, data.step[:, own])
+    kalman = make_filter(noise, steps, inverse, data.dt, data.step[:, own], jacobian[..., own])
     w = data.weight[:, own]
     z = filtered(error[:, :, own], jacobian[..., own], kalman) * w[:, None]
     return -(z**2).sum(axis=(0, 1)) / 2 - (kalman.log_det * w).sum(axis=0)

@@ -88,7 +88,8 @@ def judge(
         steps = Transition.along(jacobian, rest)
         noise = estimate(error, rest, steps, mass, data.dt)
         record[:, own], diffusion[:, own] = noise.record[:, None], noise.diffusion[:, None]
-        kalman = make_filter(noise, steps, np.linalg.inv(mass), data.dt, data.step[:, own])
+        inverse, step = np.linalg.inv(mass), data.step[:, own]
+        kalman = make_filter(noise, steps, inverse, data.dt, step, jacobian[..., own])
         weight = data.weight[:, own]
         z = filtered(error[:, :, own], jacobian[..., own], kalman) * weight[:, None]
         score[own] = -(z**2).sum(axis=(0, 1)) / 2 - (kalman.log_det * weight).sum(axis=0)

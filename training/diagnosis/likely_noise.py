@@ -31,6 +31,9 @@ def most_likely(
 ) -> Float[np.ndarray, "18"]:
     """Variances of the twelve records and the six b²; `start` where data are too few.
 
+    A process that is hidden by the records' noise counts with its standard error: a filter that
+    believes in none at all is deaf, and its innovations are correlated.
+
     Args:
         error: of one-step predictions.
         weight: zero where a piece has no sample.
@@ -73,7 +76,10 @@ def most_likely(
         damping = max(damping / 10, 1e-6)
         if gain < _ENOUGH:
             break
-    return np.exp(x)
+    found, IG = np.exp(x), inverse @ G
+    fisher = np.einsum("iab,jba->ij", IG, IG, optimize=True) / 2 * len(y) / 2
+    errors = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fisher, hermitian=True)), 0.0))
+    return np.concatenate([found[:12], np.maximum(found[12:], errors[12:])])
 
 
 def _blocks(error: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, "K n 12"]:

@@ -160,10 +160,12 @@ class Bench:
         error, weight = np.asarray(p.error), self.data.weight
         if not np.isfinite(error[:, :, weight.any(axis=0)]).all():
             raise FloatingPointError("predictions diverge")
-        steps = Transition.along(np.asarray(p.jacobian), weight)
+        jacobian = np.asarray(p.jacobian)
+        steps = Transition.along(jacobian, weight)
         mass = self.mass(theta)
         noise = estimate(error, weight, steps, mass, self.data.dt)
-        kalman = make_filter(noise, steps, np.linalg.inv(mass), self.data.dt, self.data.step)
+        data, inverse = self.data, np.linalg.inv(mass)
+        kalman = make_filter(noise, steps, inverse, data.dt, data.step, jacobian)
         # correlated innovations tell less than as many independent ones
         less = kalman.whiten / np.sqrt(noise.memory)[:, None, None]
         return p, noise, replace(kalman, whiten=less, memory=noise.memory)

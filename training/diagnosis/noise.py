@@ -32,6 +32,9 @@ _LONGEST = 0.98
 _BELOW = 0.1
 """Share of `FLOOR` that is the least when the most likely noise is sought: a floor of the order of
 what the process makes of a pose within a step would be taken from the process."""
+_MUCH = 0.03
+"""Share of what is seen of a twist that the spread of Jacobians may make before each piece has a
+filter of its own."""
 _EVEN, _NODES = 1e-6, 8
 """Share of a step by which equal ones may differ; nodes of interpolation between uneven ones."""
 
@@ -161,16 +164,36 @@ def make_filter(
     mass_inverse: Float[np.ndarray, "6 6"],
     dt: float,
     step: Float[np.ndarray, "N R"],
+    jacobian: Float[np.ndarray, "N 12 12 R"] | None = None,
 ) -> Filter:
     """The Kalman filter that starts from the first record: gains of every step.
 
-    The transition is that of a step of `dt` s. Where all are equal, one filter serves all pieces.
+    The transition is that of a step of `dt` s. Where all are equal, one filter serves all pieces,
+    unless what Jacobians differ by is much of what is seen: then each piece has one with its own.
     """
+    process = _process(noise, transition.mean, mass_inverse, dt, step)
     if np.ptp(step) <= _EVEN * dt:
-        step = step[:, :1]
-    carried = _transitions(noise, transition.mean, mass_inverse, dt, step)
-    R = np.diag(noise.record**2)
-    eye = np.eye(12)
+        found, P = _filter(noise, process, step[:, :1], dt, transition)
+        share = np.diag(transition.added(P)) / (np.diag(transition.of(P)) + noise.record**2)
+        if jacobian is None or np.max(share) < _MUCH:
+            return found
+    return _filter(noise, process, step, dt, transition, jacobian)[0]
+
+
+Process = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Ā and Q (R, 12, 12) of steps (R,) in s."""
+
+
+def _filter(
+    noise: Noise,
+    process: Process,
+    step: Float[np.ndarray, "N R"],
+    dt: float,
+    transition: Transition,
+    jacobian: Float[np.ndarray, "N 12 12 R"] | None = None,
+) -> tuple[Filter, Float[np.ndarray, "12 12"]]:
+    """A filter for each column of `step`, and the first one's last covariance."""
+    R, eye = np.diag(noise.record**2), np.eye(12)
     count = step.shape[1]
     P = np.repeat(R[None], count, 0)
     gap = np.zeros_like(P)  # I - K: the first record is believed as it is
@@ -178,9 +201,13 @@ def make_filter(
     log_det = np.zeros(step.shape)
     for n in range(len(step)):
         keep[n] = gap
-        now, Q = carried(step[n])
-        spread = (step[n] / dt)[:, None, None] ** 2 * transition.added(P)
-        prior = now @ P @ now.swapaxes(1, 2) + spread + Q
+        A, prior = process(step[n])
+        if jacobian is None:
+            prior = prior + (step[n] / dt)[:, None, None] ** 2 * transition.added(P)
+        else:
+            own = np.moveaxis(jacobian[n], -1, 0).astype(float)
+            A = np.where(np.isfinite(own), own, A)  # a piece without samples has none
+        prior = A @ P @ A.swapaxes(1, 2) + prior
         L = np.linalg.cholesky(prior + R)
         whiten[n] = np.linalg.inv(L)
         log_det[n] = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
@@ -188,26 +215,26 @@ def make_filter(
         gap = eye - K
         # Joseph's form stays positive where exact records meet a long step (Bucy and Joseph 1968)
         P = gap @ prior @ gap.swapaxes(1, 2) + K @ R @ K.swapaxes(1, 2)
-    return Filter(np.moveaxis(keep, 1, -1), np.moveaxis(whiten, 1, -1), log_det)
+    return Filter(np.moveaxis(keep, 1, -1), np.moveaxis(whiten, 1, -1), log_det), P[0]
 
 
-def _transitions(
+def _process(
     noise: Noise, A: np.ndarray, mass_inverse: np.ndarray, dt: float, step: np.ndarray
-) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """A and Q (R, 12, 12) of any steps among these, interpolated between Chebyshev nodes."""
+) -> Process:
+    """Ā and Q of any steps among these, interpolated between Chebyshev nodes."""
 
-    def process(A: np.ndarray, h: float) -> np.ndarray:
+    def of_step(A: np.ndarray, h: float) -> np.ndarray:
         return process_covariance(A, mass_inverse, noise.diffusion, h, noise.slip)
 
-    if step.shape[1] == 1 and np.ptp(step) <= _EVEN * dt:
-        alone = A[None], process(A, dt)[None]
+    if np.ptp(step) <= _EVEN * dt:
+        alone = A[None], of_step(A, dt)[None]
         return lambda h: alone
     J = np.real(scipy.linalg.logm(A)) / dt
     low, high = float(step.min()), float(step.max())
     at = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     nodes = (low + high) / 2 + (high - low) / 2 * at
     each = [scipy.linalg.expm(J * h) for h in nodes]
-    values = np.stack([each, [process(a, h) for a, h in zip(each, nodes, strict=True)]], axis=1)
+    values = np.stack([each, [of_step(a, h) for a, h in zip(each, nodes, strict=True)]], axis=1)
     inverse = np.linalg.inv(np.polynomial.chebyshev.chebvander(at, _NODES - 1))
     series = np.tensordot(inverse, values, 1)
 

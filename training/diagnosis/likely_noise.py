@@ -19,6 +19,9 @@ _BLOCK, _LEAST = 12, 8
 _ROUNDS, _TRIES, _ENOUGH = 30, 8, 1e-5
 """Of scoring; halvings of a step; gain of log likelihood a block at which it ends."""
 _STEP = 1.5  # of log θ at most
+_CLEAR = 10.0
+"""Times what the process makes of a pose within a step its record's variance must be to be heard.
+Exact poses would tell of the process by how a simulation was stepped."""
 
 
 def most_likely(
@@ -45,11 +48,13 @@ def most_likely(
     blocks = _blocks(error, weight)
     if len(blocks) < _LEAST:
         return start
+    made = np.diagonal(units, axis1=1, axis2=2)[:, :6].T @ start[12:]
+    heard = np.concatenate([start[:6] > _CLEAR * made, np.ones(12, bool)])
     basis = scipy.linalg.null_space(np.ones((1, _BLOCK)))
-    y = np.einsum("kna,nm->kma", blocks, basis).reshape(len(blocks), -1)
+    y = np.einsum("kna,nm->kma", blocks[:, :, heard[:12]], basis).reshape(len(blocks), -1)
     S = y.T @ y / len(y)
     scale = 1 / np.sqrt(np.diag(S))
-    G = _structures(transition, units, basis) * scale[:, None] * scale
+    G = _structures(transition, units, basis, heard[:12]) * scale[:, None] * scale
     S = S * scale[:, None] * scale
     low = np.log(least)
     x = np.maximum(np.log(start), low)
@@ -59,7 +64,7 @@ def most_likely(
         IG = inverse @ G * np.exp(x)[:, None, None]
         slope = (np.trace(IG, axis1=1, axis2=2) - np.einsum("iab,ba->i", IG, inverse @ S)) / 2
         fisher = np.einsum("iab,jba->ij", IG, IG, optimize=True) / 2
-        free = (x > low + 1e-9) | (slope < 0)
+        free = heard & ((x > low + 1e-9) | (slope < 0))
         for _ in range(_TRIES):
             H = fisher[np.ix_(free, free)]
             H = H + np.diag(damping * np.diag(H) + 1e-9)
@@ -92,17 +97,18 @@ def _blocks(error: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, "K n 12"
 
 
 def _structures(
-    transition: Transition, units: np.ndarray, basis: np.ndarray
+    transition: Transition, units: np.ndarray, basis: np.ndarray, heard: np.ndarray
 ) -> Float[np.ndarray, "18 d d"]:
-    """Covariance of a block for each variance of one."""
+    """Covariance of a block's axes that are heard for each variance of one."""
+    rows = np.ix_(heard, heard)
     same, next_ = basis.T @ basis, basis.T @ np.eye(_BLOCK, k=-1) @ basis
     found = []
     for i in range(12):
         one = np.zeros((12, 12))
         one[i, i] = 1.0
-        late = np.kron(next_, -transition.mean @ one)
-        found.append(np.kron(same, one + transition.of(one)) + late + late.T)
-    return np.stack([*found, *(np.kron(same, unit) for unit in units)])
+        late = np.kron(next_, (-transition.mean @ one)[rows])
+        found.append(np.kron(same, (one + transition.of(one))[rows]) + late + late.T)
+    return np.stack([*found, *(np.kron(same, unit[rows]) for unit in units)])
 
 
 def _loss(x: np.ndarray, G: np.ndarray, S: np.ndarray) -> tuple[float, np.ndarray]:

@@ -1,0 +1,117 @@
+"""Levels of records' and process noise, and the filter, where instruments drown the process."""
+
+import numpy as np
+import pytest
+from hidden.draw import draw
+from hidden.scenarios import Plan
+from hidden.simulator import Noise as Hidden
+
+from spinndrift.models.recording_csv import read_csv
+from spinndrift.models.vehicle import load_vehicle
+from spinndrift.training.diagnosis.diagnose import Diagnoser
+from spinndrift.training.diagnosis.noise import Noise, estimate, make_filter, process_covariance
+from spinndrift.training.diagnosis.transition import Transition
+
+DT, MASS = 0.05, np.diag([20.0, 20.0, 30.0, 0.4, 0.4, 0.5])
+A = np.eye(12)
+A[:6, 6:] = DT * np.eye(6)
+A[6:, 6:] = np.diag([0.95, 0.95, 0.9, 0.8, 0.8, 0.85])
+RECORD = np.repeat([0.02, 0.007, 0.02, 0.004], 3)
+
+
+def errors(rng, N, R, b):
+    """One-step errors of records with white noise about a linear system's states."""
+    Q = process_covariance(A, np.linalg.inv(MASS), b, DT)
+    L = np.linalg.cholesky(Q)
+    e = RECORD[:, None] * rng.standard_normal((N + 1, 12, R))
+    w = np.einsum("ij,njr->nir", L, rng.standard_normal((N, 12, R)))
+    return e[1:] - np.einsum("ij,njr->nir", A, e[:-1]) + w
+
+
+@pytest.mark.parametrize("part", [1.0, 0.5])
+def test_levels_are_found_far_below_the_records_noise(part):
+    """Down to a third and a sixth of the DVL's noise in a step; slow errors don't count."""
+    b = part * np.array([1.0, 1.0, 1.0, 0.03, 0.03, 0.03])
+    rng = np.random.default_rng(0)
+    error = errors(rng, 200, 60, b)
+    error[:, 6:9] += 0.002 * np.sin(2 * np.pi * np.arange(200) / 200)[:, None, None]
+    noise = estimate(error, np.ones((200, 60)), Transition.constant(A), MASS, DT)
+    assert not noise.estimated
+    np.testing.assert_allclose(noise.record[:9], RECORD[:9], rtol=0.05)
+    np.testing.assert_allclose(noise.diffusion, b, rtol=0.25)
+
+
+def test_a_process_that_can_not_be_seen_counts_with_its_error():
+    rng = np.random.default_rng(1)
+    found = []
+    for runs in (20, 80):
+        error = errors(rng, 200, runs, np.full(6, 1e-9))
+        found.append(estimate(error, np.ones((200, runs)), Transition.constant(A), MASS, DT))
+    for few, many in zip(found[0].diffusion, found[1].diffusion, strict=True):
+        assert 0 < many < few
+    step = (
+        found[1].diffusion * np.sqrt(DT) / np.diag(MASS)
+    )  # what is left for the process of a step
+    assert np.all(step < RECORD[6:] / 5)
+
+
+def test_blocks_leave_gaps_out():
+    rng = np.random.default_rng(2)
+    b = np.array([1.0, 1.0, 1.0, 0.03, 0.03, 0.03])
+    error, weight = errors(rng, 200, 60, b), np.ones((200, 60))
+    hole = rng.uniform(size=weight.shape) < 0.02
+    weight[hole] = 0
+    error[np.broadcast_to(hole[:, None], error.shape)] = 0
+    noise = estimate(error, weight, Transition.constant(A), MASS, DT)
+    np.testing.assert_allclose(noise.diffusion, b, rtol=0.15)
+
+
+def test_a_transition_carries_what_jacobians_that_change_make_of_errors():
+    rng = np.random.default_rng(3)
+    jacobian = A[None, :, :, None] + 0.1 * rng.standard_normal((50, 12, 12, 4))
+    weight = np.ones((50, 4))
+    weight[40:, 3] = 0
+    P = np.diag(RECORD**2) + 1e-5
+    exact = np.einsum("nijr,jk,nlkr,nr->il", jacobian, P, jacobian, weight) / weight.sum()
+    steps = Transition.along(jacobian, weight)
+    np.testing.assert_allclose(steps.of(P), exact, rtol=1e-10, atol=1e-16)
+    np.testing.assert_allclose(Transition.constant(A).of(P), A @ P @ A.T, rtol=1e-12)
+
+
+def test_a_filter_of_ones_own_is_that_of_the_mean_where_all_jacobians_are_equal():
+    noise = Noise(RECORD, np.array([1.0, 1.0, 1.0, 0.03, 0.03, 0.03]))
+    same = np.broadcast_to(A[None, :, :, None], (30, 12, 12, 2))
+    inverse, step = np.linalg.inv(MASS), np.full((30, 2), DT)
+    shared = make_filter(noise, Transition.constant(A), inverse, DT, step, same)
+    assert shared.keep.shape[-1] == 1
+    spread = Transition(A, np.full([12] * 4, 1.0))  # far more than a share: each has its own
+    own = make_filter(noise, spread, inverse, DT, step, same)
+    assert own.keep.shape[-1] == 2
+    for name in ("keep", "whiten", "log_det"):
+        mine, all_ = getattr(own, name), getattr(shared, name)
+        np.testing.assert_allclose(mine, np.broadcast_to(all_, mine.shape), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "hidden",
+    [
+        Hidden(diffusion=(0.05, 0.05, 0.05, 0.0015, 0.0015, 0.0015)),
+        Hidden(velocity=0.02, rate=0.004, attitude=0.007, position=0.02),
+    ],
+    ids=["calm", "coarse"],
+)
+def test_innovations_are_white_where_instruments_drown_the_process(tmp_path, hidden):
+    """Data of another maker: records to 5 %, and nothing left in the innovations."""
+    plan = Plan(scenarios=10, runs=2, seconds=10.0)
+    draw(5, "null", plan=plan, noise=hidden).write(tmp_path / "data")
+    vehicle = load_vehicle("bluerov2_heavy")
+    belief = vehicle.dynamics(np.array(hidden.diffusion))
+    bench = Diagnoser(read_csv(tmp_path / "data"), vehicle, belief).bench
+    look = bench.look(bench.believed)
+    given = np.repeat([hidden.position, hidden.attitude, hidden.velocity], 3)
+    np.testing.assert_allclose(look.noise.record[:9], given, rtol=0.05)
+    z = look.z
+    n = np.sqrt(z.shape[0] * z.shape[2])
+    assert np.abs(z.mean(axis=(0, 2)) * n).max() < 4.5
+    acf = (z[1:] * z[:-1]).mean(axis=(0, 2)) / (z**2).mean(axis=(0, 2))
+    assert np.abs(acf).max() * n < 6

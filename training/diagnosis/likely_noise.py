@@ -16,7 +16,7 @@ from .transition import Transition
 
 _BLOCK, _LEAST = 12, 8
 """Samples of a block, and blocks at least."""
-_ROUNDS, _TRIES, _ENOUGH = 30, 8, 1e-5
+_ROUNDS, _TRIES, _ENOUGH = 30, 8, 1e-4
 """Of scoring; halvings of a step; gain of log likelihood a block at which it ends."""
 _STEP = 1.5  # of log θ at most
 _CLEAR = 10.0

@@ -23,6 +23,11 @@ _EVEN = 1e-6
 """Share of a step by which equal steps may differ."""
 
 
+def all_equal(step: np.ndarray, dt: float) -> bool:
+    """Whether steps (s) are all equal, `dt` in the mean."""
+    return bool(np.ptp(step) <= _EVEN * dt)
+
+
 @dataclass(frozen=True)
 class Data:
     """R pieces of runs, N steps each, component first and pieces last; short pieces are padded.
@@ -82,7 +87,7 @@ class Data:
     @property
     def even(self) -> bool:
         """Whether all steps are equal."""
-        return bool(np.ptp(self.step) <= _EVEN * self.dt)
+        return all_equal(self.step, self.dt)
 
     def own_steps(
         self, pieces: Int[np.ndarray, " K"] | slice = slice(None)

@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float, Int
 
+from .data import all_equal
 from .likely_noise import most_likely
 from .transition import Transition
 
@@ -35,8 +36,8 @@ what the process makes of a pose within a step would be taken from the process."
 _MUCH = 0.03
 """Share of what is seen of a twist that the spread of Jacobians may make before each piece has a
 filter of its own."""
-_EVEN, _NODES = 1e-6, 8
-"""Share of a step by which equal ones may differ; nodes of interpolation between uneven ones."""
+_NODES = 8
+"""Nodes of interpolation between uneven steps."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +173,7 @@ def make_filter(
     unless what Jacobians differ by is much of what is seen: then each piece has one with its own.
     """
     process = _process(noise, transition.mean, mass_inverse, dt, step)
-    if np.ptp(step) <= _EVEN * dt:
+    if all_equal(step, dt):
         found, P = _filter(noise, process, step[:, :1], dt, transition)
         share = np.diag(transition.added(P)) / (np.diag(transition.of(P)) + noise.record**2)
         if jacobian is None or np.max(share) < _MUCH:
@@ -226,7 +227,7 @@ def _process(
     def of_step(A: np.ndarray, h: float) -> np.ndarray:
         return process_covariance(A, mass_inverse, noise.diffusion, h, noise.slip)
 
-    if np.ptp(step) <= _EVEN * dt:
+    if all_equal(step, dt):
         alone = A[None], of_step(A, dt)[None]
         return lambda h: alone
     J = np.real(scipy.linalg.logm(A)) / dt

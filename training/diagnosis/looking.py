@@ -260,6 +260,10 @@ class Bench:
         error = np.asarray(seen.predictions.error) * self.data.weight[:, None]
         return self.merit(self.covariance(error, seen.noise.estimated))
 
+    def loss(self, theta: Float[np.ndarray, " p"]) -> float:
+        """`_merit` at θ, pose and twist apart."""
+        return self.merit(self.covariance(self.errors(theta), apart=True))
+
     def covariance(self, error: np.ndarray, apart: bool) -> Float[np.ndarray, "12 12"]:
         """Of one-step errors; pose and twist `apart`: what estimated poses lack is no wrench's."""
         C = np.einsum("nir,njr->ij", error, error) / self.data.weight.sum()

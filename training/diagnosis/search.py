@@ -29,6 +29,9 @@ _OF_A_LAW = 0.02
 _OF_ESTIMATES = 0.05
 """Nats a sample that a name must win where states were estimated: below that a name may as well
 explain what the estimator makes of its own errors."""
+_HALVED = np.log(2.0)
+"""Or nats a sample by which it makes one-step errors likelier: an axis' errors are halved. Records
+of a simulation without noise look like estimates too, until the name is found."""
 
 
 @dataclass
@@ -163,18 +166,28 @@ class Search:
             if np.all(np.abs(times) < self.shortest):
                 del fits[h]
         gains = {c.hypothesis[0]: f.heldout_gain for c, f in found.accepted}
-        if current.noise.estimated:
-            least = max(least, _OF_ESTIMATES * bench.data.steps)
 
-        def chosen() -> Choice | None:
+        def best(least: float) -> Choice | None:
             needed = max(found.threshold, least)
             return choose(bench.library, current.theta, fits, needed, self.alpha, gains, strict)
+
+        def chosen() -> Choice | None:
+            found_ = best(least)
+            if found_ is None or not current.noise.estimated or self._halves(found_, current):
+                return found_
+            return best(max(least, _OF_ESTIMATES * bench.data.steps))
 
         choice = chosen()
         if choice is not None and self._about_thrust(choice):
             fits |= self._single_thrusters(current, beside, [*taken, *found.dropped])
             choice = chosen()
         return choice, fits
+
+    def _halves(self, choice: Choice, current: Look) -> bool:
+        """Whether a name makes the one-step errors much smaller than they are."""
+        theta = self._start(choice.fit, current.theta)
+        won = self.bench.loss(current.theta) - self.bench.loss(theta)
+        return won >= _HALVED * self.bench.data.steps
 
     def _about_thrust(self, choice: Choice) -> bool:
         """Whether the best names so far leave it open that a single thruster is at fault."""

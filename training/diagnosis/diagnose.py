@@ -39,8 +39,9 @@ Refit = Literal["none", "scales", "linear", "command", "all"]
 _MOST_UNKNOWN = 2
 _RIVALS = 0.25
 """Share of what the best law wins below which names leave it to structure without a name."""
-_RESAMPLED, _OF_A_STEP = 0.02, 0.1
-"""Nats a sample that a law, and share of a step that a time must have, in resampled data."""
+_RESAMPLED, _OF_A_STEP, _NO_TIME = 0.02, 0.1, 0.02
+"""Nats a sample that a law, and share of a step that a time must have, in resampled data; share of
+a step below which a time is none in any: without noise, integration shows as one."""
 _FINEST = 0.02
 """Steps (s) of data that the extended model will be used on at least: delays are told by them."""
 _LAW_MARGIN = 5.0
@@ -232,7 +233,7 @@ class Diagnoser:
 
     def _names(self, bench: Bench, nuisance: list[int], low: float, high: float) -> Search:
         config, within = self.config, self._within(low, high)
-        shortest = _OF_A_STEP * bench.data.dt if self.resampled else 0.0
+        shortest = (_OF_A_STEP if self.resampled else _NO_TIME) * bench.data.dt
         return Search(
             bench, nuisance, config.alpha, config.most, self.rng, within, self.quiet, shortest
         )

@@ -7,6 +7,7 @@ import pytest
 from hidden.draw import draw
 from hidden.effects_environment import Waves
 from hidden.scenarios import Plan
+from hidden.simulator import Noise
 
 from spinndrift.models.effects import Extended
 from spinndrift.models.effects.drag import LinearDrag
@@ -29,9 +30,10 @@ LEVELS = np.array([1.0] * 3 + [0.03] * 3)
 def bench_of(tmp_path_factory):
     """A bench of a hidden cause, and its cause; the belief states the level that was hidden."""
 
-    def made(name, size, **plan):
+    def made(name, size, noise=None, **plan):
         folder = tmp_path_factory.mktemp(name) / "data"
-        case = draw(3, names=(name,), size=size, plan=Plan(runs=2, seconds=6.0, **plan))
+        plan = Plan(runs=2, seconds=6.0, **plan)
+        case = draw(3, names=(name,), size=size, plan=plan, noise=noise)
         case.write(folder)
         diagnoser = Diagnoser(read_csv(folder), VEHICLE, VEHICLE.dynamics(LEVELS))
         return diagnoser.bench, case.effects[0]
@@ -185,6 +187,20 @@ def test_states_known_exactly_are_not_taken_for_estimates(bench_of):
     noise = estimate(error, np.ones((200, 30)), Transition.constant(A), mass, 0.05)
     assert not noise.estimated
     np.testing.assert_allclose(noise.diffusion, LEVELS, rtol=0.05)
+
+
+def test_a_name_that_halves_the_errors_is_told_of_states_without_noise(bench_of):
+    """Smooth errors of a wrong model look like an estimator's until the name is found."""
+    bench, hidden = bench_of("current_steady", 1.0, noise=Noise.none())
+    look = bench.look(bench.believed)
+    assert look.noise.estimated
+    search = Search(bench, [], 0.01, 6, np.random.default_rng(0), lambda done, remark: None)
+    choice, _ = search.next(Found(look, look, look))
+    assert choice is not None
+    assert choice.hypothesis == ("current_steady", "W")
+    theta = bench.polish(bench.believed, bench.library.at(*choice.hypothesis))[0]
+    found = theta[bench.library.at(*choice.hypothesis)]
+    np.testing.assert_allclose(found, [hidden.east, hidden.north], atol=1e-3)
 
 
 def test_drag_stays_passive_and_wild_steps_are_tamed(bench_of):

@@ -1,5 +1,6 @@
 """Which causes are there together: forward selection with exact refits, and checks backwards."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -29,7 +30,7 @@ _OF_A_LAW = 0.02
 _OF_ESTIMATES = 0.05
 """Nats a sample that a name must win where states were estimated: below that a name may as well
 explain what the estimator makes of its own errors."""
-_HALVED = np.log(2.0)
+_HALVED = math.log(2.0)
 """Or nats a sample by which it makes one-step errors likelier: an axis' errors are halved. Records
 of a simulation without noise look like estimates too, until the name is found."""
 
@@ -187,7 +188,7 @@ class Search:
         """Whether a name makes the one-step errors much smaller than they are."""
         theta = self._start(choice.fit, current.theta)
         won = self.bench.loss(current.theta) - self.bench.loss(theta)
-        return won >= _HALVED * self.bench.data.steps
+        return bool(won >= _HALVED * self.bench.data.steps)
 
     def _about_thrust(self, choice: Choice) -> bool:
         """Whether the best names so far leave it open that a single thruster is at fault."""

@@ -23,6 +23,7 @@ from spinndrift.training.diagnosis.identify import coefficients, identify, with_
 from spinndrift.training.diagnosis.looking import Bench
 from spinndrift.training.diagnosis.noise import estimate
 from spinndrift.training.diagnosis.ratios import ratios
+from spinndrift.training.diagnosis.transition import Transition
 
 MASS, INERTIA, FULL, ARM = 10.5, 0.2681, 51.48, 0.25
 DRAG = np.array([48.28, 62.08, 68.98, 7.076, 7.076, 7.076])
@@ -176,7 +177,7 @@ def test_slow_errors_of_an_estimator_are_told_from_those_of_instruments():
     slow[0] = white[0]
     for n in range(1, N):
         slow[n] = rho * slow[n - 1] + (1 - rho**2) ** 0.5 * white[n]
-    A, mass, weight = np.eye(12), 10 * np.eye(6), np.ones((N, 1))
+    A, mass, weight = Transition.constant(np.eye(12)), 10 * np.eye(6), np.ones((N, 1))
     estimated = estimate(slow, weight, A, mass, DT)
     assert estimated.estimated
     np.testing.assert_allclose(estimated.memory, (1 + rho) / (1 - rho), rtol=0.1)

@@ -115,7 +115,7 @@ def identify(
 
     def loss(theta: np.ndarray) -> float:
         away = (theta[rows] - centre) / spread
-        return _fit(bench, theta) + float(away @ away) / 2
+        return bench.loss(theta) + float(away @ away) / 2
 
     best, damping = loss(theta), 0.0
     for n in range(_ROUNDS):
@@ -160,22 +160,12 @@ def _beside(bench: Bench, rows: Sequence[int]) -> list[Coefficient]:
 
 def one_step(bench: Bench, theta: Float[np.ndarray, " p"]) -> Filter:
     """The filter that believes every record: innovations are one-step errors, whitened."""
-    C = _covariance(bench, theta)
+    C = bench.covariance(bench.errors(theta), apart=True)
     N = len(bench.data.u)
     whiten = np.linalg.inv(np.linalg.cholesky(C))
     log_det = float(np.linalg.slogdet(C)[1]) / 2
     alike = np.repeat(whiten[None, ..., None], N, 0)
     return Filter(np.zeros_like(alike), alike, np.full((N, 1), log_det))
-
-
-def _covariance(bench: Bench, theta: np.ndarray) -> Float[np.ndarray, "12 12"]:
-    """Of one-step errors, pose and twist apart: what poses lack is an instrument's."""
-    return bench.covariance(bench.errors(theta), apart=True)
-
-
-def _fit(bench: Bench, theta: np.ndarray) -> float:
-    """Minus the log likelihood of one-step errors under a covariance of their own."""
-    return bench.merit(_covariance(bench, theta))
 
 
 def _quadratic(seen: Look, rows: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -225,17 +225,17 @@ class Bench:
         theta[chosen] = np.clip(theta[chosen], low, high)
         best: tuple[np.ndarray, Look, Fit] | None = None
         back = self.believed if origin is None else origin.theta
-        bar = np.inf if origin is None else self._merit(origin)
+        bar = np.inf if origin is None else self.loss_of(origin)
         done = failed = 0
         while done < rounds and failed < _HALVINGS:
             seen = self._seen(theta, chosen, kalman)
-            if seen is None or not self._merit(seen) <= bar + _WORSE:
+            if seen is None or not self.loss_of(seen) <= bar + _WORSE:
                 # a step too far: back towards what was good
                 theta = (theta + (back if best is None else best[0])) / 2
                 failed += 1
                 continue
             fit = seen.evidence.fit(chosen)
-            best, bar = (theta.copy(), seen, fit), self._merit(seen)
+            best, bar = (theta.copy(), seen, fit), self.loss_of(seen)
             done += 1
             theta[chosen] = self._stepped(theta, chosen, fit.values, low, high)
             if np.all(np.abs(fit.values) < 0.15 * fit.errors + 1e-12):
@@ -252,7 +252,7 @@ class Bench:
         except (FloatingPointError, np.linalg.LinAlgError):
             return None
 
-    def _merit(self, seen: Look) -> float:
+    def loss_of(self, seen: Look) -> float:
         """Minus the log likelihood of one-step errors under a covariance of their own.
 
         It asks for no filter, whose noise levels change with what is fitted.
@@ -261,7 +261,7 @@ class Bench:
         return self.merit(self.covariance(error, seen.noise.estimated))
 
     def loss(self, theta: Float[np.ndarray, " p"]) -> float:
-        """`_merit` at θ, pose and twist apart."""
+        """That at θ, pose and twist apart: what poses lack is an instrument's."""
         return self.merit(self.covariance(self.errors(theta), apart=True))
 
     def covariance(self, error: np.ndarray, apart: bool) -> Float[np.ndarray, "12 12"]:

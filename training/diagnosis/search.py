@@ -187,7 +187,7 @@ class Search:
     def _halves(self, choice: Choice, current: Look) -> bool:
         """Whether a name makes the one-step errors much smaller than they are."""
         theta = self._start(choice.fit, current.theta)
-        won = self.bench.loss(current.theta) - self.bench.loss(theta)
+        won = self.bench.loss_of(current) - self.bench.loss(theta)
         return bool(won >= _HALVED * self.bench.data.steps)
 
     def _about_thrust(self, choice: Choice) -> bool:

@@ -366,9 +366,9 @@ def test_structure_without_a_name_is_found_where_it_is(tmp_path):
     bench = Diagnoser(recording, VEHICLE).bench
     look = bench.look(bench.believed)
     screen, rng = Screen(bench, look, None), np.random.default_rng(0)
-    times, frequencies = (0.4, 1.2, 4.0), (0.0, 0.2, 0.5, 1.0)
+    nodes = [(t, f) for t in (0.4, 1.2, 4.0) for f in (0.0, 0.2, 0.5, 1.0)]
     found = {
-        axis: screen.match(_memory(bench, i, times, frequencies), 0.01, rng)
+        axis: screen.match(_memory(bench, i, i, nodes), 0.01, rng)
         for i, axis in ((1, "sway"), (5, "yaw"))
     }
     assert hidden["where"] == "yaw"
@@ -378,6 +378,23 @@ def test_structure_without_a_name_is_found_where_it_is(tmp_path):
     parameters = hidden["parameters"]
     assert effect.numbers[0] == pytest.approx(parameters["decay"]["value"], rel=0.3)
     assert effect.numbers[1] == pytest.approx(parameters["frequency"]["value"], rel=0.15)
+
+
+def test_a_swaying_mass_ahead_of_the_origin_is_seen_in_yaw(tmp_path):
+    """The turning moment remembers the velocity to the side, and rings with the hidden spring."""
+    from spinndrift.training.diagnosis.unknowns import screened
+
+    case, recording = recorded(tmp_path, 70011, "unknown", names=("appendage",))
+    hidden = case.answer()["causes"][0]
+    bench = Diagnoser(recording, VEHICLE).bench
+    look = bench.look(bench.believed)
+    seen = screened(bench, look, [], 0.01, np.random.default_rng(0))
+    assert hidden["where"] == "sway"
+    assert seen is not None
+    group = seen[1].group
+    assert (group.effect.kind, group.effect.acts_on, group.variables) == ("memory", "yaw", ("v",))
+    hertz = hidden["parameters"]["frequency"]["value"]
+    assert group.labels[seen[1].node][1] == pytest.approx(hertz, rel=0.1)
 
 
 def test_axes_that_are_not_driven_and_filled_samples_are_told(tmp_path):

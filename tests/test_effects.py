@@ -298,6 +298,17 @@ def test_measurements_by_hand():
     np.testing.assert_allclose(X1, past, atol=2e-6)
     _, V1 = KINDS["clock_offset"].of("linear", delay=late).measure(X0, V0, A)
     np.testing.assert_allclose(V1, [*(V0 - late * A)[:3], *V0[3:]], atol=1e-15)
+    J = jnp.asarray([3.0, -2.0, 1.0, 4.0, 5.0, -6.0])[:, None]
+    both = jnp.concatenate([A, J])
+    _, V2 = KINDS["clock_offset"].of("twist", delay=late).measure(X0, V0, both)
+    np.testing.assert_allclose(V2, V0 - late * A + late**2 / 2 * J, atol=1e-15)
+    X2, _ = KINDS["clock_offset"].of("pose", delay=late).measure(X0, V0, both)
+    past = X0
+    for k in range(fine):
+        s = (k + 0.5) * late / fine
+        past = se3.retract(past, -late / fine * (V0 - A * s + J * s**2 / 2))
+    np.testing.assert_allclose(X2, past, atol=5e-6)
+    assert np.abs(np.asarray(X2 - X1)).max() > 2e-5  # the second derivative is in it
     off, _ = KINDS["heading_error"].of(sine=0.1).measure(X, V, none)
     np.testing.assert_allclose(se3.yaw(off), se3.yaw(X) + 0.1 * np.sin(se3.yaw(X)), atol=1e-12)
 
@@ -379,15 +390,18 @@ def test_further_fields_are_stored(tmp_path):
     assert again.remember(U)[0].shape == ((8 + 1) * 30, N)
 
 
-def test_a_memory_without_a_name_is_its_convolution():
+@pytest.mark.parametrize("of", [1, 3])
+def test_a_memory_without_a_name_is_its_convolution(of):
     """z(t) = ∫ e^((-1/T + 2πif) s) v(t - s) ds against a fine sum; the wrench weighs it."""
     T, f, dt, steps, fine = 1.4, 0.3, 0.05, 80, 200
-    effect = Unknown.neutral(kind="memory", acts_on="sway", numbers=(T, f))
+    numbers = (T, f) if of == 1 else (T, f, float(of))
+    effect = Unknown.neutral(kind="memory", acts_on="sway", numbers=numbers)
+    assert effect.terms[1] == f"Re z({'uvwpqr'[of]})"
     effect = dataclasses.replace(effect, values=jnp.array([0.5, 2.0, -1.0]))
     v = np.random.default_rng(0).standard_normal(steps)
     memory, push = jnp.zeros((2, 1)), jnp.zeros((6, 1))
     for x in v:
-        memory, push = effect.feel(memory, jnp.zeros((6, 1)).at[1].set(x), dt)
+        memory, push = effect.feel(memory, jnp.zeros((6, 1)).at[of].set(x), dt)
     t = (np.arange(steps * fine) + 0.5) * dt / fine
     kernel = np.exp((-1 / T + 2j * np.pi * f) * (steps * dt - t))
     z = np.sum(kernel * np.repeat(v, fine)) * dt / fine

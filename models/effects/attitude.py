@@ -27,7 +27,7 @@ class GyroBias(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "m *#batch"],
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         return X_WB, V_WB_B + self._bias(V_WB_B)
 
@@ -35,7 +35,7 @@ class GyroBias(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "m *#batch"],
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         return X_WB, V_WB_B - self._bias(V_WB_B)
 
@@ -65,7 +65,7 @@ class HeadingError(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "m *#batch"],
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         return _turned(X_WB, self._error(X_WB, *_heading(X_WB))), V_WB_B
 
@@ -73,7 +73,7 @@ class HeadingError(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "m *#batch"],
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         sine, cosine = _heading(X_WB)
         error = self._error(X_WB, sine, cosine)
@@ -86,8 +86,8 @@ class HeadingError(Effect):
 class ClockOffset(Effect):
     """One channel's stamps are late by δ: what is recorded at t is the value of t - δ.
 
-    `linear`, `angular`: velocities of their instrument, `twist` both: V(t - δ) ≈ V - δ dV/dt;
-    `pose`: X exp(-δ V + δ² dV/dt / 2). All against the command's clock.
+    `linear`, `angular`: velocities of an instrument, `twist` both: V(t - δ) ≈ V - δ V' + δ² V''/2;
+    `pose`: X exp(-δ V + δ² V'/2 - δ³ V''/6). All against the command's clock.
     """
 
     name: ClassVar[str] = "clock_offset"
@@ -101,13 +101,15 @@ class ClockOffset(Effect):
     def _moved(self, X: Array, V: Array, A: Array, sign: float) -> tuple[Array, Array]:
         twist, pose, linear, angular = (self.part(i, V)[None] for i in range(4))
         late = jnp.concatenate([twist + linear] * 3 + [twist + angular] * 3)
-        return se3.retract(X, sign * pose * (V - A * pose / 2)), V + sign * A * late
+        first, second = A[:6], A[6:] if len(A) == 12 else jnp.zeros_like(A)
+        moved = pose * (V - pose / 2 * (first - pose / 3 * second))
+        return se3.retract(X, sign * moved), V + sign * late * (first - late / 2 * second)
 
     def measure(
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "m *#batch"],
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         return self._moved(X_WB, V_WB_B, A_WB_B, -1.0)
 
@@ -115,7 +117,7 @@ class ClockOffset(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "m *#batch"],
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         return self._moved(X_WB, V_WB_B, A_WB_B, 1.0)
 

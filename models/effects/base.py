@@ -286,9 +286,12 @@ class Effect(eqx.Module):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "m *#batch"],
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        """What is recorded of a pose and twist; A is the rate of the twist's components."""
+        """What is recorded of a pose and twist; A: dV/dt by components, d²V/dt² after it if known.
+
+        So A has 6 rows or 12.
+        """
         del A_WB_B
         return X_WB, V_WB_B
 
@@ -296,7 +299,7 @@ class Effect(eqx.Module):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "m *#batch"],
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         """The pose and twist of a record: the inverse of `measure`."""
         del A_WB_B

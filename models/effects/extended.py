@@ -363,9 +363,9 @@ class Extended(Dynamics):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "m *#batch"],
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        """What is recorded of a state, without noise."""
+        """What is recorded of a state, without noise; A as `Effect.measure` has it."""
         for effect in self.effects:
             if effect.acts("measure"):
                 X_WB, V_WB_B = effect.measure(X_WB, V_WB_B, A_WB_B)
@@ -375,7 +375,7 @@ class Extended(Dynamics):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "6 *#batch"],
+        A_WB_B: Float[Array, "m *#batch"],
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         """The state of a record: the inverse of `observe`."""
         for effect in reversed(self.effects):

@@ -25,8 +25,12 @@ def advance(
     substeps: int = 1,
     voltage: Float[Array, "1 *#batch"] | None = None,
     push: Float[Array, "6 *#batch"] | None = None,
-) -> tuple[Memory, Float[Array, "7 *#batch"], Float[Array, "6 *#batch"], Float[Array, "6 *#batch"]]:
-    """Memory, pose and twist after `dt` s, and the twist's rate at the end of the last substep.
+) -> tuple[
+    Memory, Float[Array, "7 *#batch"], Float[Array, "6 *#batch"], Float[Array, "12 *#batch"]
+]:
+    """Memory, pose and twist after `dt` s, and dV/dt and d²V/dt² at the end of the last substep.
+
+    The second derivative is what the first changed by over that substep.
 
     `dt` is one number, or (1, *batch) where columns take steps of their own.
 
@@ -57,13 +61,14 @@ def advance(
             a = model.drift(inertia, X_s, V_s, level, voltage, push)
             twist, gain = twist + weight * V_s, gain + weight * a
             following = se3.retract(X, ahead * h * V_s), V + ahead * h * a
-            return (*following, twist, gain, a), V_s
+            return (*following, twist, gain, a), (V_s, a)
 
         zero = jnp.zeros_like(V)
-        (_, _, twist, gain, a), stages = jax.lax.scan(stage, (X, V, zero, zero, zero), table)
-        twist = twist + h / 12 * se3.ad_apply(stages[0], stages[3])
-        return (se3.retract(X, h * twist), V + h * gain, a), None
+        (_, _, twist, gain, a), (V_s, a_s) = jax.lax.scan(stage, (X, V, zero, zero, zero), table)
+        twist = twist + h / 12 * se3.ad_apply(V_s[0], V_s[3])
+        rates = jnp.concatenate([a, (a - a_s[0]) / h])
+        return (se3.retract(X, h * twist), V + h * gain, rates), None
 
-    start = (X, V, jnp.zeros_like(V))
+    start = (X, V, jnp.zeros((12, *batch), dtype))
     (X, V, a), _ = jax.lax.scan(substep, start, jnp.moveaxis(levels, -1, 0))
     return memory, X, V, a

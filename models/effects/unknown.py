@@ -36,11 +36,11 @@ class Unknown(Effect):
     """Σ_k w_k φ_k on one axis, thruster or in W; φ by `kind`, with its constants in `numbers`.
 
     `motion`: terms of `MOTION` by number, a wrench on an axis. `pose`: all of `POSE`, likewise.
-    `memory`: ξ, Re z and Im z with z' = (-1/T + 2πi f) z + ξ, ξ the axis' own velocity; numbers
-    T (s) and f (Hz). `thruster`: all of `POWERS` on one thruster. `place`: a force in W of bumps
-    exp(-½ |p - c|² / s²) over the horizontal plane, east and north for each; numbers s (m) and
-    centres. `flow`: the same as a velocity of the water. `depth`: a force in W of (z - c) / s and
-    its square, in three directions; numbers c and s (m).
+    `memory`: ξ, Re z and Im z with z' = (-1/T + 2πi f) z + ξ, ξ a velocity; numbers T (s), f (Hz)
+    and which of the six, the axis' own if left out. `thruster`: all of `POWERS` on one thruster.
+    `place`: a force in W of bumps exp(-½ |p - c|² / s²) over the horizontal plane, east and north
+    for each; numbers s (m) and centres. `flow`: the same as a velocity of the water. `depth`: a
+    force in W of (z - c) / s and its square, in three directions; numbers c and s (m).
     """
 
     name: ClassVar[str] = "unknown"
@@ -63,7 +63,7 @@ class Unknown(Effect):
         if self.kind == "motion":
             return tuple(list(MOTION)[int(i)] for i in self.numbers)
         if self.kind == "memory":
-            own = TWIST[AXES.index(self.acts_on)]
+            own = TWIST[self.remembered]
             return own, f"Re z({own})", f"Im z({own})"
         if self.kind == "pose":
             return POSE
@@ -155,6 +155,11 @@ class Unknown(Effect):
     # --------------------------------------------------------------------------------- memory
 
     @property
+    def remembered(self) -> int:
+        """Which component of the twist a memory remembers."""
+        return int(self.numbers[2]) if len(self.numbers) > 2 else AXES.index(self.acts_on)
+
+    @property
     def memory_size(self) -> int:
         return 2 if self.kind == "memory" else 0
 
@@ -162,16 +167,16 @@ class Unknown(Effect):
         self, memory: Float[Array, "2 *#batch"], V_WB_B: Float[Array, "6 *#batch"], dt: Any
     ) -> tuple[Float[Array, "2 *#batch"], Float[Array, "6 *#batch"]]:
         """The memory after a step at this velocity, and the wrench during it."""
-        i = AXES.index(self.acts_on)
+        x = V_WB_B[self.remembered]
         h = dt[0] if jnp.ndim(dt) else dt
-        after = remembered(memory, V_WB_B[i], self.numbers[0], self.numbers[1], h)
+        after = convolved(memory, x, self.numbers[0], self.numbers[1], h)
         mean = (memory + after) / 2
         w = self.column(V_WB_B)
-        total = w[0] * V_WB_B[i] + w[1] * mean[0] + w[2] * mean[1]
-        return after, axes_only({i: total}, V_WB_B)
+        total = w[0] * x + w[1] * mean[0] + w[2] * mean[1]
+        return after, axes_only({AXES.index(self.acts_on): total}, V_WB_B)
 
 
-def remembered(
+def convolved(
     z: Float[Array, "2 *#b"], x: Float[Array, " *#b"], time: float, frequency: float, dt: Any
 ) -> Float[Array, "2 *b"]:
     """After dt of z' = (-1/T + 2πi f) z + x, with x held: real and imaginary part of z."""

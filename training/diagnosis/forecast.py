@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ...models.effects.extended import Extended, times
 from ...models.effects.predict import advance
 from .data import Data
-from .innovations import Arrays, as_arrays, settle, substeps
+from .innovations import Arrays, as_arrays, first_rate, settle, substeps
 
 
 @runtime_checkable
@@ -47,7 +47,7 @@ def _forecast(
         )
         return (memory, x, v, a), model.observe(x, v, a)
 
-    start = (settle(model, u[0], step[:1], count), X[0], V[0], (V[1] - V[0]) / step[:1])
+    start = (settle(model, u[0], step[:1], count), X[0], V[0], first_rate(V, step))
     before = jnp.concatenate([u[:1], u[:-1]])
     xs = (jnp.arange(len(u)), X[:-1], V[:-1], u, before, voltage, step)
     return jax.lax.scan(body, start, xs)[1]

@@ -21,7 +21,7 @@ from ...models.effects.predict import advance
 from ..metrics import BANDS, order_statistics
 from . import result
 from .blackbox import BlackBox, arguments
-from .innovations import Arrays, as_arrays, difference, predict, settle, substeps
+from .innovations import Arrays, as_arrays, difference, first_rate, predict, settle, substeps
 from .laws import Law
 from .looking import Bench
 from .noise import estimate, filtered, make_filter
@@ -155,7 +155,8 @@ def _simulated(
     e = np.asarray(
         _errors(
             bench.model, used, contender.stirring, arrays, box, jnp.asarray(levels[1]),
-            jnp.asarray(levels[0]), jax.random.key(seed), every, substeps(data.longest) // 2,
+            jnp.asarray(levels[0]), jax.random.key(seed), every,
+            max(1, substeps(data.longest) // 4),
         ),
         np.float64,
     )  # fmt: skip
@@ -259,7 +260,7 @@ def _errors(
         return (memory, pushes, x, v, a), e.astype(jnp.float32)
 
     zero = jnp.zeros((1, S, R), V.dtype)
-    rate = ((V[1] - V[0]) / step[:1])[:, None] + zero
+    rate = first_rate(V, step)[:, None] + zero
     memory = settle(model, u[0][:, None] + zero, step[:1, None], coarse)
     pushes = random.carried(u[0][:, None] + zero)[1]
     start = (memory, pushes, X[0][:, None] + zero, V[0][:, None] + zero, rate)

@@ -28,7 +28,7 @@ from ...models.effects.extended import Extended
 from ...models.effects.library import Library
 from ...models.effects.predict import advance
 from .data import Data
-from .innovations import settle, substeps
+from .innovations import first_rate, settle, substeps
 from .looking import Bench, mass
 
 _ENOUGH = 1e-3
@@ -110,8 +110,10 @@ def _errors(model: Extended, arrays: tuple, count: int) -> Float[Array, "M 12 K"
         seen_X, seen_V = model.observe(x, v, a)
         return (memory, x, v), jnp.concatenate([se3.local(X1, seen_X), seen_V - V1])
 
-    rate = (V[1] - V[0]) / step[:1]
-    start = (settle(model, before, step[:1], count), *model.infer(X[0], V[0], rate))
+    start = (
+        settle(model, before, step[:1], count),
+        *model.infer(X[0], V[0], first_rate(V, step)),
+    )
     return jax.lax.scan(body, start, (X[1:], V[1:], u, voltage, step))[1]
 
 

@@ -46,7 +46,7 @@ class Design:
             parameter = library.entries[i].parameter
             sizes = parameter.probes if is_curved(library, i) else parameter.probes[:1]
             if is_curved(library, i) and theta[i] != 0:
-                sizes = (0.1 * theta[i],)
+                sizes = (0.01 * theta[i],)
             owner += [i] * len(sizes)
             size += list(sizes)
         probes = np.zeros((len(owner), library.size))
@@ -243,7 +243,7 @@ class Evidence:
         H = tangent @ self.total @ tangent.T + np.diag(prior)
         H = H + 1e-10 * np.diag(np.maximum(np.diag(H), 1e-300))
         inverse = np.linalg.inv(H)
-        scores = self.runs @ weights @ tangent.T
+        scores = self._scores(weights, tangent)
         n = len(scores)
         meat = scores.T @ scores * n / max(n - 1, 1)
         spread = inverse @ meat @ inverse
@@ -252,7 +252,7 @@ class Evidence:
         project = np.eye(len(tangent))[own]
         if len(other):
             project[:, other] = -H[np.ix_(own, other)] @ np.linalg.inv(H[np.ix_(other, other)])
-        s = self.runs @ base @ (project @ tangent).T
+        s = self._scores(base, project @ tangent)
         meat = s.T @ s
         total = s.sum(axis=0)
         try:
@@ -265,6 +265,13 @@ class Evidence:
             F = (n - count) / count * ratio / max(1 - ratio, 1e-300) if ratio < 1 else np.inf
             return errors, float(scipy.stats.f.sf(F, count, n - count))
         return errors, 1.0
+
+    def _scores(
+        self, weights: Float[np.ndarray, " m"], tangent: Float[np.ndarray, "k m"]
+    ) -> Float[np.ndarray, "runs k"]:
+        """Derivatives of each run's loss at `weights`."""
+        rows, used = np.flatnonzero(tangent.any(axis=0)), np.flatnonzero(weights)
+        return self.runs[:, rows[:, None], used] @ weights[used] @ tangent[:, rows].T
 
     def null_quantile(
         self,

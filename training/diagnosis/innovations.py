@@ -15,7 +15,7 @@ from ...models.effects.library import Library
 from ...models.effects.predict import advance
 from .data import Data
 
-SUBSTEPS, LONGEST = 2, 0.025
+SUBSTEPS, LONGEST = 2, 0.0125
 """Substeps of a step at least, and their length (s) at most: drag is stiff in fast turns."""
 
 
@@ -42,14 +42,17 @@ class Predictions(NamedTuple):
         X: predicted pose itself, before it is observed (N, 7, R).
         V: predicted twist (N, 6, R).
         jacobian: A_n, of errors (pose in B, twist) over a step (N, 12, 12, R).
-        rate: predicted dV/dt at the step's end, under the command that ends there (N, 6, R).
+        rate: predicted dV/dt and d²V/dt² at the step's end, under the command that ends there
+            (N, 12, R).
+        start: pose and twist of the samples themselves, what instruments did to them taken off.
     """
 
     error: Float[Array, "N 12 R"]
     X: Float[Array, "N 7 R"]
     V: Float[Array, "N 6 R"]
     jacobian: Float[Array, "N 12 12 R"]
-    rate: Float[Array, "N 6 R"]
+    rate: Float[Array, "N 12 R"]
+    start: tuple[Float[Array, "N 7 R"], Float[Array, "N 6 R"]]
 
 
 def difference(
@@ -64,6 +67,12 @@ def settle(model: Extended, command: Array, dt: Array, substeps: int) -> Memory:
     memory = model.remember(command)
     after = jax.eval_shape(lambda m: model.actuate(m, command, dt, substeps)[0], memory)
     return tuple(jnp.broadcast_to(m, s.shape) for m, s in zip(memory, after, strict=True))
+
+
+def first_rate(V: Float[Array, "M 6 R"], step: Float[Array, "N #R"]) -> Float[Array, "12 R"]:
+    """First and second derivative of the twist before anything was predicted: of two records."""
+    rate = (V[1] - V[0]) / step[:1]
+    return jnp.concatenate([rate, jnp.zeros_like(rate)])
 
 
 @eqx.filter_jit
@@ -84,9 +93,9 @@ def _predict(model: Extended, effects: Any, arrays: Arrays, count: int) -> Predi
         )
         error = difference(*model.observe(Xp, Vp, a), X1, V1)
         jacobian = _jacobian(plain, rest, x, (v + Vp) / 2, command, h)
-        return (memory, a), Predictions(error, Xp, Vp, jacobian, a)
+        return (memory, a), Predictions(error, Xp, Vp, jacobian, a, (x, v))
 
-    start = settle(model, u[0], step[:1], count), (V[1] - V[0]) / step[:1]
+    start = settle(model, u[0], step[:1], count), first_rate(V, step)
     return jax.lax.scan(body, start, (X[:-1], V[:-1], X[1:], V[1:], u, voltage, step))[1]
 
 

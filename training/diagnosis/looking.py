@@ -154,8 +154,10 @@ class Bench:
 
     # ------------------------------------------------------------------------------- looking
 
-    def predict(self, theta: Float[np.ndarray, " p"]) -> tuple[Predictions, Noise, Filter]:
-        """Predictions with the noise and the filter that they ask for."""
+    def predict(
+        self, theta: Float[np.ndarray, " p"], kalman: Filter | None = None
+    ) -> tuple[Predictions, Noise, Filter]:
+        """Predictions with the noise that they ask for, and its filter unless one is given."""
         p = predict(self.model, self.library, theta, self.data)
         error, weight = np.asarray(p.error), self.data.weight
         if not np.isfinite(error[:, :, weight.any(axis=0)]).all():
@@ -164,6 +166,8 @@ class Bench:
         steps = Transition.along(jacobian, weight)
         mass = self.mass(theta)
         noise = estimate(error, weight, steps, mass, self.data.dt)
+        if kalman is not None:
+            return p, noise, kalman
         data, inverse = self.data, np.linalg.inv(mass)
         kalman = make_filter(noise, steps, inverse, data.dt, data.step, jacobian)
         # correlated innovations tell less than as many independent ones
@@ -180,14 +184,18 @@ class Bench:
         theta: Float[np.ndarray, " p"],
         chosen: Sequence[int] | None = None,
         kalman: Filter | None = None,
+        again: Look | None = None,
     ) -> Look:
         """Innovations at θ and the responses to the parameters chosen.
 
         By default all but those in single thrusters of causes that may be in all of them, and all
-        coefficients that have a range of their own (`within`).
+        coefficients that have a range of their own (`within`). A look at the same θ may be handed
+        over to look `again`: its predictions, noise and filter serve once more.
         """
-        p, noise, own = self.predict(theta)
-        kalman = own if kalman is None else kalman
+        if again is None:
+            p, noise, kalman = self.predict(theta, kalman)
+        else:
+            p, noise, kalman = again.predictions, again.noise, again.kalman
         if chosen is None:
             first = parameters_of(self.library, self.library.hypotheses(single=False))
             ranged = (i for i, e in enumerate(self.library.entries) if _key(e) in self.bounds)

@@ -151,7 +151,7 @@ class Search:
 
     def _judge_beside(self, structure: Beside | None, found: Found) -> None:
         self.bench = replace(self.bench, beside=structure)
-        found.current = self.bench.look(found.current.theta)
+        found.current = self.bench.look(found.current.theta, again=found.current)
 
     def _chosen(
         self, found: Found, least: float = 0.0, strict: bool = False
@@ -203,7 +203,7 @@ class Search:
         library = self.bench.library
         names = [h for h in library.hypotheses(single=True) if h not in taken]
         chosen = sorted({*parameters_of(library, names), *beside})
-        seen = self.bench.look(current.theta, chosen, current.kalman)
+        seen = self.bench.look(current.theta, chosen, again=current)
         return {h: seen.evidence.fit(library.at(*h), beside) for h in names}
 
     def _start(self, fit: Fit, theta: np.ndarray) -> np.ndarray:

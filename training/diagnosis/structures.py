@@ -32,8 +32,16 @@ from .responses import through
 LANES = 24
 PIECES = 60
 """Columns that one call of the compiled program takes, and pieces that are looked at."""
-TIMES = (0.4, 1.2, 4.0)
-FREQUENCIES = (0.0, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0)
+_TENTHS = tuple(round(0.1 * k, 1) for k in range(5, 16))
+NODES = {
+    0.4: (0.0, 0.35, 1.0, 2.0),
+    1.2: (0.0, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0),
+    4.0: (0.0, 0.2, 0.35, *_TENTHS, 1.7, 2.0, 2.5, 3.0),
+}
+"""Times (s) that a memory fades in, and frequencies (Hz) for each, some 1 / (2πT) apart."""
+_CORRELATED, _MOST_CORRELATED = 0.1, 2
+"""Correlation of neighbouring innovations from which an axis may remember other velocities, and so
+many axes at most."""
 _PRIORS = (0.3, 3.0, 30.0)
 _LEAST, CLEAR = 8.0, 2.5
 """Nats, and standard errors between runs, below which a gain is not looked at further."""
@@ -314,11 +322,16 @@ def _of_water(model: Extended, X: Array, V: Array, u: Array) -> Float[Array, "6 
 # ------------------------------------------------------------------------------- the groups
 
 
-def groups(bench: Bench) -> Iterator[Group]:
+def groups(bench: Bench, look: Look) -> Iterator[Group]:
     """Everything that is tried."""
     d = bench.data
+    nodes = [(time, f) for time, frequencies in NODES.items() for f in frequencies]
+    for i in _correlated(look):
+        for j in range(6):
+            if j != i:
+                yield _memory(bench, i, j, nodes)
     for i, axis in enumerate(AXES):
-        yield _memory(bench, i, TIMES, FREQUENCIES)
+        yield _memory(bench, i, i, nodes)
         yield _of_state(bench, Unknown.neutral(kind="motion", acts_on=axis, numbers=_ALL_MOTION))
         yield _of_state(bench, Unknown.neutral(kind="pose", acts_on=axis))
     level = d.command != "F_Bo_B"
@@ -371,12 +384,21 @@ def _of_thruster(bench: Bench, k: int) -> Group:
     return Group(effect, "thruster", (f"f{k + 1}",), columns, (tuple(range(effect.size())),))
 
 
-def _memory(bench: Bench, axis: int, times: Sequence[float], frequencies: Sequence[float]) -> Group:
-    nodes = [(t, f) for f in frequencies for t in times]
-    effect = Unknown.neutral(kind="memory", acts_on=AXES[axis], numbers=nodes[0])
+def _correlated(look: Look) -> list[int]:
+    """Axes whose neighbouring innovations are correlated most, if they are."""
+    z = look.z[:, 6:].astype(float)
+    square = np.maximum((z**2).sum(axis=(0, 2)), 1e-300)
+    correlation = (z[1:] * z[:-1]).sum(axis=(0, 2)) / square
+    first = np.argsort(-correlation)[:_MOST_CORRELATED]
+    return [int(i) for i in first if correlation[i] > _CORRELATED]
+
+
+def _memory(bench: Bench, axis: int, of: int, nodes: Sequence[tuple[float, float]]) -> Group:
+    """A wrench on an axis that remembers a component of the twist."""
+    effect = Unknown.neutral(kind="memory", acts_on=AXES[axis], numbers=(*nodes[0], float(of)))
 
     def columns(kept: np.ndarray) -> np.ndarray:
-        v = bench.data.V[:-1, axis][:, kept]
+        v = bench.data.V[:-1, of][:, kept]
         rates = np.array([complex(-1 / t, 2 * np.pi * f) for t, f in nodes])[:, None]
         z, found = np.zeros((len(nodes), len(kept)), complex), []
         for x, h in zip(v, bench.data.step[:, kept], strict=True):
@@ -393,7 +415,7 @@ def _memory(bench: Bench, axis: int, times: Sequence[float], frequencies: Sequen
     columns_of = [
         (0, 1 + 2 * i) if f == 0 else (0, 1 + 2 * i, 2 + 2 * i) for i, (_, f) in enumerate(nodes)
     ]
-    return Group(effect, "wrench", (TWIST[axis],), columns, tuple(columns_of), tuple(nodes))
+    return Group(effect, "wrench", (TWIST[of],), columns, tuple(columns_of), tuple(nodes))
 
 
 def _bumps(x: np.ndarray, y: np.ndarray, most: int = 16) -> tuple[float, ...]:
@@ -416,16 +438,17 @@ def refined(screen: Screen, found: Matched, rng: np.random.Generator) -> Unknown
     """The effect of a match: a memory's numbers between the nodes, the few terms of a motion."""
     effect = found.group.effect
     if effect.kind == "memory":
-        axis = AXES.index(effect.acts_on)
+        axis, of = AXES.index(effect.acts_on), effect.remembered
         T, f = found.group.labels[found.node]
         for spread in (1.4, 1.18, 1.08):
             # a ring that decays within the runs tells its frequency to a fraction of 1 / T
             step = (spread - 1) * max(f, 0.2)
             frequencies = [g for g in (f - step, f, f + step) if g >= 0.03] if f else [0.0]
-            finer = _memory(screen.bench, axis, (T / spread, T, T * spread), frequencies)
+            times = (T / spread, T, T * spread)
+            finer = _memory(screen.bench, axis, of, [(t, g) for g in frequencies for t in times])
             again = screen.match(finer, 0.01, rng, draws=0)
             T, f = finer.labels[again.node]
-        return Unknown.neutral(kind="memory", acts_on=effect.acts_on, numbers=(T, f))
+        return Unknown.neutral(kind="memory", acts_on=effect.acts_on, numbers=(T, f, float(of)))
     if effect.kind == "motion":
         chosen = screen.sparse(found.group)
         return Unknown.neutral(kind="motion", acts_on=effect.acts_on, numbers=chosen)
@@ -447,7 +470,7 @@ def described(effect: Unknown, weights: np.ndarray, bench: Bench) -> dict[str, A
     where = effect.acts_on
     variables: Sequence[str] = _VARIABLES.get(effect.kind, ())
     if effect.kind == "memory":
-        lag, frequency = effect.numbers
+        lag, frequency = effect.numbers[:2]
         variables = (effect.terms[0],)
         rings = f" and rings at {frequency:.2f} Hz" if frequency else ""
         told = f"a wrench on {where} that remembers {variables[0]} for {lag:.2g} s{rings}"

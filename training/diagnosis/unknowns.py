@@ -50,7 +50,7 @@ def screened(
     """The structure that wins most beside `rows`, of those that noise alone can't make."""
     screen = Screen(bench, look, responses_of(bench, look, rows))
     share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
-    tried = list(groups(bench))
+    tried = list(groups(bench, look))
     best: Matched | None = None
     for group in tried:
         m = screen.match(group, alpha / len(tried), rng)

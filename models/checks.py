@@ -4,6 +4,8 @@ import dataclasses
 import math
 from typing import Any, get_args, get_origin
 
+import jax
+
 from .errors import UserError
 
 Vector3 = tuple[float, float, float]
@@ -36,3 +38,16 @@ def check_numbers(config: Any) -> None:
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, float | int):
                 require(math.isfinite(number), config, field.name, "give finite numbers")
+
+
+def require_double(who: str, before: str) -> None:
+    """Refuse to go on in single precision: `who` needs more, `before` what it must be set.
+
+    Raises:
+        ValueError: if JAX runs in single precision.
+    """
+    if not jax.config.read("jax_enable_x64"):
+        raise ValueError(
+            f"{who} in double precision: call "
+            f'jax.config.update("jax_enable_x64", True) before {before}'
+        )

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..models import checks
+
 _INLINE = {
     "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
     "xla_cpu_multi_thread_eigen": False,
@@ -28,11 +30,7 @@ def require_double() -> None:
     Raises:
         ValueError: if JAX runs in single precision.
     """
-    if not jax.config.read("jax_enable_x64"):
-        raise ValueError(
-            "the systems compute in double precision: call "
-            'jax.config.update("jax_enable_x64", True) before building a diagram'
-        )
+    checks.require_double("the systems compute", "building a diagram")
 
 
 class Program:

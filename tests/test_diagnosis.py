@@ -2,6 +2,7 @@
 
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -378,6 +379,12 @@ def test_structure_without_a_name_is_found_where_it_is(tmp_path):
     parameters = hidden["parameters"]
     assert effect.numbers[0] == pytest.approx(parameters["decay"]["value"], rel=0.3)
     assert effect.numbers[1] == pytest.approx(parameters["frequency"]["value"], rel=0.15)
+
+
+def test_single_precision_is_refused_with_a_remedy(tmp_path):
+    recording = recorded(tmp_path, 3, "null")[1]
+    with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
+        Diagnoser(recording, VEHICLE)
 
 
 def test_a_swaying_mass_ahead_of_the_origin_is_seen_in_yaw(tmp_path):

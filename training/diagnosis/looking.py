@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Bool, Float
 
+from ...models.checks import require_double
 from ...models.dynamics import Dynamics
 from ...models.effects.base import AXES, XYZ, Effect
 from ...models.effects.extended import Extended
@@ -89,7 +90,12 @@ class Bench:
         base: Dynamics | None = None,
         without: Sequence[int] = (),
     ) -> "Bench":
-        """`base` is believed in place of the vehicle's preset; runs `without` are faulty."""
+        """`base` is believed in place of the vehicle's preset; runs `without` are faulty.
+
+        Raises:
+            ValueError: if JAX runs in single precision.
+        """
+        require_double("a diagnosis computes", "anything of it is made")
         data = make_data(recording, vehicle, without=without)
         believed = vehicle.dynamics() if base is None else base
         effects = believed.effects if isinstance(believed, Extended) else ()

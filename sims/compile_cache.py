@@ -53,10 +53,13 @@ def compiled_environment() -> dict[str, str]:
     """Variables by which another process keeps its programs in the same folder, bounded alike.
 
     One that knew the folder alone would store programs without the time of their last use, which
-    those that bound it can't read (`mend`).
+    those that bound it can't read (`mend`). None where no folder was chosen.
     """
+    folder = compiled_folder()
+    if folder is None:
+        return {}
     return {
-        "JAX_COMPILATION_CACHE_DIR": str(compiled_folder()),
+        "JAX_COMPILATION_CACHE_DIR": folder,
         "JAX_COMPILATION_CACHE_MAX_SIZE": str(_LARGEST),
     }
 

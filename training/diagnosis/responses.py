@@ -84,7 +84,7 @@ def _respond(
 
 
 def _single(tree: Any) -> Any:
-    """Numbers of single precision: enough for changes of a wrench, and twice as fast."""
+    """Numbers of single precision: enough for changes of a wrench, in 0.7 of the time."""
     return jax.tree.map(lambda a: a.astype(jnp.float32) if eqx.is_inexact_array(a) else a, tree)
 
 

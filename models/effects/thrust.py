@@ -121,7 +121,7 @@ class ThrustScale(Effect):
         return force * (1 + self.part(0, force)[None])
 
 
-KNOTS = (1.0, 2.0, 3.5, 5.0, 7.0, 10.0, 13.0, 16.0, 19.0, 23.0, 28.0, 34.0, 42.0)
+KNOTS = (2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0)
 """Forces (N), each way, between which `ThrustTable` is linear."""
 
 
@@ -133,7 +133,7 @@ class ThrustTable(Effect):
 
     name: ClassVar[str] = "thrust_table"
     family: ClassVar = "actuation"
-    parameters: ClassVar = (Parameter("correction", "1", (0.05,), -0.9, 3.0, 0.2),)
+    parameters: ClassVar = (Parameter("correction", "1", (0.05,), -0.9, 3.0, 0.1),)
     places: ClassVar = tuple(f"{sign}{knot:g} N" for sign in "+-" for knot in KNOTS)
     order: ClassVar[int] = 13
     source: ClassVar[str] = "curves of one thruster differ with maker's rig, battery and software"

@@ -28,6 +28,8 @@ from .noise import estimate, filtered, make_filter
 from .transition import Transition
 
 GROUPS = {"position": slice(0, 3), "rotation": slice(3, 6), "velocity": slice(6, 9)}
+_COARSER = 4
+"""Times longer than those of predictions the substeps of the many simulated samples are."""
 HORIZONS = (0.5, 1.0, 2.0, 4.0)
 SAMPLES = 39
 _PIECES = 60
@@ -156,7 +158,7 @@ def _simulated(
         _errors(
             bench.model, used, contender.stirring, arrays, box, jnp.asarray(levels[1]),
             jnp.asarray(levels[0]), jax.random.key(seed), every,
-            max(1, substeps(data.longest) // 4),
+            max(1, substeps(data.longest) // _COARSER),
         ),
         np.float64,
     )  # fmt: skip

@@ -59,6 +59,13 @@ class Look(NamedTuple):
     z: Float[np.ndarray, "N 12 R"]
     loss: float
 
+    @property
+    def correlation(self) -> Float[np.ndarray, "12"]:
+        """Of neighbouring innovations; those of samples that do not exist are zero."""
+        z = self.z.astype(float)
+        square = np.maximum((z**2).sum(axis=(0, 2)), 1e-300)
+        return (z[1:] * z[:-1]).sum(axis=(0, 2)) / square
+
 
 @dataclass(frozen=True)
 class Bench:

@@ -38,7 +38,8 @@ NODES = {
     1.2: (0.0, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0),
     4.0: (0.0, 0.2, 0.35, *_TENTHS, 1.7, 2.0, 2.5, 3.0),
 }
-"""Times (s) that a memory fades in, and frequencies (Hz) for each, some 1 / (2πT) apart."""
+"""Times (s) that a memory fades in, and frequencies (Hz) for each, one to three times
+1 / (2πT) apart."""
 _CORRELATED, _MOST_CORRELATED = 0.1, 2
 """Correlation of neighbouring innovations from which an axis may remember other velocities, and so
 many axes at most."""
@@ -386,9 +387,7 @@ def _of_thruster(bench: Bench, k: int) -> Group:
 
 def _correlated(look: Look) -> list[int]:
     """Axes whose neighbouring innovations are correlated most, if they are."""
-    z = look.z[:, 6:].astype(float)
-    square = np.maximum((z**2).sum(axis=(0, 2)), 1e-300)
-    correlation = (z[1:] * z[:-1]).sum(axis=(0, 2)) / square
+    correlation = look.correlation[6:]
     first = np.argsort(-correlation)[:_MOST_CORRELATED]
     return [int(i) for i in first if correlation[i] > _CORRELATED]
 

@@ -80,14 +80,12 @@ def refitted(bench: Bench, look: Look, rows: Sequence[int], joint: Fit) -> list[
 
 def residual(bench: Bench, look: Look) -> dict[str, result.AxisResidual]:
     """What is left, channel by channel."""
-    w = bench.data.weight
-    n = w.sum()
+    n, correlation = bench.data.weight.sum(), look.correlation
     found = {}
     for i, name in enumerate(CHANNELS):
-        z = look.z[:, i] * w
-        square = float((z**2).sum())
-        memory = float((z[1:] * z[:-1]).sum() / max(square, 1e-300))
-        found[name] = result.AxisResidual(square / n, memory, float(z.sum() / np.sqrt(n)))
+        z = look.z[:, i]
+        mean = float(z.sum() / np.sqrt(n))
+        found[name] = result.AxisResidual(float((z**2).sum()) / n, float(correlation[i]), mean)
     return found
 
 

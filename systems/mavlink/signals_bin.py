@@ -7,6 +7,7 @@ import numpy as np
 from ...models.errors import UserError
 from ...models.resample import linear
 from . import codec
+from .depth import in_water
 from .logs_bin import BinLog, Table
 from .signals import (
     Parameter,
@@ -173,14 +174,10 @@ def _motion(
 ) -> tuple[Series | None, Series | None]:
     if "XKF1" not in tables:
         return None, None
-    scale = codec.pascal_per_metre(known.get("BARO_SPEC_GRAV", 1.0))
-    factor = 1.0 if density is None else scale / codec.pascal_per_metre(density=density)
     ekf = _of(tables["XKF1"], "C", core)
     p = codec.world_vector(ekf["PN"], ekf["PE"], ekf["PD"])
     v = codec.world_vector(ekf["VN"], ekf["VE"], ekf["VD"])
-    p[2] *= factor
-    v[2] *= factor
-    return series(ekf["t"], p, "XKF1"), series(ekf["t"], v, "XKF1")
+    return in_water(series(ekf["t"], p, "XKF1"), series(ekf["t"], v, "XKF1"), known, density)
 
 
 def _aiding(tables: Mapping[str, Table], core: int) -> dict[str, Spans]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from ...models.errors import UserError
 from . import codec
+from .depth import in_water
 from .logs_tlog import Table, TlogLog
 from .signals import (
     Parameter,
@@ -139,8 +140,6 @@ def _specific_force(
 def _motion(
     tables: Mapping[str, Table], known: Mapping[str, float], density: float | None
 ) -> tuple[Series | None, Series | None]:
-    scale = codec.pascal_per_metre(known.get("BARO_SPEC_GRAV", 1.0))
-    factor = 1.0 if density is None else scale / codec.pascal_per_metre(density=density)
     local, glob = tables.get("LOCAL_POSITION_NED"), tables.get("GLOBAL_POSITION_INT")
     if local is not None and local["t"].size > 1:
         t, name = local["t"], "LOCAL_POSITION_NED"
@@ -153,9 +152,7 @@ def _motion(
         v = np.stack([lacking, lacking, codec.climb_from_vz(glob["vz"])])
     else:
         return None, None
-    p[2] *= factor
-    v[2] *= factor
-    return series(t, p, name), series(t, v, name)
+    return in_water(series(t, p, name), series(t, v, name), known, density)
 
 
 def _aiding(tables: Mapping[str, Table]) -> dict[str, Spans]:

@@ -284,7 +284,7 @@ def test_laws_of_what_is_left():
     def best(change):
         z = rng.standard_normal((N, 12, R))
         z[:, 7] = change(z[:, 7])
-        return find_laws(z, speed, weight, fold, 0.05)[0]
+        return find_laws(z, speed, weight, fold, 0.05, np.ones(6))[0]
 
     assert best(lambda z: z).heldout_gain < 6
     blows = best(lambda z: z * np.where(rng.random(z.shape) < 0.01, 8.0, 1.0))

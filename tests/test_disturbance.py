@@ -16,7 +16,7 @@ from spinndrift.models.recording_csv import read_csv
 from spinndrift.models.vehicle import load_vehicle
 from spinndrift.training.diagnosis.beside import Beside
 from spinndrift.training.diagnosis.diagnose import Diagnoser
-from spinndrift.training.diagnosis.disturbance import SLOW, all_laws, is_apart, laws_of, told
+from spinndrift.training.diagnosis.disturbance import SLOW, all_laws, laws_of, told
 from spinndrift.training.diagnosis.noise import estimate
 from spinndrift.training.diagnosis.search import Found, Search
 from spinndrift.training.diagnosis.transition import Transition
@@ -30,12 +30,12 @@ LEVELS = np.array([1.0] * 3 + [0.03] * 3)
 def bench_of(tmp_path_factory):
     """A bench of a hidden cause, and its cause; the belief states the level that was hidden."""
 
-    def made(name, size, noise=None, **plan):
+    def made(name, size, noise=None, believed=LEVELS, **plan):
         folder = tmp_path_factory.mktemp(name) / "data"
         plan = Plan(runs=2, seconds=6.0, **plan)
         case = draw(3, names=(name,), size=size, plan=plan, noise=noise)
         case.write(folder)
-        diagnoser = Diagnoser(read_csv(folder), VEHICLE, VEHICLE.dynamics(LEVELS))
+        diagnoser = Diagnoser(read_csv(folder), VEHICLE, VEHICLE.dynamics(believed))
         return diagnoser.bench, case.effects[0]
 
     return made
@@ -169,10 +169,20 @@ def test_levels_and_what_comes_and_goes_are_told_apart(bench_of, name, size):
     bench, _ = bench_of(name, size)
     look = bench.look(bench.believed)
     assert not look.noise.estimated
-    laws = [w for w in all_laws(bench, look, 12.0) if w.heldout_gain > 12 and is_apart(w, bench)]
-    groups = told(laws, bench, look)
+    groups = told(all_laws(bench, look, 12.0), bench, look, 12.0)
     assert [group[0].name for group in groups] == [name]
     assert all(law.name == name for law in groups[0])
+
+
+@pytest.mark.parametrize("name", ["disturbance_colour", "disturbance_state_dependence"])
+def test_what_lasts_or_grows_is_no_level_in_calm_water(bench_of, name):
+    """With a twentieth of the white disturbance, and as little of it believed."""
+    calm = tuple(LEVELS / 20)
+    bench, _ = bench_of(name, 1.0, Noise(diffusion=calm), believed=np.array(calm))
+    look = bench.look(bench.believed)
+    laws = all_laws(bench, look, 12.0)
+    assert any(law.name == "disturbance_level" and law.heldout_gain > 12 for law in laws)
+    assert [group[0].name for group in told(laws, bench, look, 12.0)] == [name]
 
 
 def test_states_known_exactly_are_not_taken_for_estimates(bench_of):

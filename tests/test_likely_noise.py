@@ -9,12 +9,14 @@ from hidden.simulator import Noise as Hidden
 from spinndrift.models.recording_csv import read_csv
 from spinndrift.models.vehicle import load_vehicle
 from spinndrift.training.diagnosis.diagnose import Diagnoser
+from spinndrift.training.diagnosis.likely_noise import beside_pushes
 from spinndrift.training.diagnosis.noise import (
     Noise,
     estimate,
     filtered,
     make_filter,
     process_covariance,
+    unit_processes,
 )
 from spinndrift.training.diagnosis.transition import Transition
 
@@ -45,6 +47,41 @@ def test_levels_are_found_far_below_the_records_noise(part):
     assert not noise.estimated
     np.testing.assert_allclose(noise.record[:9], RECORD[:9], rtol=0.05)
     np.testing.assert_allclose(noise.diffusion, b, rtol=0.25)
+
+
+def test_an_axis_may_be_held_while_the_rest_is_sought():
+    b = np.array([1.0, 1.0, 1.0, 0.03, 0.03, 0.03])
+    error, weight = errors(np.random.default_rng(3), 200, 60, b), np.ones((200, 60))
+    noise = estimate(error, weight, Transition.constant(A), MASS, DT, held={1: 2.0, 5: 0.02})
+    np.testing.assert_allclose(noise.diffusion[[1, 5]], [2.0, 0.02], rtol=1e-12)
+    np.testing.assert_allclose(noise.diffusion[[0, 2, 3, 4]], b[[0, 2, 3, 4]], rtol=0.25)
+
+
+@pytest.mark.parametrize("believed", [1.0, 2.0])
+def test_a_level_is_told_from_pushes_that_last(believed):
+    """Without pushes in the model b is far above the truth, beside them the truth loses nothing."""
+    b = np.array([1.0, 1.0, 1.0, 0.03, 0.03, 0.03])
+    N, R, tau, pushes = 200, 60, 0.7, np.array([5.0, 0.0, 5.0, 0.15, 0.0, 0.0])
+    rng = np.random.default_rng(4)
+    inverse, weight = np.linalg.inv(MASS), np.ones((N, R))
+    once = np.concatenate([DT**2 / 2 * inverse, DT * inverse]).T
+    rho, p = np.exp(-DT / tau), pushes[:, None] * rng.standard_normal((6, R))
+    error = errors(rng, N, R, b)
+    for n in range(N):
+        error[n] += once.T @ p
+        drawn = rng.standard_normal((6, R))
+        p = rho * p + np.sqrt(1 - rho**2) * pushes[:, None] * drawn
+    steps = Transition.constant(A)
+    alone = estimate(error, weight, steps, MASS, DT)
+    assert np.all(alone.diffusion[[0, 2, 3]] > 1.2 * b[[0, 2, 3]])
+    units, start = unit_processes(A, inverse, DT), np.concatenate([alone.record, alone.diffusion])
+    left, lost = beside_pushes(
+        error, weight, steps, units, once, DT, start**2, believed * b, [0, 1, 3]
+    )
+    assert np.all(left < 1.2 * b)
+    np.testing.assert_allclose(left[[1, 4, 5]], b[[1, 4, 5]], rtol=0.3)
+    assert np.all(lost[[2, 4, 5]] == 0)
+    assert np.all((lost[[0, 1, 3]] > 20) if believed == 2.0 else (lost < 4))
 
 
 def test_a_process_that_can_not_be_seen_counts_with_its_error():

@@ -22,12 +22,13 @@ from . import result, telling
 from .blackbox import train
 from .checks import limits, problems, unexcited
 from .data import Data
-from .disturbance import LEVEL, OF_OTHERS, all_laws, best_law, is_apart
+from .disturbance import OF_OTHERS, all_laws, best_law, passing
 from .disturbance import told as told_laws
 from .gain import Contender, judge, told, white_part
 from .hypotheses import Fit
 from .identify import identify, with_coefficients
 from .laws import Law
+from .levels import LEVEL
 from .looking import Bench, Look
 from .naming import Hypothesis, parameters_of
 from .ratios import ratios
@@ -147,9 +148,9 @@ class Diagnoser:
         # what the names leave of their own is no law
         least = max(least, OF_OTHERS * sum(choice.fit.heldout_gain for choice, _ in found.accepted))
         laws = [] if final.noise.estimated else all_laws(bench, final, least)
-        passing = [law for law in laws if law.heldout_gain > least and is_apart(law, bench)]
-        groups = told_laws(passing, bench, final)
+        groups = told_laws(laws, bench, final, least)
         shaped = [law for group in groups for law in group if law.name != LEVEL]
+        passed = passing(laws, bench, least)
         tested = len(found.fits) + len(laws)
         causes, stirring = [], []
         if joint is not None:
@@ -158,7 +159,7 @@ class Diagnoser:
                 for a in found.accepted
             ]
         for group in groups:
-            rivals = [law for law in passing if law.name != group[0].name]
+            rivals = [law for law in passed if law.name != group[0].name]
             law_cause, effect = telling.law_cause(group, rivals, bench, final)
             causes.append(law_cause)
             stirring.append(effect)

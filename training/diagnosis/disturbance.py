@@ -3,16 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ...models.effects.base import AXES
-from .data import Data
 from .gain import white_part
 from .laws import Law, estimated, find_laws, growth_alone, run_constants
+from .levels import LEVEL, beside_slow, find_levels, process_share
 from .looking import Bench, Look
-from .noise import Noise, estimate, filtered, make_filter
+from .noise import estimate
 from .transition import Transition
 from .waves import are_waves, find_waves
 
@@ -20,7 +19,9 @@ _BLOW = 4.0
 """Standard deviations beyond which an error is a blow's."""
 _SHORTEST, _SMALLEST = 3.0, 0.1
 """Steps that a colour must last, share by which a level must differ."""
-LEVEL, SLOW = "disturbance_level", ("waves", "disturbance_colour", "current_varying")
+SLOW = ("waves", "disturbance_colour", "current_varying")
+_AS_WELL = 1.0
+"""Nats by which growth with the speed may explain less than a level to explain it as well."""
 OF_OTHERS = 1e-3
 """Share of what others win that a law must win besides: they leave some of their own."""
 
@@ -34,7 +35,9 @@ def laws_of(bench: Bench, look: Look) -> list[Law]:
         return []
     data = bench.data
     speed = np.linalg.norm(data.V[:-1, :3], axis=1)
-    found = find_laws(look.z.astype(float), speed, data.weight, data.fold, data.dt)
+    found = find_laws(
+        look.z.astype(float), speed, data.weight, data.fold, data.dt, process_share(bench, look)
+    )
     rows = bench.library.at("current_steady", "W")
     evidence = look.plain
     if set(rows) <= set(evidence.design.owner.tolist()) and len(evidence.runs) > 2:
@@ -63,33 +66,39 @@ def all_laws(bench: Bench, look: Look, least: float) -> list[Law]:
         waves = find_waves(bench, look)
         if are_waves(waves, slow):
             found.append(waves)
-    found += find_levels(bench, look)
+    found += find_levels(bench, look, least)
     return sorted(found, key=lambda law: -law.heldout_gain)
 
 
-def told(laws: Sequence[Law], bench: Bench, look: Look) -> list[list[Law]]:
+def passing(laws: Sequence[Law], bench: Bench, least: float) -> list[Law]:
+    """Laws that win more than `least` nats by more than the noise levels alone can be in error."""
+    return [law for law in laws if law.heldout_gain > least and _is_apart(law, bench)]
+
+
+def told(laws: Sequence[Law], bench: Bench, look: Look, least: float) -> list[list[Law]]:
     """Which of the laws that pass are told, in groups of one name each, largest first.
 
     Of laws with a structure one name is told. Levels differ with any of them: a slow one disturbs
     the estimate of b, one that comes and goes is a part of it. A level stands beside a slow one
-    that wins less; beside growth with the speed if that alone explains less than the level alone,
-    beside blows if it holds between them, and each time if it is the larger part of the change.
-    Then a structure must win more than what the level leaves of its own.
+    if the believed one loses more than `least` nats beside pushes that last; beside growth with
+    the speed if that alone explains less than the level alone, beside blows if it holds between
+    them, and then if it is the larger part of the change. A structure must win more than what the
+    level leaves of its own.
     """
-    levels = [law for law in laws if law.name == LEVEL]
-    shaped = [law for law in laws if law.name != LEVEL]
+    passed = passing(laws, bench, least)
+    levels = [law for law in passed if law.name == LEVEL]
+    shaped = [law for law in passed if law.name != LEVEL]
     if not shaped:
         return [levels] if levels else []
     shaped = [law for law in shaped if law.name == shaped[0].name]
-    if shaped[0].name == "disturbance_state_dependence" and _grows_alone(
-        levels, shaped, look, bench
-    ):
-        grows = {law.where for law in shaped}
-        levels = [law for law in levels if law.where not in grows]
+    if shaped[0].name == "disturbance_state_dependence":
+        shaped, levels = _grown(laws, shaped, levels, bench, look)
+    if levels and shaped[0].name in SLOW:
+        levels = beside_slow(levels, bench, look, least)
     kept = []
     for law in levels:
         rest = _level_beside(law, shaped, bench, look)
-        if rest is not None and is_apart(rest, bench):
+        if rest is not None and _is_apart(rest, bench):
             kept.append(rest)
     if not kept:
         return [shaped]
@@ -103,7 +112,7 @@ def _level_beside(law: Law, shaped: Sequence[Law], bench: Bench, look: Look) -> 
     """A level with what is left of its change beside laws of one name, if it stands."""
     i, name = AXES.index(law.where), shaped[0].name
     if name in SLOW:
-        return law if law.heldout_gain > shaped[0].heldout_gain else None
+        return law
     own = [other for other in shaped if other.where == law.where]
     if not own:
         return law
@@ -117,16 +126,27 @@ def _level_beside(law: Law, shaped: Sequence[Law], bench: Bench, look: Look) -> 
     return replace(law, parameters={"change": float(rest - 1)})
 
 
-def _grows_alone(levels: Sequence[Law], shaped: Sequence[Law], look: Look, bench: Bench) -> bool:
-    """Whether growth with the speed from the believed levels wins more than levels without it."""
+def _grown(
+    laws: Sequence[Law], shaped: Sequence[Law], levels: Sequence[Law], bench: Bench, look: Look
+) -> tuple[list[Law], list[Law]]:
+    """Axes that grow with the speed, and levels beside them.
+
+    Where growth from the believed levels wins more than levels without it, levels of these axes are
+    a part of it, and so are those of others that the speed explains as well.
+    """
     data = bench.data
     speed = np.linalg.norm(data.V[:-1, :3], axis=1)
-    grows, gain = {law.where for law in shaped}, 0.0
+    share, won = process_share(bench, look), {}
     for law in levels:
-        if law.where in grows:
-            z = look.z[:, 6 + AXES.index(law.where)].astype(float)
-            gain += growth_alone(z, speed, data.weight, 1 / (1 + law.parameters["change"]))
-    return gain > 0
+        i, rest = AXES.index(law.where), 1 / (1 + law.parameters["change"])
+        z = look.z[:, 6 + i].astype(float)
+        won[law.where] = growth_alone(z, speed, data.weight, rest, share[i])
+    grows = {law.where for law in shaped}
+    if sum(won.get(axis, 0.0) for axis in grows) <= 0:
+        return list(shaped), list(levels)
+    also = {axis for axis, gain in won.items() if gain > -_AS_WELL}
+    more = [law for law in laws if law.name == shaped[0].name and law.where in also - grows]
+    return [*shaped, *more], [law for law in levels if law.where not in grows | also]
 
 
 def _without_blows(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
@@ -144,62 +164,10 @@ def _without_blows(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
     return estimate(error, weight, steps, bench.mass(look.theta), data.dt).diffusion
 
 
-def is_apart(law: Law, bench: Bench) -> bool:
+def _is_apart(law: Law, bench: Bench) -> bool:
     """Whether a law differs from what the noise levels alone can be in error."""
     if law.name == "disturbance_colour" and law.loss is not None:
         return float(np.exp(estimated(law, bench.data.cluster)[0][0])) > _SHORTEST * bench.data.dt
     if law.name == LEVEL:
         return abs(law.parameters["change"]) > _SMALLEST
     return True
-
-
-# ------------------------------------------------------------------------------------- level
-
-
-def find_levels(bench: Bench, look: Look) -> list[Law]:
-    """White disturbance stronger or weaker than the belief says, axis by axis.
-
-    The gain is that of the level estimated on the other folds over the believed one, all other
-    levels being estimated; the error of the level by the jackknife over folds. A belief without a
-    level has none to differ from.
-    """
-    believed = np.asarray(bench.model.base.mass_and_diffusion(jnp.zeros(6))[1])
-    if not np.any(believed > 0):
-        return []
-    data = bench.data
-    error, jacobian = np.asarray(look.predictions.error), np.asarray(look.predictions.jacobian)
-    mass, labels = bench.mass(look.theta), np.unique(data.fold)
-    inverse = np.linalg.inv(mass)
-    gain = np.zeros((6, len(data.fold)))
-    levels = np.zeros((len(labels), 6))
-    for k, label in enumerate(labels):
-        own = data.fold == label
-        rest = data.weight * (~own if not own.all() else 1)
-        steps = Transition.along(jacobian, rest)
-        noise = estimate(error, rest, steps, mass, data.dt)
-        levels[k] = noise.diffusion
-        score = _score(error, jacobian, data, own, noise, steps, inverse)
-        for i in np.flatnonzero(believed > 0):
-            b = noise.diffusion.copy()
-            b[i] = believed[i]
-            other = type(noise)(noise.record, b)
-            gain[i, own] = score - _score(error, jacobian, data, own, other, steps, inverse)
-    found, n = [], len(labels)
-    for i in np.flatnonzero(believed > 0):
-        spread = np.sqrt((n - 1) / n * np.sum((levels[:, i] - levels[:, i].mean()) ** 2))
-        change = float(look.noise.diffusion[i] / believed[i] - 1)
-        error_of = {"change": float(spread / believed[i])}
-        law = Law(LEVEL, AXES[i], {"change": change}, gain[i], errors=error_of)
-        found.append(law)
-    return found
-
-
-def _score(
-    error: np.ndarray, jacobian: np.ndarray, data: Data, own: np.ndarray, noise: Noise,
-    steps: Transition, inverse: np.ndarray,
-) -> Float[np.ndarray, " R"]:  # fmt: skip
-    """Log density of the innovations of some pieces, up to a constant."""
-    kalman = make_filter(noise, steps, inverse, data.dt, data.step[:, own], jacobian[..., own])
-    w = data.weight[:, own]
-    z = filtered(error[:, :, own], jacobian[..., own], kalman) * w[:, None]
-    return -(z**2).sum(axis=(0, 1)) / 2 - (kalman.log_det * w).sum(axis=0)

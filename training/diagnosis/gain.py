@@ -24,7 +24,7 @@ from .blackbox import BlackBox, arguments
 from .innovations import Arrays, as_arrays, difference, first_rate, predict, settle, substeps
 from .laws import Law
 from .looking import Bench
-from .noise import estimate, filtered, make_filter
+from .noise import estimate, score_of
 from .transition import Transition
 
 GROUPS = {"position": slice(0, 3), "rotation": slice(3, 6), "velocity": slice(6, 9)}
@@ -90,12 +90,8 @@ def judge(
         steps = Transition.along(jacobian, rest)
         noise = estimate(error, rest, steps, mass, data.dt)
         record[:, own], diffusion[:, own] = noise.record[:, None], noise.diffusion[:, None]
-        inverse, step = np.linalg.inv(mass), data.step[:, own]
-        kalman = make_filter(noise, steps, inverse, data.dt, step, jacobian[..., own])
-        weight = data.weight[:, own]
-        z = filtered(error[:, :, own], jacobian[..., own], kalman) * weight[:, None]
-        score[own] = -(z**2).sum(axis=(0, 1)) / 2 - (kalman.log_det * weight).sum(axis=0)
-        score[own] -= 6 * np.log(2 * np.pi) * weight.sum(axis=0)
+        given = np.linalg.inv(mass), data.dt, data.step[:, own], data.weight[:, own]
+        score[own] = score_of(error[:, :, own], jacobian[..., own], noise, steps, *given)
     kept = _spread(data.fold, _PIECES)
     levels = record[:, kept], diffusion[:, kept] * contender.white[:, None]
     kinds = {bench.library.entries[i][:2] for i in in_use}

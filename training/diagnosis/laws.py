@@ -91,12 +91,17 @@ def speed_dependence(
     speed: Float[np.ndarray, "N R"],
     weight: Float[np.ndarray, "N R"],
     fold: Int[np.ndarray, " R"],
+    share: float = 1.0,
 ) -> Told:
-    """Gain of the variance s² (1 + k |v|²) over a constant one."""
+    """Gain of a process with the variance q (1 + k |v|²) over a constant one.
+
+    `share` of the variance of z is the process's, the rest the instruments'.
+    """
     growth = np.concatenate([[0.0], _GROWTHS])
 
     def at(k: float) -> np.ndarray:
-        shape = 1 + k * speed**2
+        grown = 1 + k * speed**2
+        shape = 1 - share + share * grown * weight.sum() / (grown * weight).sum()
         s2 = (z**2 / shape * weight).sum() / weight.sum()
         return ((z**2 / (s2 * shape) + np.log(s2 * shape)) / 2 * weight).sum(axis=0)
 
@@ -110,10 +115,11 @@ def growth_alone(
     speed: Float[np.ndarray, "N R"],
     weight: Float[np.ndarray, "N R"],
     rest: float,
+    share: float = 1.0,
 ) -> float:
-    """Nats by which growth from the variance rest², of one free number, is better than any s².
+    """Nats by which a process that grows from rest² times its variance is better than any constant.
 
-    As 1 + k |v|² or as (1 + k |v|)², whichever is better.
+    As 1 + k |v|² or as (1 + k |v|)², whichever is better; `share` as in `speed_dependence`.
     """
 
     def loss(s2: np.ndarray) -> float:
@@ -121,7 +127,7 @@ def growth_alone(
 
     alone = loss(np.full_like(z, (z**2 * weight).sum() / weight.sum()))
     shapes = [1 + k * speed**2 for k in _GROWTHS] + [(1 + k * speed) ** 2 for k in _GROWTHS]
-    return alone - min(loss(rest**2 * shape) for shape in shapes)
+    return alone - min(loss(1 - share + share * rest**2 * shape) for shape in shapes)
 
 
 def colour(
@@ -186,14 +192,15 @@ def find_laws(
     weight: Float[np.ndarray, "N R"],
     fold: Int[np.ndarray, " R"],
     dt: float,
+    share: Float[np.ndarray, "6"],
 ) -> list[Law]:
-    """All laws on all axes, largest gain first."""
+    """All laws on all axes, largest gain first; `share` as in `speed_dependence`, by axis."""
     found = []
     for i, axis in enumerate(AXES):
         own = z[:, 6 + i]
         for name, told in (
             ("disturbance_impacts", impacts(own, weight, fold)),
-            ("disturbance_state_dependence", speed_dependence(own, speed, weight, fold)),
+            ("disturbance_state_dependence", speed_dependence(own, speed, weight, fold, share[i])),
             ("disturbance_colour", colour(own, weight, fold, dt)),
         ):
             gain, values, loss = told

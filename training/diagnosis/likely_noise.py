@@ -6,22 +6,89 @@ covariance that is linear in the variances of records and process: Σ = Σ_i θ_
 in log θ finds the most likely ones (Anderson 1973, "Asymptotically efficient estimation of
 covariance matrices with linear structure"). Moments of neighbours alone tell little of a process
 that is smaller than the records' noise: here the whole block tells.
+
+Pushes that last add Σ_j σ_j² φ_j^|n - m| g_j g_jᵀ, with g_j what a constant one makes of an error:
+linear in their variances too. So longer blocks tell a white level from what is not white.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .transition import Transition
 
 _BLOCK, _LEAST = 12, 8
 """Samples of a block, and blocks at least."""
-_ROUNDS, _TRIES, _ENOUGH = 30, 8, 1e-4
+_LONGER = 24
+"""Samples of a block where pushes that last are told from a level."""
+_TIMES = (0.3, 1.0, 4.0)
+"""Times (s) for which pushes last, as a mixture."""
+_ROUNDS, _TRIES, _ENOUGH = 60, 8, 1e-4
 """Of scoring; halvings of a step; gain of log likelihood a block at which it ends."""
 _STEP = 1.5  # of log θ at most
+_DEEP = 14.0
+"""Of log θ below the start that pushes and levels may get."""
 _CLEAR = 10.0
 """Times what the process makes of a pose within a step its record's variance must be to be heard.
 Exact poses would tell of the process by how a simulation was stepped."""
+
+
+class Structure(NamedTuple):
+    """S, the mean of y yᵀ over blocks, is expected to be Σ_i exp(x_i) G_i; scaled alike."""
+
+    S: Float[np.ndarray, "d d"]
+    G: Float[np.ndarray, "k d d"]
+
+    def loss(self, x: Float[np.ndarray, " k"]) -> tuple[float, Float[np.ndarray, "d d"]]:
+        """Negative log likelihood a block, up to a constant, and Σ⁻¹."""
+        covariance = np.tensordot(np.exp(x), self.G, 1)
+        try:
+            L = np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError:
+            return np.inf, covariance
+        inverse = np.linalg.inv(covariance)
+        return float(np.log(np.diag(L)).sum() + np.sum(inverse * self.S) / 2), inverse
+
+    def fisher(
+        self, x: Float[np.ndarray, " k"], inverse: Float[np.ndarray, "d d"]
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
+        """Slope of the loss by x, and its expected curvature."""
+        IG = inverse @ self.G * np.exp(x)[:, None, None]
+        slope = np.trace(IG, axis1=1, axis2=2) - np.einsum("iab,ba->i", IG, inverse @ self.S)
+        return slope / 2, np.einsum("iab,jba->ij", IG, IG, optimize=True) / 2
+
+    def likeliest(
+        self,
+        x: Float[np.ndarray, " k"],
+        low: Float[np.ndarray, " k"],
+        moved: Bool[np.ndarray, " k"],
+    ) -> Float[np.ndarray, " k"]:
+        """Scoring from x on those that may be `moved`, down to `low`."""
+        x = np.where(moved, np.maximum(x, low), x)
+        loss, inverse = self.loss(x)
+        damping = 1e-3
+        for _ in range(_ROUNDS):
+            slope, fisher = self.fisher(x, inverse)
+            free = moved & ((x > low + 1e-9) | (slope < 0))
+            for _ in range(_TRIES):
+                H = fisher[np.ix_(free, free)]
+                H = H + np.diag(damping * np.diag(H) + 1e-9)
+                step = np.zeros(len(x))
+                step[free] = np.clip(-np.linalg.solve(H, slope[free]), -_STEP, _STEP)
+                tried = np.where(moved, np.maximum(x + step, low), x)
+                less, other = self.loss(tried)
+                if less <= loss:
+                    break
+                damping = 10 * max(damping, 1e-3)
+            else:
+                break
+            gain, x, loss, inverse = loss - less, tried, less, other
+            damping = max(damping / 10, 1e-6)
+            if gain < _ENOUGH:
+                break
+        return x
 
 
 def most_likely(
@@ -31,6 +98,7 @@ def most_likely(
     units: Float[np.ndarray, "6 12 12"],
     start: Float[np.ndarray, "18"],
     least: Float[np.ndarray, "18"],
+    held: Bool[np.ndarray, "6"] | None = None,
 ) -> Float[np.ndarray, "18"]:
     """Variances of the twelve records and the six b²; `start` where data are too few.
 
@@ -44,79 +112,96 @@ def most_likely(
         units: covariance of a step's process for b² = 1 of each axis.
         start: first guess.
         least: lower bounds.
+        held: axes whose b² stays as in `start`.
     """
-    blocks = _blocks(error, weight)
+    blocks = _blocks(error, weight, _BLOCK)
     if len(blocks) < _LEAST:
         return start
     made = np.diagonal(units, axis1=1, axis2=2)[:, :6].T @ start[12:]
-    heard = np.concatenate([start[:6] > _CLEAR * made, np.ones(12, bool)])
-    basis = scipy.linalg.null_space(np.ones((1, _BLOCK)))
-    y = np.einsum("kna,nm->kma", blocks[:, :, heard[:12]], basis).reshape(len(blocks), -1)
-    S = y.T @ y / len(y)
-    scale = 1 / np.sqrt(np.diag(S))
-    G = _structures(transition, units, basis, heard[:12]) * scale[:, None] * scale
-    S = S * scale[:, None] * scale
-    low = np.log(least)
-    x = np.maximum(np.log(start), low)
-    loss, inverse = _loss(x, G, S)
-    damping = 1e-3
-    for _ in range(_ROUNDS):
-        IG = inverse @ G * np.exp(x)[:, None, None]
-        slope = (np.trace(IG, axis1=1, axis2=2) - np.einsum("iab,ba->i", IG, inverse @ S)) / 2
-        fisher = np.einsum("iab,jba->ij", IG, IG, optimize=True) / 2
-        free = heard & ((x > low + 1e-9) | (slope < 0))
-        for _ in range(_TRIES):
-            H = fisher[np.ix_(free, free)]
-            H = H + np.diag(damping * np.diag(H) + 1e-9)
-            step = np.zeros(len(x))
-            step[free] = np.clip(-np.linalg.solve(H, slope[free]), -_STEP, _STEP)
-            tried = np.maximum(x + step, low)
-            less, other = _loss(tried, G, S)
-            if less <= loss:
-                break
-            damping = 10 * max(damping, 1e-3)
-        else:
-            break
-        gain, x, loss, inverse = loss - less, tried, less, other
-        damping = max(damping / 10, 1e-6)
-        if gain < _ENOUGH:
-            break
-    found, IG = np.exp(x), inverse @ G
-    fisher = np.einsum("iab,jba->ij", IG, IG, optimize=True) / 2 * len(y) / 2
-    errors = np.sqrt(np.maximum(np.diag(np.linalg.pinv(fisher, hermitian=True)), 0.0))
-    return np.concatenate([found[:12], np.maximum(found[12:], errors[12:])])
+    heard = np.concatenate([start[:6] > _CLEAR * made, np.ones(6, bool)])
+    structure = _structure(blocks, transition, units, heard)
+    held = np.zeros(6, bool) if held is None else held
+    moved = np.concatenate([heard, ~held])
+    x = structure.likeliest(np.log(start), np.log(least), moved)
+    found = np.exp(x)
+    curvature = structure.fisher(x, structure.loss(x)[1])[1] / np.outer(found, found)
+    covariance = np.linalg.pinv(curvature * len(blocks) / 2, hermitian=True)
+    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))[12:]
+    return np.concatenate([found[:12], np.where(held, found[12:], np.maximum(found[12:], errors))])
 
 
-def _blocks(error: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, "K n 12"]:
+def beside_pushes(
+    error: Float[np.ndarray, "N 12 R"],
+    weight: Float[np.ndarray, "N R"],
+    transition: Transition,
+    units: Float[np.ndarray, "6 12 12"],
+    push: Float[np.ndarray, "6 12"],
+    dt: float,
+    start: Float[np.ndarray, "18"],
+    believed: Float[np.ndarray, "6"],
+    axes: list[int],
+) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"]]:
+    """White b beside pushes that last, and what a believed b loses there (nats), of some axes.
+
+    Args:
+        error, weight, transition, units: as in `most_likely`.
+        push: what a constant unit wrench makes of an error, by axis.
+        dt: step (s).
+        start: variances to start from.
+        believed: b.
+        axes: of which the loss is told; it is zero elsewhere, and where data are too few.
+    """
+    blocks, lost = _blocks(error, weight, _LONGER), np.zeros(6)
+    if len(blocks) < _LEAST:
+        return np.sqrt(start[12:]), lost
+    structure = _structure(blocks, transition, units, np.ones(12, bool), (push, dt))
+    often = np.repeat(start[12:], len(_TIMES)) / dt / 10
+    x = np.log(np.concatenate([start, often]))
+    low, moved = x - _DEEP, np.ones(len(x), bool)
+    x = structure.likeliest(x, low, moved)
+    best = structure.loss(x)[0]
+    for i in axes:
+        other, free = x.copy(), moved.copy()
+        other[12 + i], free[12 + i] = 2 * np.log(believed[i]), False
+        other = structure.likeliest(other, low, free)
+        lost[i] = (structure.loss(other)[0] - best) * len(blocks) / 2
+    return np.exp(x[12:18] / 2), lost
+
+
+def _blocks(error: np.ndarray, weight: np.ndarray, length: int) -> Float[np.ndarray, "K n 12"]:
     """Blocks of neighbours without a gap, each half over the next."""
     found = []
-    for n in range(0, len(error) - _BLOCK + 1, _BLOCK // 2):
-        whole = np.all(weight[n : n + _BLOCK] > 0, axis=0)
-        found.append(error[n : n + _BLOCK, :, whole].transpose(2, 0, 1))
-    return np.concatenate(found).astype(float) if found else np.zeros((0, _BLOCK, 12))
+    for n in range(0, len(error) - length + 1, length // 2):
+        whole = np.all(weight[n : n + length] > 0, axis=0)
+        found.append(error[n : n + length, :, whole].transpose(2, 0, 1))
+    return np.concatenate(found).astype(float) if found else np.zeros((0, length, 12))
 
 
-def _structures(
-    transition: Transition, units: np.ndarray, basis: np.ndarray, heard: np.ndarray
-) -> Float[np.ndarray, "18 d d"]:
-    """Covariance of a block's axes that are heard for each variance of one."""
+def _structure(
+    blocks: Float[np.ndarray, "K n 12"],
+    transition: Transition,
+    units: Float[np.ndarray, "6 12 12"],
+    heard: Bool[np.ndarray, "12"],
+    pushes: tuple[np.ndarray, float] | None = None,
+) -> Structure:
+    """Of the axes that are heard: twelve records, six white processes, perhaps pushes that last."""
+    n = blocks.shape[1]
+    basis = scipy.linalg.null_space(np.ones((1, n)))
+    y = np.einsum("kna,nm->kma", blocks[:, :, heard], basis).reshape(len(blocks), -1)
     rows = np.ix_(heard, heard)
-    same, next_ = basis.T @ basis, basis.T @ np.eye(_BLOCK, k=-1) @ basis
-    found = []
+    same, next_ = basis.T @ basis, basis.T @ np.eye(n, k=-1) @ basis
+    G = []
     for i in range(12):
         one = np.zeros((12, 12))
         one[i, i] = 1.0
         late = np.kron(next_, (-transition.mean @ one)[rows])
-        found.append(np.kron(same, (one + transition.of(one))[rows]) + late + late.T)
-    return np.stack([*found, *(np.kron(same, unit[rows]) for unit in units)])
-
-
-def _loss(x: np.ndarray, G: np.ndarray, S: np.ndarray) -> tuple[float, np.ndarray]:
-    """Negative log likelihood a block, up to a constant, and Σ⁻¹."""
-    covariance = np.tensordot(np.exp(x), G, 1)
-    try:
-        L = np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        return np.inf, covariance
-    inverse = np.linalg.inv(covariance)
-    return float(np.log(np.diag(L)).sum() + np.sum(inverse * S) / 2), inverse
+        G.append(np.kron(same, (one + transition.of(one))[rows]) + late + late.T)
+    G += [np.kron(same, unit[rows]) for unit in units]
+    if pushes is not None:
+        push, dt = pushes
+        apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n))) * dt
+        lasting = [basis.T @ np.exp(-apart / time) @ basis for time in _TIMES]
+        G += [np.kron(k, np.outer(g, g)[rows]) for g in push for k in lasting]
+    S = y.T @ y / len(y)
+    scale = 1 / np.sqrt(np.diag(S))
+    return Structure(S * scale[:, None] * scale, np.stack(G) * scale[:, None] * scale)

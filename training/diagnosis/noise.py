@@ -10,7 +10,7 @@ process noise there, poses that slip against the twist included, and the errors'
 is kept: so many samples tell less.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -105,14 +105,25 @@ def process_covariance(
     return Q
 
 
+def unit_processes(
+    A: Float[np.ndarray, "12 12"], mass_inverse: Float[np.ndarray, "6 6"], dt: float
+) -> Float[np.ndarray, "6 12 12"]:
+    """Covariance of a step's process for b = 1 of each axis alone."""
+    return np.stack([process_covariance(A, mass_inverse, b, dt) for b in np.eye(6)])
+
+
 def estimate(
     error: Float[np.ndarray, "N 12 R"],
     weight: Float[np.ndarray, "N R"],
     transition: Transition,
     mass: Float[np.ndarray, "6 6"],
     dt: float,
+    held: Mapping[int, float] | None = None,
 ) -> Noise:
-    """Noise of records and process: the most likely, from a first guess by moments."""
+    """Noise of records and process: the most likely, from a first guess by moments.
+
+    The diffusion b of some axes may be `held` (not of states that were estimated).
+    """
     C = []
     for lag in range(3):
         w = weight[lag:] * weight[: len(weight) - lag]
@@ -121,7 +132,7 @@ def estimate(
     A, inverse = transition.mean, np.linalg.inv(mass)
     R = np.diag(-np.linalg.solve(A, C[1] - C[2]))
     variance = np.maximum(R, FLOOR**2)
-    units = np.stack([process_covariance(A, inverse, b, dt) for b in np.eye(6)])
+    units = unit_processes(A, inverse, dt)
     unit = np.diag(units.sum(axis=0))[6:]
     alike = np.diag(C[1]) > _ALIKE * np.diag(C[0])
     none, near = (alike & ((times * FLOOR) ** 2 >= R) for times in (1.0, _NEAR))
@@ -133,7 +144,10 @@ def estimate(
     wrench = np.maximum(np.diag(Q)[6:] / unit, 1e4 * least)
     start = np.concatenate([variance, wrench])
     bounds = np.concatenate([(_BELOW * FLOOR) ** 2, np.maximum(least, 1e-300)])
-    found = most_likely(error, weight, transition, units, np.maximum(start, bounds), bounds)
+    start, fixed = np.maximum(start, bounds), np.zeros(6, bool)
+    for i, b in ({} if held is None else held).items():
+        start[12 + i], fixed[i] = b**2, True
+    found = most_likely(error, weight, transition, units, start, bounds, fixed)
     return Noise(np.maximum(np.sqrt(found[:12]), FLOOR), np.sqrt(found[12:]))
 
 
@@ -257,3 +271,20 @@ def filtered(
         nu = error[n] + np.einsum("ijr,jr->ir", jacobian[n], kept)
         found[n] = np.einsum("ijr,jr->ir", kalman.whiten[n], nu)
     return found
+
+
+def score_of(
+    error: Float[np.ndarray, "N 12 R"],
+    jacobian: Float[np.ndarray, "N 12 12 R"],
+    noise: Noise,
+    transition: Transition,
+    mass_inverse: Float[np.ndarray, "6 6"],
+    dt: float,
+    step: Float[np.ndarray, "N R"],
+    weight: Float[np.ndarray, "N R"],
+) -> Float[np.ndarray, " R"]:
+    """Log density of the innovations by piece (nats)."""
+    kalman = make_filter(noise, transition, mass_inverse, dt, step, jacobian)
+    z = filtered(error, jacobian, kalman) * weight[:, None]
+    found = -(z**2).sum(axis=(0, 1)) / 2 - (kalman.log_det * weight).sum(axis=0)
+    return found - 6 * np.log(2 * np.pi) * weight.sum(axis=0)

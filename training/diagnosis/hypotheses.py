@@ -239,7 +239,11 @@ class Evidence:
         prior: np.ndarray,
         count: int,
     ) -> tuple[np.ndarray, float]:
-        """Robust standard errors, and the p value of the scores at the base being zero in mean."""
+        """Robust standard errors, and the p value of the scores at the base being zero in mean.
+
+        Errors are clustered by run, but no smaller than those of independent innovations: the
+        spread between few runs is itself uncertain, and often small by chance.
+        """
         H = tangent @ self.total @ tangent.T + np.diag(prior)
         H = H + 1e-10 * np.diag(np.maximum(np.diag(H), 1e-300))
         inverse = np.linalg.inv(H)
@@ -247,7 +251,7 @@ class Evidence:
         n = len(scores)
         meat = scores.T @ scores * n / max(n - 1, 1)
         spread = inverse @ meat @ inverse
-        errors = np.sqrt(np.maximum(np.diag(spread), np.diag(inverse) * 0.25))
+        errors = np.sqrt(np.maximum(np.diag(spread), np.diag(inverse)))
         own, other = np.arange(count), np.arange(count, len(tangent))
         project = np.eye(len(tangent))[own]
         if len(other):

@@ -14,8 +14,11 @@ Hypothesis = tuple[str, str]
 
 MARGIN_NATS, MARGIN_SHARE = 10.0, 0.02
 ECHO_SHARE = 0.01
-CLEAR = 5.0
-"""Multiple of the threshold from which the robust p value is not asked: few runs bound it."""
+CLEAR, CLEAR_OF_FEW = 5.0, 1.5
+"""Multiples of the threshold from which the robust p value is not asked: few runs bound it, so few
+that only some of them show an effect bound it to nothing."""
+_FEW = 12
+"""Runs that are few."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +76,7 @@ def choose(
                 needed = max(needed, ECHO_SHARE * gain)
         if (
             fit.heldout_gain > needed
-            and (
-                fit.p_value * len(fits) < alpha
-                or (fit.heldout_gain > CLEAR * threshold and not strict)
-            )
+            and (fit.p_value * len(fits) < alpha or (_is_clear(fit, threshold) and not strict))
             and admissible(library, theta, fit)
         ):
             passing[hypothesis] = fit
@@ -95,6 +95,10 @@ def choose(
     ties = [h for h in order if h != top and _tied(passing[top], passing[h])]
     rivals = [(h, passing[h].heldout_gain) for h in order if h != top][:5]
     return Choice(top, passing[top], tuple(ties), tuple(rivals))
+
+
+def _is_clear(fit: Fit, threshold: float) -> bool:
+    return fit.heldout_gain > (CLEAR_OF_FEW if len(fit.heldout) < _FEW else CLEAR) * threshold
 
 
 def _is_simpler(a: Hypothesis, b: Hypothesis) -> bool:

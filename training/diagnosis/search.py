@@ -27,6 +27,8 @@ _CLOSE = 0.7
 _TAKEN_BACK = 2
 _OF_A_LAW = 0.02
 """Share of what the best law wins that a name must win where the law wins more."""
+_LEFT = 0.05
+"""Share of what the laws win that is hardly anything."""
 _OF_ESTIMATES = 0.05
 """Nats a sample that a name must win where states were estimated: below that a name may as well
 explain what the estimator makes of its own errors."""
@@ -132,8 +134,9 @@ class Search:
     def _next(self, found: Found) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
         """Where a law wins more than the best name, names must hold between runs by themselves.
 
-        Where that law lasts, so that names imitate it, they are judged beside it: what it wins on
-        all axes counts.
+        Unless nothing is left of the law once the name is fitted: chance is not explained by a few
+        numbers. Where that law lasts, so that names imitate it, they are judged beside it: what it
+        wins on all axes counts.
         """
         if self.bench.beside is not None:
             self._judge_beside(None, found)
@@ -145,9 +148,44 @@ class Search:
         law = max(lasting, laws[0].heldout_gain)
         if law < choice.fit.heldout_gain:
             return choice, fits
+        explains = self._explaining(choice, fits, found, law)
+        if explains is not None:
+            return explains, {**fits, explains.hypothesis: explains.fit}
         if law == lasting:
             self._judge_beside(beside_laws(self.bench, found.current, laws), found)
         return self._chosen(found, _OF_A_LAW * law, strict=True)
+
+    def _explaining(
+        self, choice: Choice, fits: dict[Hypothesis, Fit], found: Found, law: float
+    ) -> Choice | None:
+        """The first of the best names that leaves hardly anything of what the laws win.
+
+        Names whose numbers multiply each other (a pull and its lever) win little before they are
+        fitted.
+        """
+        names = [choice.hypothesis, *(h for h, _ in choice.rivals)]
+        for h in names:
+            theta, seen = self._fitted(h, fits, found, None)
+            left = laws_of(self.bench, seen)
+            if left and max(won_by(w.name, left) for w in left) < _LEFT * law:
+                gains = [(other, fits[other].heldout_gain) for other in names if other != h]
+                return Choice(h, self._exact(fits[h], theta, seen, found), (), tuple(gains))
+        return None
+
+    def _exact(self, fit: Fit, theta: Float[np.ndarray, " p"], seen: Look, found: Found) -> Fit:
+        """A fit with its exact values, and the nats that they win less one a number."""
+        current, rows = found.current, list(fit.parameters)
+        won = (current.z.astype(float) ** 2 - seen.z.astype(float) ** 2).sum(axis=(0, 1)) / 2
+        labels, index = np.unique(self.bench.data.cluster, return_inverse=True)
+        heldout = np.bincount(index, won, len(labels)) - len(rows) / len(labels)
+        change = theta - current.theta
+        return replace(
+            fit,
+            values=change[rows],
+            others={i: float(change[i]) for i in fit.others},
+            gain=float(won.sum()),
+            heldout=heldout,
+        )
 
     def _judge_beside(self, structure: Beside | None, found: Found) -> None:
         self.bench = replace(self.bench, beside=structure)
@@ -213,20 +251,23 @@ class Search:
             moved[i] += change
         return moved
 
+    def _fitted(
+        self, h: Hypothesis, fits: dict[Hypothesis, Fit], found: Found, kalman: Filter | None
+    ) -> tuple[Float[np.ndarray, " p"], Look]:
+        """A name fitted with exact predictions, beside all that was found."""
+        beside = self.nuisance + parameters_of(self.bench.library, found.hypotheses)
+        chosen = [*self.bench.library.at(*h), *beside]
+        start = self._start(fits[h], found.current.theta)
+        return self.bench.polish(start, chosen, kalman, origin=found.current)[:2]
+
     def _refine(
         self, choice: Choice, fits: dict[Hypothesis, Fit], found: Found
     ) -> tuple[Choice, Float[np.ndarray, " p"]]:
         """Fit the name with exact predictions; let close rivals try the same, and take the best."""
         library, bench = self.bench.library, self.bench
         beside = self.nuisance + parameters_of(library, found.hypotheses)
-
-        def fitted(h: Hypothesis, kalman: Filter | None) -> tuple[np.ndarray, Look]:
-            chosen = [*library.at(*h), *beside]
-            start = self._start(fits[h], found.current.theta)
-            return bench.polish(start, chosen, kalman, origin=found.current)[:2]
-
         top = choice.hypothesis
-        theta, seen = fitted(top, None)
+        theta, seen = self._fitted(top, fits, found, None)
         close = [h for h, g in choice.rivals[:2] if g > _CLOSE * choice.fit.heldout_gain]
         if not close:
             return choice, theta
@@ -235,7 +276,7 @@ class Search:
         for h in close:
             if h[0] in kind(top[0]).simpler:
                 continue
-            other, rival = fitted(h, seen.kalman)
+            other, rival = self._fitted(h, fits, found, seen.kalman)
             within = admissible(library, np.zeros_like(other), _as_fit(library, h, other))
             # what is nested in a name keeps it unless clearly beaten; more numbers must pay
             least = 2.0 if best.loss == start_loss else 0.0

@@ -244,12 +244,12 @@ LIBRARY = Library(
 )
 
 
-def fit(name, where, gain, values, spread=0.0, seed=0):
-    heldout = np.full(40, gain / 40)
-    heldout += spread * np.random.default_rng(seed).standard_normal(40)
-    heldout += (gain - heldout.sum()) / 40
+def fit(name, where, gain, values, spread=0.0, seed=0, runs=40, p=1e-9):
+    heldout = np.full(runs, gain / runs)
+    heldout += spread * np.random.default_rng(seed).standard_normal(runs)
+    heldout += (gain - heldout.sum()) / runs
     rows = LIBRARY.at(name, where)
-    return Fit(tuple(rows), np.array(values), {}, np.full(len(rows), 1e-3), gain, heldout, 1e-9)
+    return Fit(tuple(rows), np.array(values), {}, np.full(len(rows), 1e-3), gain, heldout, p)
 
 
 def test_names_follow_the_rules():
@@ -272,6 +272,20 @@ def test_names_follow_the_rules():
     choice = choose(LIBRARY, zero, tied, 8.0, 0.01)
     assert choice is not None
     assert choice.ties == (clock,)
+
+
+@pytest.mark.parametrize(
+    ("runs", "gain", "named"), [(6, 15.0, True), (6, 10.0, False), (40, 15.0, False)]
+)
+def test_few_runs_ask_for_a_clear_gain_in_place_of_a_robust_p(runs, gain, named):
+    """An effect that some of six runs show has no p between runs at all."""
+    scale = ("thrust_scale", "all")
+    fits = {scale: fit(*scale, gain, [0.1], runs=runs, p=0.2)}
+    choices = [
+        choose(LIBRARY, np.zeros(LIBRARY.size), fits, 8.0, 0.01, strict=s) for s in (False, True)
+    ]
+    assert (choices[0] is not None) == named
+    assert choices[1] is None, "unless a law of the disturbance wins more"
 
 
 def test_laws_of_what_is_left():

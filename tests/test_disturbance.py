@@ -93,6 +93,23 @@ def test_no_name_imitates_a_large_random_structure(bench_of, name):
     assert max(f.heldout_gain for f in fits.values()) < 0.3 * best
 
 
+def test_a_name_that_leaves_nothing_of_a_law_is_taken(tmp_path):
+    """A minute of a tether: pull and lever multiply, so before they are fitted colour wins more."""
+    case = draw(1024, names=("tether",), plan=Plan().short())
+    case.write(tmp_path / "data")
+    bench = Diagnoser(read_csv(tmp_path / "data"), VEHICLE, VEHICLE.dynamics(LEVELS)).bench
+    look = bench.look(bench.believed)
+    search = Search(bench, [], 0.01, 6, np.random.default_rng(0), lambda fraction, remark: None)
+    found = Found(look, look, look)
+    best = max(f.heldout_gain for f in search._chosen(found)[1].values())
+    law = laws_of(bench, look)[0].heldout_gain
+    assert law > best
+    choice, _ = search.next(found)
+    assert choice is not None
+    assert choice.hypothesis == ("tether", "W")
+    assert choice.fit.heldout_gain > law
+
+
 def test_water_is_drawn_for_every_piece(bench_of):
     """Scenarios of unequal numbers of runs: none of their pieces is left out."""
     bench, _ = bench_of("current_varying", 1.0)

@@ -35,8 +35,8 @@ _CLEAR = 10.0
 Exact poses would tell of the process by how a simulation was stepped."""
 
 
-class Structure(NamedTuple):
-    """S, the mean of y yᵀ over blocks, is expected to be Σ_i exp(x_i) G_i; scaled alike."""
+class Likelihood(NamedTuple):
+    """Of blocks y: S, the mean of y yᵀ, is expected to be Σ_i exp(x_i) G_i; both scaled alike."""
 
     S: Float[np.ndarray, "d d"]
     G: Float[np.ndarray, "k d d"]
@@ -119,12 +119,12 @@ def most_likely(
         return start
     made = np.diagonal(units, axis1=1, axis2=2)[:, :6].T @ start[12:]
     heard = np.concatenate([start[:6] > _CLEAR * made, np.ones(6, bool)])
-    structure = _structure(blocks, transition, units, heard)
+    model = _likelihood(blocks, transition, units, heard)
     held = np.zeros(6, bool) if held is None else held
     moved = np.concatenate([heard, ~held])
-    x = structure.likeliest(np.log(start), np.log(least), moved)
+    x = model.likeliest(np.log(start), np.log(least), moved)
     found = np.exp(x)
-    curvature = structure.fisher(x, structure.loss(x)[1])[1] / np.outer(found, found)
+    curvature = model.fisher(x, model.loss(x)[1])[1] / np.outer(found, found)
     covariance = np.linalg.pinv(curvature * len(blocks) / 2, hermitian=True)
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))[12:]
     return np.concatenate([found[:12], np.where(held, found[12:], np.maximum(found[12:], errors))])
@@ -154,17 +154,17 @@ def beside_pushes(
     blocks, lost = _blocks(error, weight, _LONGER), np.zeros(6)
     if len(blocks) < _LEAST:
         return np.sqrt(start[12:]), lost
-    structure = _structure(blocks, transition, units, np.ones(12, bool), (push, dt))
+    model = _likelihood(blocks, transition, units, np.ones(12, bool), (push, dt))
     often = np.repeat(start[12:], len(_TIMES)) / dt / 10
     x = np.log(np.concatenate([start, often]))
     low, moved = x - _DEEP, np.ones(len(x), bool)
-    x = structure.likeliest(x, low, moved)
-    best = structure.loss(x)[0]
+    x = model.likeliest(x, low, moved)
+    best = model.loss(x)[0]
     for i in axes:
         other, free = x.copy(), moved.copy()
         other[12 + i], free[12 + i] = 2 * np.log(believed[i]), False
-        other = structure.likeliest(other, low, free)
-        lost[i] = (structure.loss(other)[0] - best) * len(blocks) / 2
+        other = model.likeliest(other, low, free)
+        lost[i] = (model.loss(other)[0] - best) * len(blocks) / 2
     return np.exp(x[12:18] / 2), lost
 
 
@@ -177,13 +177,13 @@ def _blocks(error: np.ndarray, weight: np.ndarray, length: int) -> Float[np.ndar
     return np.concatenate(found).astype(float) if found else np.zeros((0, length, 12))
 
 
-def _structure(
+def _likelihood(
     blocks: Float[np.ndarray, "K n 12"],
     transition: Transition,
     units: Float[np.ndarray, "6 12 12"],
     heard: Bool[np.ndarray, "12"],
     pushes: tuple[np.ndarray, float] | None = None,
-) -> Structure:
+) -> Likelihood:
     """Of the axes that are heard: twelve records, six white processes, perhaps pushes that last."""
     n = blocks.shape[1]
     basis = scipy.linalg.null_space(np.ones((1, n)))
@@ -204,4 +204,4 @@ def _structure(
         G += [np.kron(k, np.outer(g, g)[rows]) for g in push for k in lasting]
     S = y.T @ y / len(y)
     scale = 1 / np.sqrt(np.diag(S))
-    return Structure(S * scale[:, None] * scale, np.stack(G) * scale[:, None] * scale)
+    return Likelihood(S * scale[:, None] * scale, np.stack(G) * scale[:, None] * scale)

@@ -45,6 +45,8 @@ def test_levels_are_found_far_below_the_records_noise(part):
     error[:, 6:9] += 0.002 * np.sin(2 * np.pi * np.arange(200) / 200)[:, None, None]
     noise = estimate(error, np.ones((200, 60)), Transition.constant(A), MASS, DT)
     assert not noise.estimated
+    assert np.all(np.abs(noise.diffusion - b) < 3 * noise.error)
+    assert np.all(noise.error < 0.25 * b)
     np.testing.assert_allclose(noise.record[:9], RECORD[:9], rtol=0.05)
     np.testing.assert_allclose(noise.diffusion, b, rtol=0.25)
 

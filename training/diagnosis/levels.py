@@ -27,7 +27,8 @@ def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
     """Levels axis by axis, none where the belief states none.
 
     The gain is that of the level estimated on the other folds over the believed one, all other
-    levels being estimated; the error of the level by the jackknife over folds. Where it is above
+    levels being estimated; the error of the level that of its likelihood or, if larger, by the
+    jackknife over folds. Where it is above
     `least` the others are estimated again with the believed one held: a filter that believes too
     much process noise in instruments of too much noise wins against neither right.
     """
@@ -66,7 +67,7 @@ def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
                 gain[i, own] = best - score(own, other, steps)
         spread = np.sqrt((n - 1) / n * np.sum((levels[:, i] - levels[:, i].mean()) ** 2))
         change = float(look.noise.diffusion[i] / believed[i] - 1)
-        error_of = {"change": float(spread / believed[i])}
+        error_of = {"change": float(max(spread, look.noise.error[i]) / believed[i])}
         law = Law(LEVEL, AXES[i], {"change": change}, gain[i], errors=error_of)
         found.append(law)
     return found

@@ -99,8 +99,10 @@ def most_likely(
     start: Float[np.ndarray, "18"],
     least: Float[np.ndarray, "18"],
     held: Bool[np.ndarray, "6"] | None = None,
-) -> Float[np.ndarray, "18"]:
-    """Variances of the twelve records and the six b²; `start` where data are too few.
+) -> tuple[Float[np.ndarray, "18"], Float[np.ndarray, "6"]]:
+    """Variances of the twelve records and the six b², and standard errors of the six.
+
+    Where data are too few that is `start`, with errors as large.
 
     A process that is hidden by the records' noise counts with its standard error: a filter that
     believes in none at all is deaf, and its innovations are correlated.
@@ -116,7 +118,7 @@ def most_likely(
     """
     blocks = _blocks(error, weight, _BLOCK)
     if len(blocks) < _LEAST:
-        return start
+        return start, start[12:]
     made = np.diagonal(units, axis1=1, axis2=2)[:, :6].T @ start[12:]
     heard = np.concatenate([start[:6] > _CLEAR * made, np.ones(6, bool)])
     model = _likelihood(blocks, transition, units, heard)
@@ -127,7 +129,8 @@ def most_likely(
     curvature = model.fisher(x, model.loss(x)[1])[1] / np.outer(found, found)
     covariance = np.linalg.pinv(curvature * len(blocks) / 2, hermitian=True)
     errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))[12:]
-    return np.concatenate([found[:12], np.where(held, found[12:], np.maximum(found[12:], errors))])
+    wrench = np.where(held, found[12:], np.maximum(found[12:], errors))
+    return np.concatenate([found[:12], wrench]), errors
 
 
 def beside_pushes(

@@ -49,12 +49,14 @@ class Noise:
         diffusion: b.
         slip: of the pose against the integrated twist, in m/√s and rad/√s.
         memory: how many samples tell as much as one independent one (12,).
+        error: standard error of b; zero where it was not asked for.
     """
 
     record: Float[np.ndarray, "12"]
     diffusion: Float[np.ndarray, "6"]
     slip: Float[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
     memory: Float[np.ndarray, "12"] = field(default_factory=lambda: np.ones(12))
+    error: Float[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
 
     @property
     def estimated(self) -> bool:
@@ -147,8 +149,9 @@ def estimate(
     start, fixed = np.maximum(start, bounds), np.zeros(6, bool)
     for i, b in ({} if held is None else held).items():
         start[12 + i], fixed[i] = b**2, True
-    found = most_likely(error, weight, transition, units, start, bounds, fixed)
-    return Noise(np.maximum(np.sqrt(found[:12]), FLOOR), np.sqrt(found[12:]))
+    found, errors = most_likely(error, weight, transition, units, start, bounds, fixed)
+    b = np.sqrt(found[12:])
+    return Noise(np.maximum(np.sqrt(found[:12]), FLOOR), b, error=errors / (2 * b))
 
 
 def _of_estimates(

@@ -69,6 +69,13 @@ def test_a_filters_height_and_climb_come_back(acceleration, depth):
     assert np.std((found[1].x[2] - true[1])[settled]) < 0.05 * alike
 
 
+def test_noise_that_is_none_is_as_usual():
+    for wrong in (0.0, -1.0, np.nan):
+        assert crossover({"EK3_ALT_M_NSE": wrong, "EK3_ACC_P_NSE": 0.35}) == pytest.approx(
+            CROSSOVER
+        )
+
+
 def test_a_pause_starts_the_filter_anew():
     t, z, *_ = dive(1)
     gap = (t < 40) | (t > 80)

@@ -33,7 +33,8 @@ _PAUSE = 5.0
 
 def crossover(known: Mapping[str, float]) -> float:
     """Frequency (Hz) above which climb is that of the accelerometer; `known` are parameters."""
-    own = {name: known.get(name, 0.0) or usual for name, usual in _NOISE.items()}
+    given = {name: value for name, value in known.items() if value > 0}
+    own = {**_NOISE, **given}
     ratio = own["EK3_ACC_P_NSE"] / own["EK3_ALT_M_NSE"]
     return CROSSOVER * float(np.sqrt(ratio * _NOISE["EK3_ALT_M_NSE"] / _NOISE["EK3_ACC_P_NSE"]))
 

@@ -27,10 +27,9 @@ def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
     """Levels axis by axis, none where the belief states none.
 
     The gain is that of the level estimated on the other folds over the believed one, all other
-    levels being estimated; the error of the level that of its likelihood or, if larger, by the
-    jackknife over folds. Where it is above
-    `least` the others are estimated again with the believed one held: a filter that believes too
-    much process noise in instruments of too much noise wins against neither right.
+    levels being estimated. Where it is above `least`, the others are estimated again with the
+    believed one held, for noise of the instruments may stand in for it. The error of a level is
+    that of its likelihood or, if larger, that by the jackknife over folds.
     """
     believed = believed_levels(bench)
     if not np.any(believed > 0):

@@ -18,10 +18,13 @@ from .rigid_body import GRAVITY
 
 NEUTRAL = 1500.0
 """PWM at which a thruster rests, µs."""
+RESTING = 1e-6
+"""Force (N) up to which a thruster rests. Within a dead band the force grows up to it in proportion
+to the pulse, so that forces tell what was commanded where another curve has the thruster turn."""
 
 
 class ThrusterCurve(eqx.Module):
-    """Force against PWM and voltage: strictly increasing outside a dead band around 1500 µs."""
+    """Force against PWM and voltage: strictly increasing, around 1500 µs by `RESTING` at most."""
 
     @abc.abstractmethod
     def force(
@@ -65,7 +68,13 @@ def _t200_table() -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
         return voltages, knots, np.stack([np.interp(knots, p[:, 1], p[:, column]) for p in parts])
 
     voltages, knots, kilograms = grid(2)
-    return (voltages, knots, kilograms * GRAVITY), grid(3)
+    newtons = kilograms * GRAVITY
+    away = knots - NEUTRAL
+    for row in newtons:
+        for sign in (-1, 1):
+            band = (row == 0) & (sign * away > 0)
+            row[band] = RESTING * away[band] / np.abs(away[band]).max(initial=0.0)
+    return (voltages, knots, newtons), grid(3)
 
 
 def _over(table: Array, x: Array) -> Array:
@@ -92,8 +101,8 @@ class T200Curve(ThrusterCurve):
 
     Source: Blue Robotics, T200 public performance data, September 2019 (R1 unit, Basic ESC), the
     rounded figures of `vehicles/t200.csv`. Forward thrust exceeds reverse thrust by a quarter to a
-    third; the dead band narrows from 1460–1540 µs at 10 V to 1476–1528 µs at 20 V. PWM is clamped
-    to 1100–1900 µs and voltage to 10–20 V (12–20 V for the current).
+    third; the dead band, in which it rests, narrows from 1460–1540 µs at 10 V to 1476–1528 µs at
+    20 V. PWM is clamped to 1100–1900 µs and voltage to 10–20 V (12–20 V for the current).
     """
 
     voltages: Float[Array, "V"]
@@ -179,10 +188,10 @@ class T200Curve(ThrusterCurve):
 class QuadraticCurve(ThrusterCurve):
     """ArduSub's simulated thruster: F = F_max u|u| with u = (PWM - 1500)/400, whatever the voltage.
 
-    Zero within `dead_band` µs of 1500 (edges included), so the force jumps at the edge, and zero at
-    or beyond 1000 and 2000 µs, which are no valid pulses (ArduPilot, SIM_Submarine.cpp). The
-    inverse answers forces smaller than the jump with the nearer of 1500 and the dead band's edge,
-    and stays within 1100–1900 µs.
+    It rests within `dead_band` µs of 1500 (edges included), so the force jumps at the edge, and has
+    none at or beyond 1000 and 2000 µs, which are no valid pulses (ArduPilot, SIM_Submarine.cpp).
+    The inverse answers forces smaller than the jump, larger than `RESTING`, with the nearer of 1500
+    and the dead band's edge, and stays within 1100–1900 µs.
     """
 
     full_force: Float[Array, ""]
@@ -207,7 +216,9 @@ class QuadraticCurve(ThrusterCurve):
         offset = pwm - NEUTRAL
         u = offset / 400
         turns = (jnp.abs(offset) > self.dead_band) & (jnp.abs(offset) < 500)
-        return jnp.where(turns, self.full_force * u * jnp.abs(u), 0) + 0 * voltage
+        rests = RESTING * offset / jnp.maximum(self.dead_band, 1e-9)
+        rests = jnp.where(jnp.abs(offset) <= self.dead_band, rests, 0)
+        return jnp.where(turns, self.full_force * u * jnp.abs(u), rests) + 0 * voltage
 
     def pwm(
         self, force: Float[Array, "*shape"], voltage: Float[Array, "*#shape"]
@@ -216,8 +227,10 @@ class QuadraticCurve(ThrusterCurve):
         some = size > 0
         u = jnp.where(some, jnp.sqrt(jnp.where(some, size, 1)), 0)
         jump = (self.dead_band / 400) ** 2
-        offset = jnp.clip(400 * u, jnp.where(size < jump / 2, 0, self.dead_band), 400)
-        offset = jnp.where(size < jump / 2, 0, offset)
+        share = jnp.abs(force) / RESTING
+        rests = jnp.where(share <= 1, share * self.dead_band, 0)
+        offset = jnp.clip(400 * u, self.dead_band, 400)
+        offset = jnp.where(size < jump / 2, rests, offset)
         return NEUTRAL + jnp.sign(force) * offset + 0 * voltage
 
     def limits(

@@ -10,7 +10,7 @@ import pytest
 
 from helpers import shared_data
 from spinndrift.models.rigid_body import GRAVITY
-from spinndrift.models.thruster_curves import QuadraticCurve, T200Curve
+from spinndrift.models.thruster_curves import RESTING, QuadraticCurve, T200Curve
 
 VOLTS = jnp.array([10.0, 12.0, 14.0, 16.0, 18.0, 20.0])
 PWM = jnp.arange(1100.0, 1901.0)
@@ -50,15 +50,16 @@ def test_measured_curve_within_three_percent_of_full_thrust(t200):
         error = t200.force(jnp.asarray(part["pwm_us"]), volts) - part["force_N"]
         assert float(jnp.max(jnp.abs(error))) < 0.03 * part["force_N"].max()
         still = part["pwm_us"][part["force_N"] == 0]
-        assert not np.any(t200.force(jnp.asarray(still), volts))
+        assert np.all(np.abs(t200.force(jnp.asarray(still), volts)) <= RESTING)
 
 
 def test_monotone_in_pwm_with_dead_band_and_asymmetry(t200):
     force = grid(t200, jnp.linspace(9.0, 21.0, 25))
-    assert jnp.all(jnp.diff(force, axis=0) >= 0)
-    assert not jnp.any(force[(PWM >= 1476) & (PWM <= 1524)])
-    assert jnp.all(force[PWM <= 1455] < 0)
-    assert jnp.all(force[PWM >= 1545] > 0)
+    assert jnp.all(jnp.diff(force, axis=0) > 0)
+    assert not jnp.any(force[PWM == 1500])
+    assert jnp.all(jnp.abs(force[(PWM >= 1476) & (PWM <= 1524)]) <= RESTING)
+    assert jnp.all(force[PWM <= 1455] < -0.1)
+    assert jnp.all(force[PWM >= 1545] > 0.1)
     ratio = -force[0] / force[-1]
     assert jnp.all((ratio > 0.74) & (ratio < 0.81))
     full = force[jnp.array([0, -1])]
@@ -80,9 +81,7 @@ def test_inverse_returns_pwm_within_a_microsecond(dtype):
         force = curve.force(pwm, volts)
         back = curve.pwm(force, volts)
         assert back.dtype == dtype
-        pushes = force != 0
-        assert float(jnp.max(jnp.abs(back - pwm)[pushes])) < 1
-        np.testing.assert_array_equal(back[~pushes], 1500)
+        assert float(jnp.max(jnp.abs(back - pwm))) < 1
 
 
 def test_inverse_gives_the_force_or_the_limit(t200):
@@ -95,14 +94,15 @@ def test_inverse_gives_the_force_or_the_limit(t200):
 
 
 def test_smallest_forces_start_at_the_edge_of_the_dead_band(t200):
-    pwm = t200.pwm(jnp.array([-1e-9, 0.0, 1e-9]), jnp.array(16.0))
-    np.testing.assert_allclose(pwm, [1472, 1500, 1528], atol=1e-3)
+    force = RESTING * jnp.array([-1.001, -0.5, 0.0, 0.5, 1.001])
+    pwm = t200.pwm(force, jnp.array(16.0))
+    np.testing.assert_allclose(pwm, [1472, 1486, 1500, 1514, 1528], atol=1e-3)
 
 
 def test_derivatives_are_the_slopes_and_finite(t200):
     slope = jax.vmap(jax.grad(t200.force), (0, None))(jnp.array([1150.0, 1500.0, 1850.0]), VOLTS[3])
     expected = np.array([(4.07 - 2.71) / 100, 0, (5.25 - 3.42) / 100]) * GRAVITY
-    np.testing.assert_allclose(slope, expected, rtol=1e-9)
+    np.testing.assert_allclose(slope, expected, rtol=1e-9, atol=RESTING / 20)
     force = jnp.array([-60.0, -1.0, 0.0, 1.0, 60.0])
     for argument in (0, 1):
         inverse = jax.vmap(jax.grad(t200.pwm, argument), (0, None))(force, jnp.array(15.0))
@@ -127,14 +127,14 @@ def test_quadratic_curve_is_the_simulators():
     pwm = jnp.array([900.0, 1000, 1100, 1300, 1474, 1475, 1525, 1526, 1700, 1900, 2000, 65535])
     u = (pwm - 1500) / 400
     expected = 51.48 * u * jnp.abs(u)
-    expected = expected.at[jnp.array([0, 1, 5, 6, 10, 11])].set(0)
+    expected = expected.at[jnp.array([0, 1, 10, 11])].set(0)
+    expected = expected.at[jnp.array([5, 6])].set(jnp.array([-RESTING, RESTING]))
     np.testing.assert_allclose(curve.force(pwm, volts), expected, rtol=1e-12)
 
 
 def test_quadratic_inverse_round_trips_clamps_and_takes_the_nearer_at_the_jump():
     curve, volts = jitted(QuadraticCurve(51.48)), jnp.array(12.0)
-    outside = PWM[jnp.abs(PWM - 1500) > 25]
-    np.testing.assert_allclose(curve.pwm(curve.force(outside, volts), volts), outside, atol=1e-9)
+    np.testing.assert_allclose(curve.pwm(curve.force(PWM, volts), volts), PWM, atol=1e-9)
     jump = 51.48 / 256
     force = jnp.array([-99.0, -0.6 * jump, -0.4 * jump, 0.0, 0.4 * jump, 0.6 * jump, 99.0])
     np.testing.assert_array_equal(

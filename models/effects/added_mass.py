@@ -21,7 +21,7 @@ class AddedMass(Effect):
 
     name: ClassVar[str] = "added_mass"
     family: ClassVar = "body"
-    parameters: ClassVar = (Parameter("change", "kg or kg·m²", (0.5,), -60.0, 100.0),)
+    parameters: ClassVar = (Parameter("change", "kg or kg·m²", (0.05,), -60.0, 100.0, 25.0),)
     places: ClassVar = AXES
     source: ClassVar[str] = "published sets differ by a factor of 2"
 

@@ -45,7 +45,6 @@ class Parameter:
         name: as reports say it.
         unit: SI unit, "1" for a ratio.
         probes: sizes at which a diagnosis measures the response; several where it is not linear.
-            For effects with places of unlike units, one tuple of sizes a place.
         low: least admissible value; an estimate below it vetoes the name.
         high: largest admissible value.
         spread: standard deviation of what is known of it beforehand; 0 stands for very little.

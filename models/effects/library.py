@@ -36,6 +36,7 @@ from .thrust import (
     ThrusterDeadZone,
     ThrusterGain,
     ThrustLever,
+    ThrustOffset,
     ThrustScale,
     ThrustTable,
 )
@@ -87,7 +88,14 @@ KINDS: dict[str, type[Effect]] = {
 
 COEFFICIENTS: dict[str, type[Effect]] = {
     kind.name: kind
-    for kind in (ThrustTable, VoltageExponent, AxisThrust, ThrustLever, CentreOfBuoyancy)
+    for kind in (
+        ThrustOffset,
+        ThrustTable,
+        VoltageExponent,
+        AxisThrust,
+        ThrustLever,
+        CentreOfBuoyancy,
+    )
 }
 """What is refitted where `--refit` asks for it, and never named as a cause."""
 

@@ -5,6 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..thruster_curves import RESTING
 from .base import ALL_OR_ONE, AXES, THRUSTERS, Effect, Parameter, Plant
 
 REFERENCE = 10.0
@@ -108,7 +109,7 @@ class ThrustScale(Effect):
     name: ClassVar[str] = "thrust_scale"
     family: ClassVar = "actuation"
     parameters: ClassVar = (Parameter("scale", "1", (0.03,), -0.8, 4.0),)
-    order: ClassVar[int] = 14
+    order: ClassVar[int] = 10
     source: ClassVar[str] = "bollard thrust of equal thrusters scatters by 10 to 20 %"
 
     def thrust(
@@ -121,7 +122,7 @@ class ThrustScale(Effect):
         return force * (1 + self.part(0, force)[None])
 
 
-KNOTS = (2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0)
+KNOTS = (1.0, 2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0)
 """Forces (N), each way, between which `ThrustTable` is linear."""
 
 
@@ -157,6 +158,30 @@ class ThrustTable(Effect):
                 before, reached = knot, here
             force = force + sign * change * jnp.maximum(size / KNOTS[-1], 1)
         return force
+
+
+class ThrustOffset(Effect):
+    """f = u + o sign(u) min(|u| / ε, 1)²: a dead band that is narrower than believed.
+
+    Thrusters push o more from the believed band's edge on, and within the band, where u only tells
+    the pulse (ε is `thruster_curves.RESTING`), as its square.
+    """
+
+    name: ClassVar[str] = "thrust_offset"
+    family: ClassVar = "actuation"
+    parameters: ClassVar = (Parameter("force", "N", (0.05,), 0.0, 3.0, 1.0),)
+    order: ClassVar[int] = 10
+    source: ClassVar[str] = "dead bands of 25 to 40 µs around 1500 µs: speed controllers differ"
+
+    def thrust(
+        self,
+        force: Float[Array, "n *#batch"],
+        V_CB_B: Float[Array, "6 *#batch"],
+        voltage: Float[Array, "1 *#batch"],
+        plant: Plant,
+    ) -> Float[Array, "n *#batch"]:
+        share = jnp.minimum(jnp.abs(force) / RESTING, 1)
+        return force + self.part(0, force)[None] * jnp.sign(force) * share**2
 
 
 class AxisThrust(Effect):

@@ -35,6 +35,8 @@ class Diagnose:
     command, where commands pass through gains that are not known (`command`), or all of a grey box
     (these, the thrusters' curve and levers, restoring moment), for a belief that is wrong in most
     of them."""
+    water_density: float | None = None
+    """kg/m³, where a log's autopilot took the sea for fresh water (as of `spinndrift import`)."""
     out: Path = Path("diagnosis")
     """Folder to write."""
 
@@ -46,7 +48,7 @@ class Diagnose:
 
         from ...models.checkpoint import load_model, save_model
         from ...models.vehicle import load_vehicle
-        from ...systems.mavlink.logs import load_data
+        from ...systems.mavlink.logs import LogOptions, load_data
         from ...training.diagnosis.diagnose import DiagnoseConfig, diagnose
         from ...training.diagnosis.result import schema
         from ..diagnosis_report import diagnosis_page
@@ -55,7 +57,13 @@ class Diagnose:
             raise UserError(f"--out {self.out}: is a file; name a folder")
         config = DiagnoseConfig(alpha=self.alpha, refit=self.refit)
         with progress_bar(f"reading {self.data.name}") as update:
-            recording = load_data(self.data, vehicle=self.vehicle, resample=False, progress=update)
+            recording = load_data(
+                self.data,
+                vehicle=self.vehicle,
+                options=LogOptions(water_density=self.water_density),
+                resample=False,
+                progress=update,
+            )
         base = None if self.model is None else load_model(self.model, dtype=float)[0]
         vehicle = load_vehicle(self.vehicle or recording.vehicle or "bluerov2_heavy")
         if self.diffusion is not None:

@@ -24,6 +24,7 @@ from .noise import Filter
 COMMON = ("added_mass", "linear_drag", "quadratic_drag", "net_buoyancy")
 WRENCH = ("axis_thrust", "thrust_lever", "centre_of_buoyancy")
 CURVE = ("thrust_table", "voltage_exponent")
+PULSES = ("thrust_offset",)
 OF_ALL = {
     "thrust_curve": ("exponent", 0.3),
     "thrust_asymmetry": ("reverse_gain", 0.5),
@@ -34,7 +35,9 @@ _ROUNDS, _TRIES = 40, 8
 _ENOUGH = 1.0
 """Nats a round from which a fit goes on."""
 _START = 0.3
-"""Dead zone (N) to start from: at none its response is one-sided."""
+"""Dead zone and offset (N) to start from: at none their responses are one-sided."""
+_COMMON = 13
+"""Samples by which a piece's covariance is drawn to that of all: as many as give it an inverse."""
 _DRAG, _BUOYANCY, _DELAY = 3.0, 20.0, 0.01
 """How far drag (in multiples of itself), net buoyancy (N) and the commands' delay (s) are known
 beforehand."""
@@ -52,9 +55,9 @@ class Coefficient:
 
 def with_coefficients(bench: Bench) -> Bench:
     """The bench with the effects that only such a fit has, and bounds that physics sets."""
-    level = bench.data.command != "F_Bo_B"
+    level, of_pulses = bench.data.command != "F_Bo_B", bench.data.command == "pwm"
     for name, kind in COEFFICIENTS.items():
-        if name in CURVE and not level:
+        if (name in CURVE and not level) or (name in PULSES and not of_pulses):
             continue
         if name == "voltage_exponent" and not bench.data.has_voltage:
             continue
@@ -65,7 +68,7 @@ def with_coefficients(bench: Bench) -> Bench:
 def coefficients(bench: Bench) -> list[Coefficient]:
     """All that is fitted."""
     library, found = bench.library, []
-    level = bench.data.command != "F_Bo_B"
+    level, of_pulses = bench.data.command != "F_Bo_B", bench.data.command == "pwm"
     rigid = np.diag(np.asarray(bench.model.rigid_inertia))
     for i, (cause, where, p) in enumerate(library.entries):
         old, start = bench.believes(cause, where), bench.believed[i]
@@ -80,8 +83,10 @@ def coefficients(bench: Bench) -> list[Coefficient]:
         elif (cause, where) == ("actuation_delay", "all") and level:
             spread = _DELAY
         elif cause in OF_ALL and level and where == "all" and p.name == OF_ALL[cause][0]:
+            if cause == "thruster_dead_zone" and of_pulses:
+                continue  # an offset says more
             spread = OF_ALL[cause][1]
-        elif cause not in (*WRENCH, *CURVE):
+        elif cause not in (*WRENCH, *CURVE, *PULSES):
             continue
         found.append(Coefficient(i, spread, start + min(low, 0.0), start + high))
     return found
@@ -93,11 +98,15 @@ def identify(
     start: Float[np.ndarray, " p"] | None = None,
     also: Sequence[int] = (),
 ) -> Float[np.ndarray, " p"]:
-    """θ with all coefficients where data and prior have them (Levenberg and Marquardt).
+    """θ with all coefficients where data and prior have them (Levenberg 1944).
+
+    Steps are damped in units of what is known beforehand, so that they are short along valleys that
+    data leave flat, which are curved, and whole across them.
 
     From the belief, or from `start`; with the parameters `also` of causes free beside them. Every
-    step is weighed by the covariance that the one-step errors of pose and of twist have at it,
-    which asks for no noise levels that a wrong model makes too large.
+    step is weighed by the covariances that the one-step errors of pose and of twist have at it, in
+    each piece its own: that asks for no noise levels that a wrong model makes too large, and an
+    estimator's slow errors do less harm where the vehicle rests than where drag multiplies them.
     """
     chosen = [*coefficients(bench), *_beside(bench, also)]
     rows = [c.row for c in chosen]
@@ -107,28 +116,35 @@ def identify(
     if start is None:
         theta = bench.believed.copy()
         for c in chosen:
-            if bench.library.entries[c.row].cause == "thruster_dead_zone":
+            if bench.library.entries[c.row].cause in ("thruster_dead_zone", "thrust_offset"):
                 theta[c.row] += _START
     else:
         theta = start.copy()
         theta[rows] = np.clip(theta[rows], low, high)
 
-    def loss(theta: np.ndarray) -> float:
+    def loss(theta: np.ndarray, common: np.ndarray) -> float:
         away = (theta[rows] - centre) / spread
-        return bench.loss(theta) + float(away @ away) / 2
+        C, counts = _by_piece(bench, bench.errors(theta), common)
+        if not np.isfinite(C).all():
+            return np.inf
+        return float(counts @ np.linalg.slogdet(C)[1] + away @ away) / 2
 
-    best, damping = loss(theta), 0.0
+    damping = 0.0
     for n in range(_ROUNDS):
         progress(n / _ROUNDS)
+        common = bench.covariance(bench.errors(theta), apart=True)
+        best = loss(theta, common)
         seen = bench.look(theta, rows, one_step(bench, theta))
         gradient, H = _quadratic(seen, rows)
         gradient = (gradient + (theta[rows] - centre) / spread**2) * spread
-        H = H * np.outer(spread, spread) + np.eye(len(rows))
+        # products of responses are rounded; with the prior no eigenvalue is below 1
+        values, vectors = np.linalg.eigh(H * np.outer(spread, spread) + np.eye(len(rows)))
+        values = np.maximum(values, 1.0)
         for _ in range(_TRIES):
-            L = np.linalg.cholesky(H + damping * np.diag(np.diag(H)))
+            roots = np.sqrt(values + damping)
             step = scipy.optimize.lsq_linear(
-                L.T,
-                -scipy.linalg.solve_triangular(L, gradient, lower=True),
+                roots[:, None] * vectors.T,
+                -(vectors.T @ gradient) / roots,
                 bounds=(
                     (low - theta[rows]) / spread - 1e-12,
                     (high - theta[rows]) / spread + 1e-12,
@@ -136,14 +152,14 @@ def identify(
             ).x
             moved = theta.copy()
             moved[rows] = np.clip(theta[rows] + step * spread, low, high)
-            new = loss(moved)
+            new = loss(moved, common)
             if new < best:
                 break
-            damping = max(5 * damping, 1e-3)
+            damping = max(10 * damping, 1.0)
         else:
             break
         won, theta, best = best - new, moved, new
-        damping = damping / 5 if damping > 1e-5 else 0.0
+        damping = damping / 10 if damping > 0.1 else 0.0
         if won < _ENOUGH:
             break
     return theta
@@ -160,12 +176,25 @@ def _beside(bench: Bench, rows: Sequence[int]) -> list[Coefficient]:
 
 def one_step(bench: Bench, theta: Float[np.ndarray, " p"]) -> Filter:
     """The filter that believes every record: innovations are one-step errors, whitened."""
-    C = bench.covariance(bench.errors(theta), apart=True)
-    N = len(bench.data.u)
-    whiten = np.linalg.inv(np.linalg.cholesky(C))
-    log_det = float(np.linalg.slogdet(C)[1]) / 2
-    alike = np.repeat(whiten[None, ..., None], N, 0)
-    return Filter(np.zeros_like(alike), alike, np.full((N, 1), log_det))
+    error = bench.errors(theta)
+    C, _ = _by_piece(bench, error, bench.covariance(error, apart=True))
+    whiten = np.moveaxis(np.linalg.inv(np.linalg.cholesky(C)), 0, -1)
+    whiten = np.repeat(whiten[None], len(bench.data.u), axis=0)
+    log_det = np.broadcast_to(np.linalg.slogdet(C)[1] / 2, bench.data.weight.shape)
+    return Filter(np.zeros_like(whiten), whiten, log_det)
+
+
+def _by_piece(
+    bench: Bench, error: Float[np.ndarray, "N 12 R"], common: Float[np.ndarray, "12 12"]
+) -> tuple[Float[np.ndarray, "R 12 12"], Float[np.ndarray, " R"]]:
+    """Covariance of each piece's one-step errors, and of how many samples it is one.
+
+    It is the most likely under an inverse Wishart prior with the mean that all have in `common`.
+    """
+    C = np.einsum("nir,njr->rij", error, error)
+    C[:, :6, 6:], C[:, 6:, :6] = 0.0, 0.0
+    counts = bench.data.weight.sum(axis=0) + _COMMON
+    return (C + _COMMON * common) / counts[:, None, None], counts
 
 
 def _quadratic(seen: Look, rows: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -2,8 +2,9 @@
 
 Forces and masses that are all larger by one factor move alike, so data tell coefficients in
 proportion to inertia only. Intervals are those of the likelihood (inverse of its curvature, the
-correlation of errors in time taken off) by the delta method; a coefficient at its physical limit
-is taken for known.
+correlation of errors in time taken off) by the delta method or, where they are wider, of scores
+that differ from piece to piece (Huber 1967); a coefficient at its physical limit is taken for
+known.
 """
 
 from collections.abc import Callable, Sequence
@@ -58,15 +59,19 @@ def ratios(bench: Bench, look: Look, rows: Sequence[int]) -> list[result.Ratio]:
     H = look.evidence.total[np.ix_(columns, columns)] + np.diag(look.evidence.prior(free))
     # principal directions, each moved by a share of its standard error
     values, vectors = np.linalg.eigh(H)
-    variance = dict.fromkeys(mean, 0.0)
-    for value, direction in zip(values, vectors.T, strict=True):
+    roots = vectors / np.sqrt(np.maximum(values, 1e-300))
+    scores = look.evidence.runs[:, columns, 0] @ roots
+    scores = scores - scores.mean(axis=0)
+    slopes: dict[tuple[str, str], list[float]] = {key: [] for key in mean}
+    for direction in roots.T:
         moved = theta.copy()
-        moved[free] += _STEP * direction / np.sqrt(max(value, 1e-300))
+        moved[free] += _STEP * direction
         for key, after in numbers(moved).items():
-            variance[key] += ((after - mean[key]) / _STEP) ** 2
+            slopes[key].append((after - mean[key]) / _STEP)
     found = []
     for (name, where), value in mean.items():
-        error = 1.96 * float(np.sqrt(variance[name, where]))
+        slope = np.array(slopes[name, where])
+        error = 1.96 * float(np.sqrt(max(slope @ slope, np.sum((scores @ slope) ** 2))))
         unit = _UNITS[name][where in AXES[3:]]
         told = result.Value(value, unit, (value - error, value + error))
         found.append(result.Ratio(name, where, before[name, where], told))

@@ -16,8 +16,10 @@ from spinndrift.models.recording_csv import read_csv
 from spinndrift.models.vehicle import load_vehicle
 from spinndrift.training.diagnosis.beside import Beside
 from spinndrift.training.diagnosis.diagnose import Diagnoser
-from spinndrift.training.diagnosis.disturbance import SLOW, all_laws, laws_of, told
-from spinndrift.training.diagnosis.noise import estimate
+from spinndrift.training.diagnosis.disturbance import SLOW, _grown, all_laws, laws_of, told
+from spinndrift.training.diagnosis.laws import Law
+from spinndrift.training.diagnosis.levels import LEVEL
+from spinndrift.training.diagnosis.noise import estimate, score_of
 from spinndrift.training.diagnosis.search import Found, Search
 from spinndrift.training.diagnosis.transition import Transition
 from spinndrift.training.diagnosis.waves import beside_laws, find_waves
@@ -110,6 +112,29 @@ def test_a_name_that_leaves_nothing_of_a_law_is_taken(tmp_path):
     assert choice.fit.heldout_gain > law
 
 
+def test_what_a_name_wins_exactly_is_likelihood(tmp_path):
+    """A name's own noise is smaller: squares of innovations alone may even grow."""
+    case = draw(5, names=("thruster_lag",), plan=Plan().short())
+    case.write(tmp_path / "data")
+    bench = Diagnoser(read_csv(tmp_path / "data"), VEHICLE, VEHICLE.dynamics(LEVELS)).bench
+    look = bench.look(bench.believed)
+    search = Search(bench, [], 0.01, 6, np.random.default_rng(0), lambda fraction, remark: None)
+    found, h = Found(look, look, look), ("thruster_lag", "all")
+    fit = search._chosen(found)[1][h]
+    theta, seen = search._fitted(h, {h: fit}, found, None)
+    exact = search._exact(fit, theta, seen, found)
+    data, scores = bench.data, []
+    for one in (look, seen):
+        error, jacobian = (np.asarray(a) for a in (one.predictions.error, one.predictions.jacobian))
+        steps = Transition.along(jacobian, data.weight)
+        inverse = np.linalg.inv(bench.mass(one.theta))
+        given = one.noise, steps, inverse, data.dt, data.step, data.weight
+        scores.append(score_of(error, jacobian, *given).sum())
+    assert exact.gain == pytest.approx(scores[1] - scores[0], rel=0.01)
+    assert exact.heldout_gain == pytest.approx(exact.gain - 1)
+    assert exact.heldout_gain > fit.heldout_gain
+
+
 def test_water_is_drawn_for_every_piece(bench_of):
     """Scenarios of unequal numbers of runs: none of their pieces is left out."""
     bench, _ = bench_of("current_varying", 1.0)
@@ -200,6 +225,21 @@ def test_what_lasts_or_grows_is_no_level_in_calm_water(bench_of, name):
     laws = all_laws(bench, look, 12.0)
     assert any(law.name == "disturbance_level" and law.heldout_gain > 12 for law in laws)
     assert [group[0].name for group in told(laws, bench, look, 12.0)] == [name]
+
+
+def test_growth_beside_a_level_is_told_where_it_holds_on_data_left_out(bench_of):
+    bench, _ = bench_of("disturbance_state_dependence", 1.0)
+    look = bench.look(bench.believed)
+    runs, name = np.ones(len(bench.data.fold)), "disturbance_state_dependence"
+    grown = next(law for law in laws_of(bench, look) if law.name == name)
+    other = "sway" if grown.where != "sway" else "heave"
+    # what the levels take off is nothing: growth alone explains them as well
+    levels = [Law(LEVEL, axis, {"change": 0.0}, 40 * runs) for axis in (grown.where, other)]
+    for gain, growth, holds in ((-0.1, 0.1, False), (0.1, 0.0, False), (0.1, 0.1, True)):
+        beside = Law(name, other, {"growth": growth}, gain * runs)
+        shaped, left = _grown([grown, beside], [grown], levels, bench, look)
+        assert left == []
+        assert [law.where for law in shaped] == [grown.where] + [other] * holds
 
 
 def test_states_known_exactly_are_not_taken_for_estimates(bench_of):

@@ -27,9 +27,9 @@ A[6:, 6:] = np.diag([0.95, 0.95, 0.9, 0.8, 0.8, 0.85])
 RECORD = np.repeat([0.02, 0.007, 0.02, 0.004], 3)
 
 
-def errors(rng, N, R, b):
+def errors(rng, N, R, b, mass=MASS):
     """One-step errors of records with white noise about a linear system's states."""
-    Q = process_covariance(A, np.linalg.inv(MASS), b, DT)
+    Q = process_covariance(A, np.linalg.inv(mass), b, DT)
     L = np.linalg.cholesky(Q)
     e = RECORD[:, None] * rng.standard_normal((N + 1, 12, R))
     w = np.einsum("ij,njr->nir", L, rng.standard_normal((N, 12, R)))
@@ -49,6 +49,39 @@ def test_levels_are_found_far_below_the_records_noise(part):
     assert np.all(noise.error < 0.25 * b)
     np.testing.assert_allclose(noise.record[:9], RECORD[:9], rtol=0.05)
     np.testing.assert_allclose(noise.diffusion, b, rtol=0.25)
+
+
+def test_errors_of_levels_are_told_of_a_heavy_vehicle_too():
+    """Half a ton: variances of forces and of angles are ten orders of magnitude apart."""
+    mass, b = 25 * MASS, 20 * np.array([1.0, 1.0, 1.0, 0.03, 0.03, 0.03])
+    z = []
+    for seed in range(4):
+        error = errors(np.random.default_rng(seed), 200, 20, b, mass)
+        noise = estimate(error, np.ones((200, 20)), Transition.constant(A), mass, DT)
+        z.append((noise.diffusion - b) / noise.error)
+    assert np.max(np.abs(z)) < 4
+    assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.6
+
+
+def test_an_axis_that_never_errs_is_left_out():
+    b = np.array([1.0, 1.0, 1.0, 0.03, 0.03, 0.03])
+    error = errors(np.random.default_rng(5), 200, 60, b)
+    error[:, 2] = 0.0
+    noise = estimate(error, np.ones((200, 60)), Transition.constant(A), MASS, DT)
+    np.testing.assert_allclose(noise.diffusion[[0, 1, 3, 4, 5]], b[[0, 1, 3, 4, 5]], rtol=0.25)
+
+
+def test_levels_of_estimates_may_be_held():
+    rng, rho = np.random.default_rng(6), 0.9
+    slow = np.zeros((400, 12, 20))
+    for n in range(1, 400):
+        slow[n] = rho * slow[n - 1] + rng.standard_normal((12, 20))
+    given = 1e-2 * slow, np.ones((400, 20)), Transition.constant(A), MASS, DT
+    free, held = estimate(*given), estimate(*given, held={0: 123.0})
+    assert free.estimated
+    assert held.diffusion[0] == 123.0
+    np.testing.assert_array_equal(held.diffusion[1:], free.diffusion[1:])
+    np.testing.assert_array_equal(held.slip, free.slip)
 
 
 def test_an_axis_may_be_held_while_the_rest_is_sought():

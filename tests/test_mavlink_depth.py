@@ -69,6 +69,25 @@ def test_a_filters_height_and_climb_come_back(acceleration, depth):
     assert np.std((found[1].x[2] - true[1])[settled]) < 0.05 * alike
 
 
+@pytest.mark.parametrize("stream", ["lost", "faster", "slow"])
+def test_streams_may_be_uneven(stream):
+    """A third of the messages lost, and rates that a ground station changes."""
+    t, z, _, a = dive(0)
+    true, wrong = (estimate(t, z, a, 0.35, 0.1, scale) for scale in (1.0, EXCESS))
+    kept = np.random.default_rng(0).uniform(size=t.size) > 0.3
+    if stream != "lost":
+        every = {"faster": 4, "slow": 12}[stream]
+        kept = (np.arange(t.size) % every == 0) | (t > 60)
+    zero = np.zeros((2, kept.sum()))
+    given = [Series(t[kept], np.vstack([zero, x[kept]]), "LOCAL_POSITION_NED") for x in wrong]
+    found = in_water(given[0], given[1], {}, DENSITY)
+    settled = t[kept] > 4
+    for before, after, x in zip(given, found, true, strict=True):
+        assert after is not None
+        off, left = (np.std((one.x[2] - x[kept])[settled]) for one in (before, after))
+        assert left < 0.06 * off
+
+
 def test_noise_that_is_none_is_as_usual():
     for wrong in (0.0, -1.0, np.nan):
         assert crossover({"EK3_ALT_M_NSE": wrong, "EK3_ACC_P_NSE": 0.35}) == pytest.approx(

@@ -6,7 +6,8 @@ between from the accelerometer. So with σ the depths that it measures for one o
     z_est = z + (σ - 1) G z,        v_est = v + (σ - 1) L v,
     L = ω² / (s² + √2 ω s + ω²),    G = (√2 ω s + ω²) / (s² + √2 ω s + ω²):
 
-wrong where the motion is slow, right where it is fast. This is the stationary Kalman filter of a
+wrong where the motion is slow, right where it is fast, which is taken off to first order in σ - 1,
+with L and G of what was estimated. This is the stationary Kalman filter of a
 height with white acceleration noise (Kalman and Bucy 1961), for which ω⁴ is the intensity of that
 noise over that of the measurement.
 """
@@ -27,8 +28,8 @@ dive."""
 _NOISE = {"EK3_ACC_P_NSE": 0.35, "EK3_ALT_M_NSE": 0.1}
 """m/s² and m, as in that dive."""
 _BAROMETER = 1  # EK3_SRC1_POSZ
-_PAUSE = 5.0
-"""Steps without a sample after which a filter starts anew."""
+_PAUSE, _GRID = 2.0, 0.01
+"""s without a sample after which a filter starts anew, and its longest step."""
 
 
 def crossover(known: Mapping[str, float]) -> float:
@@ -73,14 +74,18 @@ def _filtered(
     top: Float[np.ndarray, "3"],
     bottom: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, " n"]:
-    """Output of a transfer function, at rest in the first value after every pause."""
-    step = np.diff(t)
-    usual = float(np.median(step))
-    b, a = scipy.signal.bilinear(top, bottom, 1.0 / usual)
-    rest = scipy.signal.lfilter_zi(b, a)
-    edges = [0, *(np.flatnonzero(step > _PAUSE * usual) + 1).tolist(), t.size]
+    """Output of a transfer function, at rest in the first value after every pause.
+
+    Samples may be uneven: between pauses the filter runs on an even grid of its own.
+    """
+    edges = [0, *(np.flatnonzero(np.diff(t) > _PAUSE) + 1).tolist(), t.size]
     found = np.empty_like(x)
     for start, stop in itertools.pairwise(edges):
-        piece = x[start:stop]
-        found[start:stop] = scipy.signal.lfilter(b, a, piece, zi=rest * piece[0])[0]
+        own, piece = t[start:stop], x[start:stop]
+        count = max(int(np.ceil((own[-1] - own[0]) / _GRID)), 1)
+        grid, step = np.linspace(own[0], max(own[-1], own[0] + _GRID), count + 1, retstep=True)
+        b, a = scipy.signal.bilinear(top, bottom, 1.0 / step)
+        even = np.interp(grid, own, piece)
+        rest = scipy.signal.lfilter_zi(b, a) * even[0]
+        found[start:stop] = np.interp(own, grid, scipy.signal.lfilter(b, a, even, zi=rest)[0])
     return found

@@ -31,8 +31,9 @@ class LogOptions:
     Attributes:
         minimum: shortest stretch kept (s).
         gap: longest pause between samples of one signal within a stretch (s).
-        water_density: kg/m³, to correct depth and vertical velocity of an autopilot that assumed
-            fresh water; None takes its figures as they are.
+        water_density: kg/m³, to correct depth and the slow part of the climb of an autopilot that
+            assumed fresh water, where its height is the barometer's (`depth.in_water`); None takes
+            its figures as they are.
         disarmed: keep disarmed stretches too.
         system: MAVLink system id, if several autopilots are in the log.
     """

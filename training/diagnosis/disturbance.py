@@ -132,7 +132,8 @@ def _grown(
     """Axes that grow with the speed, and levels beside them.
 
     Where growth from the believed levels wins more than levels without it, levels of these axes are
-    a part of it, and so are those of others that the speed explains as well.
+    a part of it, and so are those of others that the speed explains as well. Growth is told of
+    those others where it wins on data left out.
     """
     data = bench.data
     speed = np.linalg.norm(data.V[:-1, :3], axis=1)
@@ -144,8 +145,9 @@ def _grown(
     grows = {law.where for law in shaped}
     if sum(won.get(axis, 0.0) for axis in grows) <= 0:
         return list(shaped), list(levels)
-    also = {axis for axis, gain in won.items() if gain > -_AS_WELL}
-    more = [law for law in laws if law.name == shaped[0].name and law.where in also - grows]
+    also = {axis for axis, gain in won.items() if gain > -_AS_WELL} - grows
+    of_others = [law for law in laws if law.name == shaped[0].name and law.where in also]
+    more = [law for law in of_others if law.heldout_gain > 0 and law.parameters["growth"] > 0]
     return [*shaped, *more], [law for law in levels if law.where not in grows | also]
 
 

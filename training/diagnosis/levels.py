@@ -55,9 +55,8 @@ def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
         best = score(own, noise, steps)
         judged.append((own, rest, steps, best))
         for i in np.flatnonzero(believed > 0):
-            b = noise.diffusion.copy()
-            b[i] = believed[i]
-            gain[i, own] = best - score(own, Noise(noise.record, b), steps)
+            other = noise.with_diffusion({int(i): believed[i]})
+            gain[i, own] = best - score(own, other, steps)
     found, n = [], len(labels)
     for i in np.flatnonzero(believed > 0):
         if gain[i].sum() > least:

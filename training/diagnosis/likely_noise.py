@@ -102,7 +102,7 @@ def most_likely(
 ) -> tuple[Float[np.ndarray, "18"], Float[np.ndarray, "6"]]:
     """Variances of the twelve records and the six b², and standard errors of the six.
 
-    Where data are too few that is `start`, with errors as large.
+    Where data are too few that is `start`, with errors of b² as large.
 
     A process that is hidden by the records' noise counts with its standard error: a filter that
     believes in none at all is deaf, and its innovations are correlated.
@@ -119,16 +119,18 @@ def most_likely(
     blocks = _blocks(error, weight, _BLOCK)
     if len(blocks) < _LEAST:
         return start, start[12:]
-    made = np.diagonal(units, axis1=1, axis2=2)[:, :6].T @ start[12:]
-    heard = np.concatenate([start[:6] > _CLEAR * made, np.ones(6, bool)])
+    heard = _heard(blocks, units, start)
     model = _likelihood(blocks, transition, units, heard)
     held = np.zeros(6, bool) if held is None else held
     moved = np.concatenate([heard, ~held])
     x = model.likeliest(np.log(start), np.log(least), moved)
     found = np.exp(x)
-    curvature = model.fisher(x, model.loss(x)[1])[1] / np.outer(found, found)
-    covariance = np.linalg.pinv(curvature * len(blocks) / 2, hermitian=True)
-    errors = np.sqrt(np.maximum(np.diag(covariance), 0.0))[12:]
+    curvature = model.fisher(x, model.loss(x)[1])[1][np.ix_(moved, moved)] * len(blocks) / 2
+    size = np.sqrt(np.diag(curvature))  # poses and forces are of unlike sizes
+    covariance = np.linalg.pinv(curvature / np.outer(size, size), hermitian=True)
+    relative = np.zeros(len(found))
+    relative[moved] = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / size
+    errors = (relative * found)[12:]
     wrench = np.where(held, found[12:], np.maximum(found[12:], errors))
     return np.concatenate([found[:12], wrench]), errors
 
@@ -157,10 +159,11 @@ def beside_pushes(
     blocks, lost = _blocks(error, weight, _LONGER), np.zeros(6)
     if len(blocks) < _LEAST:
         return np.sqrt(start[12:]), lost
-    model = _likelihood(blocks, transition, units, np.ones(12, bool), (push, dt))
+    heard = _heard(blocks, units, start)
+    model = _likelihood(blocks, transition, units, heard, (push, dt))
     often = np.repeat(start[12:], len(_TIMES)) / dt / 10
     x = np.log(np.concatenate([start, often]))
-    low, moved = x - _DEEP, np.ones(len(x), bool)
+    low, moved = x - _DEEP, np.concatenate([heard, np.ones(len(x) - 12, bool)])
     x = model.likeliest(x, low, moved)
     best = model.loss(x)[0]
     for i in axes:
@@ -178,6 +181,17 @@ def _blocks(error: np.ndarray, weight: np.ndarray, length: int) -> Float[np.ndar
         whole = np.all(weight[n : n + length] > 0, axis=0)
         found.append(error[n : n + length, :, whole].transpose(2, 0, 1))
     return np.concatenate(found).astype(float) if found else np.zeros((0, length, 12))
+
+
+def _heard(
+    blocks: Float[np.ndarray, "K n 12"],
+    units: Float[np.ndarray, "6 12 12"],
+    start: Float[np.ndarray, "18"],
+) -> Bool[np.ndarray, "12"]:
+    """Axes that tell of noise: twists, and poses whose records are clear of what a step makes."""
+    made = np.diagonal(units, axis1=1, axis2=2)[:, :6].T @ start[12:]
+    heard = np.concatenate([start[:6] > _CLEAR * made, np.ones(6, bool)])
+    return heard & np.any(blocks != blocks[:, :1], axis=(0, 1))
 
 
 def _likelihood(

@@ -59,6 +59,11 @@ class Look(NamedTuple):
     z: Float[np.ndarray, "N 12 R"]
     loss: float
 
+    def likelihood(self, weight: Float[np.ndarray, "N R"]) -> Float[np.ndarray, " R"]:
+        """Log density of each piece's innovations up to a constant (nats)."""
+        square = (self.z.astype(float) ** 2).sum(axis=(0, 1))
+        return -square / 2 - (self.kalman.log_det * weight).sum(axis=0)
+
     @property
     def correlation(self) -> Float[np.ndarray, "12"]:
         """Of neighbouring innovations; those of samples that do not exist are zero."""

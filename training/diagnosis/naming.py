@@ -15,10 +15,11 @@ Hypothesis = tuple[str, str]
 MARGIN_NATS, MARGIN_SHARE = 10.0, 0.02
 ECHO_SHARE = 0.01
 CLEAR, CLEAR_OF_FEW = 5.0, 1.5
-"""Multiples of the threshold from which the robust p value is not asked: few runs bound it, so few
-that only some of them show an effect bound it to nothing."""
+"""Multiples of the threshold from which the robust p value is not asked: few clusters (runs, or
+pieces of a handful of runs) bound it, so few that only some of them show an effect bound it to
+nothing."""
 _FEW = 12
-"""Runs that are few."""
+"""Clusters that are few."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ is kept: so many samples tell less.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg
@@ -49,7 +49,7 @@ class Noise:
         diffusion: b.
         slip: of the pose against the integrated twist, in m/√s and rad/√s.
         memory: how many samples tell as much as one independent one (12,).
-        error: standard error of b; zero where it was not asked for.
+        error: standard error of b; half of b where data are too few, zero for estimated states.
     """
 
     record: Float[np.ndarray, "12"]
@@ -57,6 +57,12 @@ class Noise:
     slip: Float[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
     memory: Float[np.ndarray, "12"] = field(default_factory=lambda: np.ones(12))
     error: Float[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
+
+    def with_diffusion(self, values: Mapping[int, float]) -> "Noise":
+        """The same with another b of some axes."""
+        b = self.diffusion.copy()
+        b[list(values)] = list(values.values())
+        return replace(self, diffusion=b)
 
     @property
     def estimated(self) -> bool:
@@ -124,8 +130,9 @@ def estimate(
 ) -> Noise:
     """Noise of records and process: the most likely, from a first guess by moments.
 
-    The diffusion b of some axes may be `held` (not of states that were estimated).
+    The diffusion b of some axes may be `held`.
     """
+    held = {} if held is None else held
     C = []
     for lag in range(3):
         w = weight[lag:] * weight[: len(weight) - lag]
@@ -139,7 +146,7 @@ def estimate(
     alike = np.diag(C[1]) > _ALIKE * np.diag(C[0])
     none, near = (alike & ((times * FLOOR) ** 2 >= R) for times in (1.0, _NEAR))
     if np.sum(none[6:]) >= _SMOOTH or np.sum(near) >= _SMOOTH_OF_ALL:
-        return _of_estimates(C[0], C[1], variance, A, inverse, unit, dt)
+        return _of_estimates(C[0], C[1], variance, A, inverse, unit, dt).with_diffusion(held)
     C0 = C[0] - (C[2] + C[2].T) / 2
     Q = C0 - np.diag(variance) - transition.of(np.diag(variance))
     least = 1e-8 * np.diag(C[0])[6:] / unit
@@ -147,7 +154,7 @@ def estimate(
     start = np.concatenate([variance, wrench])
     bounds = np.concatenate([(_BELOW * FLOOR) ** 2, np.maximum(least, 1e-300)])
     start, fixed = np.maximum(start, bounds), np.zeros(6, bool)
-    for i, b in ({} if held is None else held).items():
+    for i, b in held.items():
         start[12 + i], fixed[i] = b**2, True
     found, errors = most_likely(error, weight, transition, units, start, bounds, fixed)
     b = np.sqrt(found[12:])

@@ -168,14 +168,21 @@ class Search:
             theta, seen = self._fitted(h, fits, found, None)
             left = laws_of(self.bench, seen)
             if left and max(won_by(w.name, left) for w in left) < _LEFT * law:
+                exact = self._exact(fits[h], theta, seen, found)
+                if not admissible(self.bench.library, found.current.theta, exact):
+                    continue
                 gains = [(other, fits[other].heldout_gain) for other in names if other != h]
-                return Choice(h, self._exact(fits[h], theta, seen, found), (), tuple(gains))
+                return Choice(h, exact, (), tuple(gains))
         return None
 
     def _exact(self, fit: Fit, theta: Float[np.ndarray, " p"], seen: Look, found: Found) -> Fit:
-        """A fit with its exact values, and the nats that they win less one a number."""
+        """A fit with its exact values, and the nats that they win less one a number.
+
+        Each by a filter of its own: what a name explains is no noise any more.
+        """
         current, rows = found.current, list(fit.parameters)
-        won = (current.z.astype(float) ** 2 - seen.z.astype(float) ** 2).sum(axis=(0, 1)) / 2
+        weight = self.bench.data.weight
+        won = seen.likelihood(weight) - current.likelihood(weight)
         labels, index = np.unique(self.bench.data.cluster, return_inverse=True)
         heldout = np.bincount(index, won, len(labels)) - len(rows) / len(labels)
         change = theta - current.theta

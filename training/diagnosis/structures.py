@@ -38,8 +38,8 @@ NODES = {
     1.2: (0.0, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0),
     4.0: (0.0, 0.2, 0.35, *_TENTHS, 1.7, 2.0, 2.5, 3.0),
 }
-"""Times (s) that a memory fades in, and frequencies (Hz) for each, one to three times
-1 / (2πT) apart."""
+"""Times (s) that a memory fades in, and frequencies (Hz) for each, closest where vehicles and what
+hangs on them ring."""
 _CORRELATED, _MOST_CORRELATED = 0.1, 2
 """Correlation of neighbouring innovations from which an axis may remember other velocities, and so
 many axes at most."""

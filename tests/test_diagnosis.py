@@ -474,7 +474,7 @@ def test_bands_hold_what_a_law_of_the_disturbance_adds(tmp_path):
     theta = np.repeat(bench.believed[:, None], len(bench.data.fold), axis=1)
     shares, energies = [], []
     for stirring in ((), (colour,)):
-        judged = judge(bench, Contender(theta, stirring=stirring), 2.0, 0, [])
+        judged = judge(bench, Contender(theta, stirring=stirring), 2.0, 0, [], estimated=False)
         shares.append(judged.inside[BANDS.index(0.9)].sum(axis=1) / judged.count.sum(axis=1))
         energies.append(judged.energy.sum(axis=1) / judged.count.sum(axis=1))
     assert shares[0][-1] < 0.8

@@ -220,3 +220,7 @@ def test_slow_errors_of_an_estimator_are_told_from_those_of_instruments():
     np.testing.assert_allclose(with_a_gyro.record[9:], 0.01, rtol=0.06)
     np.testing.assert_allclose(measured.record, 0.01, rtol=0.06)  # four standard errors
     np.testing.assert_array_equal(measured.slip, 0)
+    # a stretch without slow errors of what is known to be a filter's is no instrument's
+    calm = estimate(fast, weight, A, mass, DT, estimated=True)
+    assert calm.estimated
+    np.testing.assert_allclose(calm.diffusion, 2**0.5 * 0.01 * 10 / DT**0.5, rtol=0.05)

@@ -309,11 +309,11 @@ class Diagnoser:
         contenders["black_box"] = Contender(
             still, train(found.base.predictions, bench.data, self.rng)
         )
-        judged = {}
+        judged, estimated = {}, fitted.noise.estimated
         for number, (name, contender) in enumerate(contenders.items()):
             self.progress(0.84 + 0.04 * number, f"gain: {name.replace('_', ' ')}")
             in_use = [] if contender.box is not None else [*belief, *rows]
-            judged[name] = judge(bench, contender, horizon, seed, in_use)
+            judged[name] = judge(bench, contender, horizon, seed, in_use, estimated)
         return {
             name: told(j, judged["base"], bench, horizon, np.random.default_rng(seed))
             for name, j in judged.items()

@@ -163,7 +163,8 @@ def _without_blows(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
     near[:-1] |= hit[1:]
     weight = data.weight * ~near
     steps = Transition.along(jacobian, weight)
-    return estimate(error, weight, steps, bench.mass(look.theta), data.dt).diffusion
+    mass = bench.mass(look.theta)
+    return estimate(error, weight, steps, mass, data.dt, estimated=False).diffusion
 
 
 def _is_apart(law: Law, bench: Bench) -> bool:

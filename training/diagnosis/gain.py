@@ -67,12 +67,18 @@ class Judged(NamedTuple):
 
 
 def judge(
-    bench: Bench, contender: Contender, horizon: float, seed: int, in_use: Sequence[int]
+    bench: Bench,
+    contender: Contender,
+    horizon: float,
+    seed: int,
+    in_use: Sequence[int],
+    estimated: bool,
 ) -> Judged:
     """Score a model's innovations, and simulate it over `horizon` s from recorded states.
 
     Effects that own none of the parameters `in_use` are left out of the simulations; contenders
-    with the same ones share a compiled program.
+    with the same ones share a compiled program. Whether the records are states that a filter has
+    `estimated` is one answer for all folds and contenders.
     """
     data, theta = bench.data, contender.theta
     p = predict(bench.model, bench.library, theta, data)
@@ -88,7 +94,7 @@ def judge(
         own = data.fold == label
         rest = data.weight * (~own if not own.all() else 1)
         steps = Transition.along(jacobian, rest)
-        noise = estimate(error, rest, steps, mass, data.dt)
+        noise = estimate(error, rest, steps, mass, data.dt, estimated=estimated)
         record[:, own], diffusion[:, own] = noise.record[:, None], noise.diffusion[:, None]
         given = np.linalg.inv(mass), data.dt, data.step[:, own], data.weight[:, own]
         score[own] = score_of(error[:, :, own], jacobian[..., own], noise, steps, *given)

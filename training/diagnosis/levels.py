@@ -50,7 +50,7 @@ def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
         own = data.fold == label
         rest = data.weight * (~own if not own.all() else 1)
         steps = Transition.along(jacobian, rest)
-        noise = estimate(error, rest, steps, mass, data.dt)
+        noise = estimate(error, rest, steps, mass, data.dt, estimated=False)
         levels[k] = noise.diffusion
         best = score(own, noise, steps)
         judged.append((own, rest, steps, best))
@@ -61,7 +61,8 @@ def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
     for i in np.flatnonzero(believed > 0):
         if gain[i].sum() > least:
             for own, rest, steps, best in judged:
-                other = estimate(error, rest, steps, mass, data.dt, held={int(i): believed[i]})
+                held = {int(i): believed[i]}
+                other = estimate(error, rest, steps, mass, data.dt, held, estimated=False)
                 gain[i, own] = best - score(own, other, steps)
         spread = np.sqrt((n - 1) / n * np.sum((levels[:, i] - levels[:, i].mean()) ** 2))
         change = float(look.noise.diffusion[i] / believed[i] - 1)

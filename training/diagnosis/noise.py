@@ -50,6 +50,7 @@ class Noise:
         slip: of the pose against the integrated twist, in m/√s and rad/√s.
         memory: how many samples tell as much as one independent one (12,).
         error: standard error of b; half of b where data are too few, zero for estimated states.
+        estimated: whether the records are states that a filter has estimated.
     """
 
     record: Float[np.ndarray, "12"]
@@ -57,17 +58,13 @@ class Noise:
     slip: Float[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
     memory: Float[np.ndarray, "12"] = field(default_factory=lambda: np.ones(12))
     error: Float[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
+    estimated: bool = False
 
     def with_diffusion(self, values: Mapping[int, float]) -> "Noise":
         """The same with another b of some axes."""
         b = self.diffusion.copy()
         b[list(values)] = list(values.values())
         return replace(self, diffusion=b)
-
-    @property
-    def estimated(self) -> bool:
-        """Whether the records are states that a filter has estimated."""
-        return bool(np.any(self.memory > 1))
 
 
 @dataclass(frozen=True)
@@ -127,10 +124,12 @@ def estimate(
     mass: Float[np.ndarray, "6 6"],
     dt: float,
     held: Mapping[int, float] | None = None,
+    estimated: bool | None = None,
 ) -> Noise:
     """Noise of records and process: the most likely, from a first guess by moments.
 
-    The diffusion b of some axes may be `held`.
+    The diffusion b of some axes may be `held`. Whether the records are states that a filter has
+    `estimated` is told by the errors unless it is known.
     """
     held = {} if held is None else held
     C = []
@@ -145,7 +144,9 @@ def estimate(
     unit = np.diag(units.sum(axis=0))[6:]
     alike = np.diag(C[1]) > _ALIKE * np.diag(C[0])
     none, near = (alike & ((times * FLOOR) ** 2 >= R) for times in (1.0, _NEAR))
-    if np.sum(none[6:]) >= _SMOOTH or np.sum(near) >= _SMOOTH_OF_ALL:
+    if estimated is None:
+        estimated = bool(np.sum(none[6:]) >= _SMOOTH or np.sum(near) >= _SMOOTH_OF_ALL)
+    if estimated:
         return _of_estimates(C[0], C[1], variance, A, inverse, unit, dt).with_diffusion(held)
     C0 = C[0] - (C[2] + C[2].T) / 2
     Q = C0 - np.diag(variance) - transition.of(np.diag(variance))
@@ -180,6 +181,7 @@ def _of_estimates(
         diffusion=np.sqrt(square),
         slip=np.sqrt(np.maximum(left, 0.0) / dt),
         memory=(1 + correlation) / (1 - correlation),
+        estimated=True,
     )
 
 

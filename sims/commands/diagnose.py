@@ -33,8 +33,8 @@ class Diagnose:
     """Coefficients that are fitted before any cause is named: none, one factor on all thrust
     (`scales`), added mass, drag and buoyancy (`linear`), drag, buoyancy and the scale of each axis'
     command, where commands pass through gains that are not known (`command`), or all of a grey box
-    (these, the thrusters' curve and levers, restoring moment), for a belief that is wrong in most
-    of them."""
+    (these, the thrusters' curve, dead band and levers, restoring moment), for a belief that is
+    wrong in most of them."""
     water_density: float | None = None
     """kg/m³, where a log's autopilot took the sea for fresh water (as of `spinndrift import`)."""
     out: Path = Path("diagnosis")

@@ -2,10 +2,10 @@
 
 A preset may be off by factors, where kernels hardly feel a difference, and a gradient step sees
 masses and drags through very unequal slopes. With the networks' weights left alone a SPINN is a
-vehicle with constant M, D and D^f: some 70 numbers, which Powell's dogleg method (Nocedal and
-Wright 2006, chapter 4) finds in a few steps from the noise-free motion over short pieces. What the
-data don't tell (an axis that never moves) stays where the preset has it, held by a weak prior. It
-is meant for measured states; `likelihood` tells much more of exact ones.
+vehicle with constant M, D and D^f: some 70 numbers, which a trust region (Moré 1978, SciPy's)
+finds in a few steps from the noise-free motion over short pieces. What the data don't tell (an axis
+that never moves) stays where the preset has it, held by a weak prior. It is meant for measured
+states; `likelihood` tells much more of exact ones.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
+import scipy.optimize
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
@@ -52,33 +52,48 @@ def fit_drift(
     pieces = _telling(windows.subdivide(steps), small, config.pieces, substeps)
     start, unravel = ravel_pytree(constants(model))
     residuals = _residuals(config, unravel, start, substeps, pieces.dt)
-    solver = optimistix.Dogleg(rtol=1e-3, atol=1e-3)
-
-    @eqx.filter_jit
-    def solve(values: Array, arguments: Any) -> Array:
-        return optimistix.least_squares(
-            residuals,
-            solver,
-            values,
-            args=arguments,
-            options={"jac": "fwd"},
-            max_steps=config.iterations,
-            throw=False,
-        ).value
 
     # once with the preset's errors as the units, once with the errors that are left
-    values = start.astype(jnp.result_type(float))  # what the solver makes its own numbers of
+    values = np.asarray(start, float)
     for n in range(_PASSES):
         if progress is not None:
             progress(n, _PASSES, float("nan"))
-        current = eqx.tree_at(constants, small, unravel(values.astype(start.dtype)))
-        unit = SquaredError.build("typical", substeps, current, pieces)
-        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-            found = solve(values, (small, Batch.of(pieces), unit))
-        if not bool(jnp.all(jnp.isfinite(found))):
+        current = eqx.tree_at(constants, small, unravel(jnp.asarray(values, start.dtype)))
+        given = small, Batch.of(pieces), SquaredError.build("typical", substeps, current, pieces)
+        found = _solved(residuals, given, values, start.dtype, config.iterations)
+        if not np.all(np.isfinite(found)):
             break
         values = found
-    return eqx.tree_at(constants, model, unravel(values.astype(start.dtype)))
+    return eqx.tree_at(constants, model, unravel(jnp.asarray(values, start.dtype)))
+
+
+def _solved(
+    residuals: Callable[[Array, Any], tuple[Array, Array]],
+    given: Any,
+    values: Float[np.ndarray, " p"],
+    dtype: Any,
+    steps: int,
+) -> Float[np.ndarray, " p"]:
+    """Where the sum of squared residuals is least, after at most so many steps from `values`."""
+    known: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+
+    def both(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if x.tobytes() not in known:
+            known.clear()
+            errors, jacobian = (
+                np.asarray(a, float) for a in residuals(jnp.asarray(x, dtype), given)
+            )
+            # what has run away has no slope
+            known[x.tobytes()] = errors, np.where(np.isfinite(jacobian), jacobian, 0.0)
+        return known[x.tobytes()]
+
+    def slopes(x: np.ndarray) -> np.ndarray:
+        return both(x)[1]
+
+    jac: Any = slopes  # SciPy's stubs know names alone
+    return scipy.optimize.least_squares(
+        lambda x: both(x)[0], values, jac, xtol=1e-3, ftol=1e-4, max_nfev=steps
+    ).x
 
 
 def _telling(pieces: Windows, model: Spinn, count: int, substeps: int) -> Windows:
@@ -104,17 +119,23 @@ def _residuals(
     start: Float[Array, " p"],
     substeps: int,
     dt: float,
-) -> Callable[[Array, Any], Any]:
-    def residuals(values: Array, arguments: Any) -> Any:
-        model, batch, unit = arguments
-        model = eqx.tree_at(constants, model, unravel(values.astype(start.dtype)))
+) -> Callable[[Array, Any], tuple[Array, Array]]:
+    """A compiled function of constants and (model, pieces, units): residuals and Jacobian."""
+
+    def residuals(values: Array, given: Any) -> Array:
+        model, batch, unit = given
+        model = eqx.tree_at(constants, model, unravel(values))
         X, V = predict_drift(model, batch.X[0], batch.V[0], batch.F, dt, substeps=substeps)
         errors = jnp.stack(unit.by_axis(X[:, :, None], V[:, :, None], batch))
         errors = errors[:, :, 1::4]  # neighbouring times say nearly the same
         # a far step of the solver may run away: a large finite error tells it to go back
         errors = jnp.where(jnp.isfinite(errors), jnp.clip(errors, -1e3, 1e3), 1e3)
-        errors = (errors / errors.size**0.5).astype(values.dtype)
         change = (values - start) / jnp.maximum(1, jnp.abs(start))
-        return errors, config.prior**0.5 * change.astype(values.dtype)
+        return jnp.concatenate([errors.ravel() / errors.size**0.5, config.prior**0.5 * change])
 
-    return residuals
+    @eqx.filter_jit
+    def both(values: Array, given: Any) -> tuple[Array, Array]:
+        errors, push = jax.linearize(lambda x: residuals(x, given), values)
+        return errors, jax.vmap(push, out_axes=1)(jnp.eye(len(values), dtype=values.dtype))
+
+    return both

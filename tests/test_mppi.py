@@ -403,14 +403,14 @@ def test_the_system_plans_from_its_ports_and_repeats_itself():
     assert figures["effective_samples"] == pytest.approx(12, rel=0.02)
 
 
-@pytest.mark.parametrize("threads", [1, 2, 7])
+@pytest.mark.parametrize("threads", [1, 7])
 def test_threads_change_nothing_but_the_time(threads):
-    """120 sequences in 1, 2 or 7 parts (of 18 and 17) give what one program gives for all."""
-    planner = among(1.5, config=replace(AMONG, threads=threads))
+    """120 sequences in 1 or 7 parts (of 18 and 17) give what one program gives for all."""
     noise = np.array([0.3, -1.2, 0.0, 2.5])
-    nominal = planner.init()
+    nominal = among(1.5).init()
     X, V, bias = np.asarray(at(0.2, 0.1)), np.full(6, 0.05), np.array([3.0, -2.0, 1.0, 0, 0, 0])
-    state, whole = step(planner, nominal, key_from_gaussians(jnp.array(noise)), X, V, bias)
+    state, whole = step(among(1.5), nominal, key_from_gaussians(jnp.array(noise)), X, V, bias)
+    planner = among(1.5, config=replace(AMONG, threads=threads))
     system = Mppi(planner)
     values = system.plan(1.5, np.asarray(nominal.F_Bo_B, float).ravel(), X, V, bias, noise)
     again = system.plan(1.5, np.asarray(nominal.F_Bo_B, float).ravel(), X, V, bias, noise)

@@ -35,7 +35,6 @@ def _threads() -> ThreadPoolExecutor:
 def _respond(
     model: Extended,
     effects: Any,
-    believed: Any,
     predictions: Predictions,
     arrays: Arrays,
     filters: tuple[Array, Array, Array],
@@ -43,7 +42,6 @@ def _respond(
     instruments: bool,
 ) -> Float[Array, "L N12 R"]:
     """Whitened innovations of lane 0 (the base) and changes of them in the other lanes."""
-    base = model.with_effects(believed)
     model = model.with_effects(effects)
     if not instruments:
         model, predictions, arrays, filters = _single((model, predictions, arrays, filters))
@@ -56,11 +54,12 @@ def _respond(
         dt = h[None, None]
         kept = through(gap, nu)
         if instruments:
-            x, v = model.infer(X0[:, None], V0[:, None], rate[:, None])
-            seen = model.observe(p.X[:, None], p.V[:, None], p.rate[:, None])
-            direct = _apart(seen)
-            # states that differ, as the base's instruments show them: ν is of records
-            moved = kept - _apart(base.observe(x, v, rate[:, None]))
+            # states that instruments show otherwise go their way, and are read at its end
+            away = _apart(model.infer(X0[:, None], V0[:, None], rate[:, None]))
+            away = jnp.sum(p.jacobian[:, :, None] * away[None], axis=1)
+            x, v = se3.retract(p.X[:, None], away[:6]), p.V[:, None] + away[6:]
+            direct = _apart(model.observe(x, v, p.rate[:, None]))
+            moved = kept
         else:
             x, v = (a[:, None] for a in p.start)
             middle_V = (v + p.V[:, None]) / 2
@@ -139,7 +138,7 @@ def respond(
             lanes = library.filled((theta + chunk).T[:, :, None])
             effects = _of_family(lanes, believed, instruments)
             arguments = predictions, arrays, filters, size + 1, instruments
-            call = _threads().submit(run, model, effects, believed, *arguments)
+            call = _threads().submit(run, model, effects, *arguments)
             running.append((some, call))
             if len(running) > AHEAD:
                 collect()

@@ -66,6 +66,11 @@ class Recording:
         return float(self.dataset.attrs["dt"])
 
     @property
+    def command_period(self) -> float:
+        """Time (s) between samples of commands where they were logged; `dt` if nothing tells."""
+        return float(self.dataset.attrs.get("command_period", self.dt))
+
+    @property
     def scenarios(self) -> tuple[str, ...]:
         """Names of the scenarios."""
         return tuple(str(name) for name in self.dataset["scenario"].to_numpy())
@@ -342,13 +347,15 @@ class Recording:
         ]
         notes = dict.fromkeys(note for recording in recordings for note in recording.notes)
         sources = dict.fromkeys(str(r.dataset.attrs.get("source", "")) for r in recordings)
-        return cls.from_trajectories(
+        joined = cls.from_trajectories(
             parts,
             recordings[0].dt,
             vehicle=vehicles.pop() if vehicles else "",
             source="; ".join(source for source in sources if source),
             notes=list(notes),
         )
+        period = max(recording.command_period for recording in recordings)
+        return cls(joined.dataset.assign_attrs(command_period=period))
 
     # files
 

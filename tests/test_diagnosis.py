@@ -12,9 +12,11 @@ from hidden.draw import draw
 from hidden.scenarios import Plan
 
 from spinndrift.models.effects import KINDS, Extended, Library
+from spinndrift.models.recording import Recording
 from spinndrift.models.recording_csv import read_csv
 from spinndrift.models.vehicle import load_vehicle
 from spinndrift.training.diagnosis import looking
+from spinndrift.training.diagnosis.checks import limits
 from spinndrift.training.diagnosis.data import Data
 from spinndrift.training.diagnosis.diagnose import DiagnoseConfig, Diagnoser
 from spinndrift.training.diagnosis.hypotheses import Fit
@@ -450,6 +452,23 @@ def test_axes_that_are_not_driven_and_filled_samples_are_told(tmp_path):
     assert "missing" in problems(_read(tmp_path / "gap", runs))[0][0]
     blows = draw(3, names=("disturbance_impacts",), size=3.0, plan=PLAN)
     assert problems(_read(tmp_path / "blows", blows.logged())) == ([], [])
+
+
+def test_times_below_those_of_sparse_commands_are_no_cause(tmp_path):
+    """Lines between commands that were logged now and then show as a small delay of something."""
+    case, recording = recorded(tmp_path, 3, names=("clock_offset",), size=0.3)
+    assert all(abs(p["value"]) < 0.1 * 0.1 for p in case.effects[0].parameters().values())
+    sparse = Recording(recording.dataset.assign_attrs(command_period=0.1))
+    for given, named in ((recording, True), (sparse, False)):
+        diagnoser = Diagnoser(given, VEHICLE)
+        look = diagnoser.bench.look(diagnoser.bench.believed)
+        search = diagnoser._names(diagnoser.bench, [], 0.0, 1.0)
+        choice = search.next(Found(look, look, look))[0]
+        assert (choice is not None and choice.hypothesis[0] == "clock_offset") == named
+    assert "logged at 10 Hz" in limits(diagnoser.bench.data, [], False, command_period=0.1)[-1]
+    assert limits(
+        diagnoser.bench.data, [], False, command_period=diagnoser.bench.data.dt
+    ) == limits(diagnoser.bench.data, [], False)
 
 
 def _read(folder, runs):

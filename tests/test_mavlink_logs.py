@@ -225,7 +225,8 @@ def test_without_a_horizontal_estimate_only_the_vertical_is_kept(tmp_path):
 
 
 def test_slow_outputs_are_told_to_hide_the_lag(tmp_path):
-    _, report = imported(tmp_path, dive(rates=(50.0, 4.0, 10.0)).bytes())
+    recording, report = imported(tmp_path, dive(rates=(50.0, 4.0, 10.0)).bytes())
+    assert recording.command_period == pytest.approx(0.1, rel=0.05)
     text = " ".join(report.lacks)
     assert "Thruster outputs at 10.0 Hz: thruster lag" in text
     assert "Position and velocity at 4.0 Hz only" in text

@@ -150,6 +150,9 @@ def test_concatenation_keeps_every_run():
     assert both.scenarios == ("surge", "sway")
     assert both.lengths.tolist() == [[40, 25, 40, 25], [10, 0, 0, 0]]
     assert both.notes == ("one", "two")
+    sparse = Recording(a.dataset.assign_attrs(command_period=0.2))
+    assert a.command_period == a.dt
+    assert Recording.concat([a, sparse]).command_period == 0.2
     other = Recording.from_trajectories(
         [trajectory(commands={"pwm": np.full((40, 8), 1500.0)})], DT, vehicle="test"
     )

@@ -102,8 +102,9 @@ def import_log(
         )
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
+    period = 1.0 / signals.outputs.rate
     progress(1.0)
-    return recording, report
+    return Recording(recording.dataset.assign_attrs(command_period=period)), report
 
 
 def own_rate(signals: Signals) -> float:

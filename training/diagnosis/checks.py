@@ -83,6 +83,10 @@ def _longest(holds: np.ndarray) -> int:
     return int((edges[1::2] - edges[::2]).max()) if edges.size else 0
 
 
+SPARSE = 1.5
+"""Steps between samples of commands from which these count as sparse."""
+
+
 def unexcited(data: Data, wrench_of: np.ndarray) -> list[str]:
     """Axes that were not driven: what acts along them can't be told from these data.
 
@@ -95,7 +99,13 @@ def unexcited(data: Data, wrench_of: np.ndarray) -> list[str]:
     return [a for a, f, s in zip(AXES, rms, scale, strict=True) if f <= _STILL * s]
 
 
-def limits(data: Data, quiet: list[str], resampled: bool, estimated: bool = False) -> list[str]:
+def limits(
+    data: Data,
+    quiet: list[str],
+    resampled: bool,
+    estimated: bool = False,
+    command_period: float = 0.0,
+) -> list[str]:
     """What these data can't tell, one sentence each."""
     found = [
         f"{axis} was not driven: its drag and inertia are not identifiable from these data"
@@ -109,6 +119,12 @@ def limits(data: Data, quiet: list[str], resampled: bool, estimated: bool = Fals
         found.append(
             "time steps were uneven: effects of a tenth of a step in time, and rare blows, can't "
             "be told from the resampling"
+        )
+    if command_period > SPARSE * data.dt:
+        found.append(
+            f"commands were logged at {1 / command_period:.3g} Hz: what they did in between is not "
+            f"known, so lags and delays below {command_period:.2g} s and what turns settle to "
+            "within that time are uncertain beyond their intervals; log outputs at 50 Hz or more"
         )
     if estimated:
         found.append(

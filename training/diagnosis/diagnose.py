@@ -20,7 +20,7 @@ from ...models.recording import Recording
 from ...models.vehicle import Vehicle
 from . import result, telling
 from .blackbox import train
-from .checks import limits, problems, unexcited
+from .checks import SPARSE, limits, problems, unexcited
 from .data import Data
 from .disturbance import OF_OTHERS, all_laws, best_law, passing
 from .disturbance import told as told_laws
@@ -43,6 +43,8 @@ _RIVALS = 0.25
 _RESAMPLED, _OF_A_STEP, _NO_TIME = 0.02, 0.1, 0.02
 """Nats a sample that a law, and share of a step that a time must have, in resampled data; share of
 a step below which a time is none in any: without noise, integration shows as one."""
+_OF_A_COMMAND = 0.1
+"""Share of the time between sparse commands that a time must have: interpolation shows as one."""
 _FINEST = 0.02
 """Steps (s) of data that the extended model will be used on at least: delays are told by them."""
 _LAW_MARGIN = 5.0
@@ -112,6 +114,7 @@ class Diagnoser:
         if self.config.refit == "command" and not self.bench.library.has("axis_thrust"):
             self.bench = self.bench.with_effect(AxisThrust.neutral())
         self.resampled = any("resampled" in note for note in recording.notes)
+        self.command_period = recording.command_period
         directions = np.asarray(self.bench.model.allocate(jnp.eye(self.bench.data.u.shape[1])))
         self.quiet = unexcited(self.bench.data, directions)
         self.rng = np.random.default_rng(self.config.seed)
@@ -182,7 +185,9 @@ class Diagnoser:
                 step=d.dt,
                 command=d.command,
                 problems=self.faults,
-                limits=limits(d, self.quiet, self.resampled, final.noise.estimated),
+                limits=limits(
+                    d, self.quiet, self.resampled, final.noise.estimated, self.command_period
+                ),
                 noise=telling.noise_words(final),
             ),
             tested=tested,
@@ -235,6 +240,8 @@ class Diagnoser:
     def _names(self, bench: Bench, nuisance: list[int], low: float, high: float) -> Search:
         config, within = self.config, self._within(low, high)
         shortest = (_OF_A_STEP if self.resampled else _NO_TIME) * bench.data.dt
+        if self.command_period > SPARSE * bench.data.dt:
+            shortest = max(shortest, _OF_A_COMMAND * self.command_period)
         return Search(
             bench, nuisance, config.alpha, config.most, self.rng, within, self.quiet, shortest
         )

@@ -100,7 +100,10 @@ class _Lines:
 
     def update(self, fraction: float, remark: str = "", /) -> None:
         fraction, now = min(max(fraction, 0.0), 1.0), time.monotonic()
-        if fraction <= 0:
+        if fraction <= 0:  # work begins, or begins again
+            self._tenth, self._first = 0, None
+            if self._shown and remark:
+                self._out.print(f"{self._what}: {remark}")
             return
         if self._first is None:
             self._first = (now, fraction)

@@ -18,7 +18,12 @@ from spinndrift.models.vehicle import load_vehicle
 from spinndrift.training.diagnosis import looking
 from spinndrift.training.diagnosis.checks import limits
 from spinndrift.training.diagnosis.data import Data
-from spinndrift.training.diagnosis.diagnose import DiagnoseConfig, Diagnoser
+from spinndrift.training.diagnosis.diagnose import (
+    DiagnoseConfig,
+    Diagnoser,
+    best_gain,
+    coefficients_are_off,
+)
 from spinndrift.training.diagnosis.hypotheses import Fit
 from spinndrift.training.diagnosis.innovations import predict
 from spinndrift.training.diagnosis.laws import find_laws
@@ -30,8 +35,9 @@ from spinndrift.training.diagnosis.noise import (
     process_covariance,
 )
 from spinndrift.training.diagnosis.responses import respond
-from spinndrift.training.diagnosis.result import Diagnosis, schema
+from spinndrift.training.diagnosis.result import Diagnosis, Interval, Ratio, Value, schema
 from spinndrift.training.diagnosis.search import Found, Search
+from spinndrift.training.diagnosis.telling import with_coefficients_off
 from spinndrift.training.diagnosis.transition import Transition
 
 VEHICLE = load_vehicle("bluerov2_heavy")
@@ -213,6 +219,23 @@ def test_a_lag_is_named_measured_and_extended(tmp_path):
     assert seen == sorted(seen)
     assert seen[-1] == 1
     check(json.loads(d.as_json()), schema())
+    assert not coefficients_are_off(d)
+    assert best_gain(d) == d.gain["extended"].log_score_gain.value
+    # what a belief that is wrong in most coefficients shows: no name, and a refit that tells
+    refit = replace(d.gain["refitted"], log_score_gain=Interval(5.0, (4.0, 6.0)))
+    nothing = replace(d, causes=[], gain={"base": d.gain["base"], "refitted": refit})
+    assert coefficients_are_off(nothing)
+    assert coefficients_are_off(replace(d, causes=4 * d.causes))
+    off = [("linear_drag", 0.1, 0.2), ("quadratic_drag", 9.0, 3.0), ("quadratic_drag", 8.0, 2.0),
+           ("inertia", 1.0, 1.0)]  # fmt: skip
+    ratios = [
+        Ratio(name, "surge", believed, Value(found, "1", (0.9 * found, 1.1 * found)))
+        for name, found, believed in off
+    ]
+    said = with_coefficients_off(replace(nothing, ratios=ratios, verdict="adequate"))
+    assert said.verdict == "explained"
+    assert "quadratic_drag of surge 8 (believed: 2); linear_drag" in said.sentence
+    assert "inertia of" not in said.sentence
 
 
 def check(value, rule, root=None):

@@ -36,6 +36,20 @@ def test_a_log_gets_one_line_each_ten_per_cent(soon):
     assert "100%" in lines[-1]
 
 
+def test_work_that_begins_again_counts_anew(soon):
+    out = io.StringIO()
+    with progress_bar("work", Console(file=out, width=100)) as update:
+        time.sleep(0.2)
+        for k in range(1, 101):
+            update(k / 100)
+        update(0.0, "once more")
+        for k in range(1, 101):
+            update(k / 100)
+    lines = out.getvalue().splitlines()
+    assert lines.index("work: once more") == 10
+    assert len(lines) == 21
+
+
 def test_a_terminal_gets_a_bar(soon):
     told = played(True, 0.3)
     assert "work" in told

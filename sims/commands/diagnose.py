@@ -29,12 +29,12 @@ class Diagnose:
     (N·m√s). Without it a level other than believed can't be told."""
     alpha: float = 0.01
     """Rate of false alarms over all names together."""
-    refit: Literal["none", "scales", "linear", "command", "all"] = "none"
+    refit: Literal["auto", "none", "scales", "linear", "command", "all"] = "auto"
     """Coefficients that are fitted before any cause is named: none, one factor on all thrust
     (`scales`), added mass, drag and buoyancy (`linear`), drag, buoyancy and the scale of each axis'
     command, where commands pass through gains that are not known (`command`), or all of a grey box
     (these, the thrusters' curve, dead band and levers, restoring moment), for a belief that is
-    wrong in most of them."""
+    wrong in most of them. `auto` fits none, and all where that tells clearly more than names."""
     water_density: float | None = None
     """kg/m³, where a log's autopilot took the sea for fresh water (as of `spinndrift import`)."""
     out: Path = Path("diagnosis")

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import jax.numpy as jnp
@@ -36,7 +36,10 @@ from .search import Found, Search, refitted
 from .unknowns import accept, seek, structure
 
 Progress = Callable[[float, str], None]
-Refit = Literal["none", "scales", "linear", "command", "all"]
+Refit = Literal["auto", "none", "scales", "linear", "command", "all"]
+_CLEARLY, _MANY = 0.05, 3
+"""Nats a sample that coefficients fitted to other runs must win over all causes together before a
+belief counts as wrong in most of them, and causes beyond which it may be."""
 _MOST_UNKNOWN = 2
 _RIVALS = 0.25
 """Share of what the best law wins below which names leave it to structure without a name."""
@@ -61,14 +64,16 @@ class DiagnoseConfig:
             belief is a cause), `scales` (one factor on all thrust), `linear` (added masses,
             drag, buoyancy), `command` (a factor on the wrench of each axis, drag, buoyancy: for
             commands of unknown scale; the inertia stays as believed) or `all` (these, the
-            thrusters' curve and levers, the centre of buoyancy: `identify`).
+            thrusters' curve and levers, the centre of buoyancy: `identify`). `auto` is `none`
+            unless refitted coefficients forecast left-out runs clearly better than the causes
+            found: names don't explain a belief that is wrong in most of them, and `all` are fitted.
         most: causes at most.
         horizon: length of the simulations that the gain is told by (s).
         seed: of bootstraps and simulated noise.
     """
 
     alpha: float = 0.01
-    refit: Refit = "none"
+    refit: Refit = "auto"
     most: int = 6
     horizon: float = 4.0
     seed: int = 0
@@ -96,7 +101,7 @@ class Finding:
 
 
 class Diagnoser:
-    """One recording under one belief."""
+    """One recording under one belief, looked at once: a `refit` of `auto` is `none` here."""
 
     def __init__(
         self,
@@ -106,7 +111,8 @@ class Diagnoser:
         config: DiagnoseConfig | None = None,
         progress: Progress = lambda fraction, remark: None,
     ):
-        self.config = DiagnoseConfig() if config is None else config
+        config = DiagnoseConfig() if config is None else config
+        self.config = replace(config, refit="none") if config.refit == "auto" else config
         self.furthest = 0.0
         self.tell = progress
         self.faults, faulty = problems(recording)
@@ -339,4 +345,29 @@ def diagnose(
     Raises:
         UserError: the recording lacks pose or twist, or is too short.
     """
-    return Diagnoser(recording, vehicle, base, config, progress).run()
+    config = DiagnoseConfig() if config is None else config
+    found = Diagnoser(recording, vehicle, base, config, progress).run()
+    first = found.diagnosis
+    if config.refit != "auto" or not coefficients_are_off(first):
+        return found
+    progress(0.0, "again with all coefficients fitted, for most are off")
+    again = Diagnoser(recording, vehicle, base, replace(config, refit="all"), progress).run()
+    second = again.diagnosis
+    if best_gain(second) < best_gain(first) + _CLEARLY:
+        return found
+    told = telling.with_coefficients_off(second)
+    return replace(again, diagnosis=replace(told, seconds=first.seconds + second.seconds))
+
+
+def coefficients_are_off(diagnosis: result.Diagnosis) -> bool:
+    """Whether refitted coefficients win what causes do not, or it takes many causes."""
+    causes = diagnosis.gain.get("extended")
+    won = 0.0 if causes is None else max(causes.log_score_gain.value, 0.0)
+    refitted = diagnosis.gain["refitted"].log_score_gain
+    return refitted.interval95[0] > won + _CLEARLY or len(diagnosis.causes) > _MANY
+
+
+def best_gain(diagnosis: result.Diagnosis) -> float:
+    """Nats a sample that the better of refit and extended model wins on data left out."""
+    models = (diagnosis.gain.get(name) for name in ("refitted", "extended"))
+    return max(m.log_score_gain.value for m in models if m is not None)

@@ -163,8 +163,8 @@ class Diagnosis:
     """The whole finding.
 
     Attributes:
-        verdict: adequate (no cause), explained (all by names), partly_explained (names and
-            `unknown`), unexplained (`unknown` alone).
+        verdict: adequate (no cause), explained (all by names, or by coefficients), partly_explained
+            (names and `unknown`), unexplained (`unknown` alone).
         refitted: coefficients fitted before any cause was named.
         ratios: what such a fit tells whatever the mass; with `--refit all` only.
         gain: of base, refitted, extended (where there are causes) and black_box.

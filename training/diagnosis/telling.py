@@ -1,6 +1,7 @@
 """A finding in words and numbers: causes with intervals, what is left, what was refitted."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -202,6 +203,31 @@ def sentence(
         if c.structure is not None:
             told += f" No name explains {c.structure.description}."
     return first + told.strip()
+
+
+def with_coefficients_off(diagnosis: result.Diagnosis) -> result.Diagnosis:
+    """The finding on a belief whose coefficients explain what it gets wrong."""
+
+    def factor(r: result.Ratio) -> float:
+        return abs(np.log(r.found.value / r.believed))
+
+    off: dict[str, result.Ratio] = {}  # of each kind the one that is off most
+    for r in diagnosis.ratios:
+        low, high = r.found.interval95
+        if r.believed * r.found.value > 0 and not low <= r.believed <= high:
+            off[r.name] = max(off.get(r.name, r), r, key=factor)
+    units = {"1": ""}
+    told = "; ".join(
+        f"{r.name} of {r.where} {r.found.value:.3g} {units.get(r.found.unit, r.found.unit + ' ')}"
+        f"(believed: {r.believed:.3g})"
+        for r in sorted(off.values(), key=factor, reverse=True)
+    )
+    most = f" Over inertia, of each kind the most: {told}." if told else ""
+    return replace(
+        diagnosis,
+        sentence=f"Your model is wrong in most of its coefficients.{most} {diagnosis.sentence}",
+        verdict="explained" if diagnosis.verdict == "adequate" else diagnosis.verdict,
+    )
 
 
 def noise_words(look: Look) -> dict[str, float]:

@@ -155,7 +155,7 @@ class Diagnoser:
         if self.resampled:  # interpolation makes the noise uneven
             least += _RESAMPLED * bench.data.steps
         # what the names leave of their own is no law
-        least = max(least, OF_OTHERS * sum(choice.fit.heldout_gain for choice, _ in found.accepted))
+        least = max(least, OF_OTHERS * sum(choice.fit.heldout_gain for choice in found.accepted))
         laws = [] if final.noise.estimated else all_laws(bench, final, least)
         groups = told_laws(laws, bench, final, least)
         shaped = [law for group in groups for law in group if law.name != LEVEL]
@@ -164,7 +164,7 @@ class Diagnoser:
         causes, stirring = [], []
         if joint is not None:
             causes = [
-                telling.cause(*a, bench, final, joint, tested, structures.get(a[0].hypothesis))
+                telling.cause(a, bench, final, joint, structures.get(a.hypothesis))
                 for a in found.accepted
             ]
         for group in groups:

@@ -1,6 +1,7 @@
 """Inner products of whitened innovations and responses, by cluster."""
 
 import numpy as np
+import scipy.optimize
 from jaxtyping import Float, Int
 
 
@@ -22,3 +23,25 @@ def pooled(
     total = np.zeros((len(labels), *G.shape[1:]))
     np.add.at(total, index, G)
     return total
+
+
+def least_within(
+    values: Float[np.ndarray, " k"],
+    vectors: Float[np.ndarray, "k k"],
+    gradient: Float[np.ndarray, " k"],
+    low: Float[np.ndarray, " k"],
+    high: Float[np.ndarray, " k"],
+) -> Float[np.ndarray, " k"]:
+    """The x in a box with the least ½ xᵀH x + gᵀx, of H by its eigenvalues (positive) and vectors.
+
+    Where a bound holds one number, the others answer to it.
+    """
+    turned = vectors.T @ gradient
+    free = -vectors @ (turned / values)
+    if np.all((low <= free) & (free <= high)):
+        return free
+    roots = np.sqrt(values)
+    # a box must have some width
+    bounds = (low - 1e-12, high + 1e-12)
+    found = scipy.optimize.lsq_linear(roots[:, None] * vectors.T, -turned / roots, bounds).x
+    return np.clip(found, low, high)

@@ -179,7 +179,6 @@ def fit_forecasts(
     own = [at.index(i) for i in rows]
     entries = [library.entries[i].parameter for i in own]
     low, high = bench.limits(rows)
-    low = np.maximum(low, bench.passive(rows))
     probe = np.array([abs(p.probes[0]) for p in entries])
     arrays = _arrays(w)
     best = theta[at]

@@ -9,7 +9,7 @@ responses is taken, which is again a combination of columns.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.stats
@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 
 from ...models.effects.base import Parameter
 from ...models.effects.library import Library
-from .gram import pooled
+from .gram import least_within, pooled
 
 PRIOR = 50.0
 """Standard deviation of the weak prior on every parameter, in units of its first probe."""
@@ -86,6 +86,21 @@ class Fit:
     def heldout_gain(self) -> float:
         """Nats won on data that the fit has not seen."""
         return float(self.heldout.sum())
+
+
+class Chance(NamedTuple):
+    """What noise alone wins at best: P(more than g nats) = exp((start - g) / scale) where small."""
+
+    start: float
+    scale: float
+
+    def exceeded(self, alpha: float) -> float:
+        """The gain that noise alone exceeds with this probability, of a tenth at most."""
+        return float(max(self.start + self.scale * np.log(1 / min(alpha, 0.1)), 0.0))
+
+    def beyond(self, gain: float) -> float:
+        """The probability that noise alone wins more."""
+        return float(np.exp(min((self.start - gain) / self.scale, 0.0)))
 
 
 def known_within(parameter: Parameter) -> float:
@@ -219,6 +234,33 @@ class Evidence:
             p_value,
         )
 
+    def step(
+        self,
+        parameters: Sequence[int],
+        low: Float[np.ndarray, " k"],
+        high: Float[np.ndarray, " k"],
+        without: int | None = None,
+    ) -> Float[np.ndarray, " k"]:
+        """The changes of θ that fit best between `low` and `high`, perhaps `without` a fold."""
+        T = self.total if without is None else self.total - self.folds[without]
+        place = {i: k for k, i in enumerate(parameters)}
+        curved, linear = self._split([i for i in parameters if self.shows(i)])
+        changes, shift = np.zeros(len(place)), np.eye(1, len(T))[0]
+        if curved is not None:
+            k = place[curved]
+            changes[k] = np.clip(self._combine(T, curved, linear)[1], low[k], high[k])
+            grid, weights = self.curve(curved)
+            if changes[k] != 0:
+                shift = weights[np.argmin(np.abs(grid - changes[k]))]
+        if linear:
+            own, columns = [place[i] for i in linear], [self.column(i) for i in linear]
+            H = T[np.ix_(columns, columns)] + np.diag(self.prior(linear))
+            s = np.sqrt(np.diag(H))
+            values, vectors = np.linalg.eigh(H / np.outer(s, s))
+            values, gradient = np.maximum(values, 1e-12), shift @ T[:, columns] / s
+            changes[own] = least_within(values, vectors, gradient, low[own] * s, high[own] * s) / s
+        return changes
+
     def _tangent(self, curved: int | None, t: float, parameters: list[int]) -> np.ndarray:
         """Weights (k, m) of the derivative of the innovations by each parameter."""
         rows = np.zeros((len(parameters), self.total.shape[0]))
@@ -277,19 +319,18 @@ class Evidence:
         rows, used = np.flatnonzero(tangent.any(axis=0)), np.flatnonzero(weights)
         return self.runs[:, rows[:, None], used] @ weights[used] @ tangent[:, rows].T
 
-    def null_quantile(
+    def chance(
         self,
         hypotheses: Sequence[Sequence[int]],
         nuisance: Sequence[int],
-        alpha: float,
         rng: np.random.Generator,
         draws: int = 400,
-    ) -> float:
-        """The largest held-out gain of any hypothesis that 1 - α of draws of pure noise stay below.
+    ) -> Chance:
+        """The largest held-out gain of any hypothesis in pure noise.
 
         Under the fitted base the innovations are white and their products with the responses of a
         fold are Gaussian with the responses' own products as covariance: no simulation of motion
-        is needed. The tail beyond the draws is exponential.
+        is needed. The largest tenth is taken to be exponential.
         """
         m = self.total.shape[0]
         linear = [
@@ -309,7 +350,7 @@ class Evidence:
             best = np.maximum(best, gain - self._null_gain(noise, total, extra))
         q = np.quantile(best, 0.9)
         mean_excess = np.mean(best[best > q] - q)
-        return float(max(q + mean_excess * np.log(0.1 / alpha), 0.0) if alpha < 0.1 else q)
+        return Chance(float(q + mean_excess * np.log(0.1)), float(mean_excess))
 
     def _null_gain(self, noise: np.ndarray, total: np.ndarray, parameters: list[int]) -> np.ndarray:
         if not parameters:

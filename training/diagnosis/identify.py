@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.optimize
 from jaxtyping import Float
 
 from ...models.effects.base import AXES
 from ...models.effects.library import COEFFICIENTS
+from .gram import least_within
 from .hypotheses import known_within
 from .looking import Bench, Look
 from .noise import Filter
@@ -141,15 +141,8 @@ def identify(
         values, vectors = np.linalg.eigh(H * np.outer(spread, spread) + np.eye(len(rows)))
         values = np.maximum(values, 1.0)
         for _ in range(_TRIES):
-            roots = np.sqrt(values + damping)
-            step = scipy.optimize.lsq_linear(
-                roots[:, None] * vectors.T,
-                -(vectors.T @ gradient) / roots,
-                bounds=(
-                    (low - theta[rows]) / spread - 1e-12,
-                    (high - theta[rows]) / spread + 1e-12,
-                ),
-            ).x
+            within = (low - theta[rows]) / spread, (high - theta[rows]) / spread
+            step = least_within(values + damping, vectors, gradient, *within)
             moved = theta.copy()
             moved[rows] = np.clip(theta[rows] + step * spread, low, high)
             new = loss(moved, common)

@@ -129,17 +129,13 @@ class Bench:
         return replace(self, bounds={**self.bounds, **named})
 
     def limits(self, rows: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Least and largest admissible values."""
+        """Least and largest admissible values; drag stays passive, unless it is believed not to."""
+        rows = list(rows)
         entries = [self.library.entries[i] for i in rows]
         both = [self.bounds.get(_key(e), (e.parameter.low, e.parameter.high)) for e in entries]
-        return np.array([b[0] for b in both]), np.array([b[1] for b in both])
-
-    def passive(self, rows: Sequence[int]) -> Float[np.ndarray, " k"]:
-        """Least values at which the drag of no axis drives it; without a bound for all else."""
-        entries = [self.library.entries[i] for i in rows]
-        return np.array(
-            [-self.believes(e.cause, e.where) if e.cause in _DRAG else -np.inf for e in entries]
-        )
+        least = [-self.believes(e.cause, e.where) if e.cause in _DRAG else -np.inf for e in entries]
+        low = np.maximum([b[0] for b in both], np.minimum(least, self.believed[rows]))
+        return low, np.array([b[1] for b in both])
 
     def moved(self, theta: Float[np.ndarray, " q"], library: Library) -> Float[np.ndarray, " p"]:
         """A θ of another library in this one's order."""
@@ -241,12 +237,11 @@ class Bench:
         """Gauss–Newton on the parameters chosen, with exact predictions at every step.
 
         A step that makes one-step errors clearly larger is halved; so is the way to the start from
-        `origin`, if one is given. Drag stays passive. The fit returned is at the θ returned: its
+        `origin`, if one is given. The fit returned is at the θ returned: its
         errors are joint, clustered by run.
         """
         chosen = list(chosen)
         low, high = self.limits(chosen)
-        low = np.maximum(low, np.minimum(self.passive(chosen), self.believed[chosen]))
         theta = theta.copy()
         theta[chosen] = np.clip(theta[chosen], low, high)
         best: tuple[np.ndarray, Look, Fit] | None = None
@@ -263,8 +258,9 @@ class Bench:
             fit = seen.evidence.fit(chosen)
             best, bar = (theta.copy(), seen, fit), self.loss_of(seen)
             done += 1
-            theta[chosen] = self._stepped(theta, chosen, fit.values, low, high)
-            if np.all(np.abs(fit.values) < 0.15 * fit.errors + 1e-12):
+            step = seen.evidence.step(chosen, low - theta[chosen], high - theta[chosen])
+            theta[chosen] = self._stepped(theta, chosen, step, low, high)
+            if np.all(np.abs(step) < 0.15 * fit.errors + 1e-12):
                 break
         if best is None:
             seen = self.look(back, chosen, kalman)
@@ -329,13 +325,10 @@ class Bench:
         evidence = look.evidence
         if not chosen or len(evidence.folds) < 2:
             return theta
-        columns = [evidence.column(i) for i in chosen]
-        prior = np.diag(evidence.prior(chosen))
-        low, high = self.limits(chosen)
+        low, high = (bound - look.theta[chosen] for bound in self.limits(chosen))
+        low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
         for number, label in enumerate(np.unique(data.fold)):
-            T = evidence.total - evidence.folds[number]
-            change = -np.linalg.solve(T[np.ix_(columns, columns)] + prior, T[columns, 0])
-            values = np.clip(look.theta[chosen] + change, low, high)
+            values = look.theta[chosen] + evidence.step(chosen, low, high, without=number)
             theta[np.ix_(chosen, data.fold == label)] = values[:, None]
         for share in (*(0.5 for _ in range(_HALVINGS)), 1.0):
             wild = np.isin(data.fold, data.fold[self._wild(theta)])

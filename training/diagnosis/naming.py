@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...models.effects.library import Library, kind
-from .hypotheses import Fit
+from .hypotheses import Chance, Fit
 
 Hypothesis = tuple[str, str]
 """(cause, where)"""
@@ -24,12 +24,13 @@ _FEW = 12
 
 @dataclass(frozen=True)
 class Choice:
-    """The name given, what it could as well be, and who came next."""
+    """The name given, what it could as well be, who came next; a p value for all names tried."""
 
     hypothesis: Hypothesis
     fit: Fit
     ties: tuple[Hypothesis, ...]
     rivals: tuple[tuple[Hypothesis, float], ...]
+    p_value: float = 1.0
 
 
 def admissible(library: Library, theta: Float[np.ndarray, " p"], fit: Fit) -> bool:
@@ -77,7 +78,10 @@ def choose(
                 needed = max(needed, ECHO_SHARE * gain)
         if (
             fit.heldout_gain > needed
-            and (fit.p_value * len(fits) < alpha or (_is_clear(fit, threshold) and not strict))
+            and (
+                fit.p_value * len(fits) < alpha
+                or (fit.heldout_gain > _clear(fit) * threshold and not strict)
+            )
             and admissible(library, theta, fit)
         ):
             passing[hypothesis] = fit
@@ -98,8 +102,13 @@ def choose(
     return Choice(top, passing[top], tuple(ties), tuple(rivals))
 
 
-def _is_clear(fit: Fit, threshold: float) -> bool:
-    return fit.heldout_gain > (CLEAR_OF_FEW if len(fit.heldout) < _FEW else CLEAR) * threshold
+def p_value(fit: Fit, tried: int, chance: Chance) -> float:
+    """Of the best of the names tried: the robust one, or that of a clear gain in noise alone."""
+    return min(1.0, fit.p_value * tried, chance.beyond(fit.heldout_gain / _clear(fit)))
+
+
+def _clear(fit: Fit) -> float:
+    return CLEAR_OF_FEW if len(fit.heldout) < _FEW else CLEAR
 
 
 def _is_simpler(a: Hypothesis, b: Hypothesis) -> bool:

@@ -10,10 +10,18 @@ from jaxtyping import Float
 from ...models.effects.library import Library, kind
 from .beside import Beside
 from .disturbance import SLOW, laws_of, won_by
-from .hypotheses import Fit
+from .hypotheses import Chance, Fit
 from .identify import coefficients
 from .looking import Bench, Look
-from .naming import Choice, Hypothesis, admissible, choose, margin, parameters_of
+from .naming import (
+    Choice,
+    Hypothesis,
+    admissible,
+    choose,
+    margin,
+    p_value,
+    parameters_of,
+)
 from .noise import Filter
 from .waves import beside_laws
 
@@ -43,26 +51,28 @@ class Found:
 
     Attributes:
         base, first, current: the belief, the belief refitted, and with the causes.
-        accepted: causes in the order found, with the fit that named them.
+        accepted: causes in the order found.
         fits: every name alone, beside the belief refitted.
         left: every further name beside those accepted.
         dropped: causes that others made needless; they are not tried again.
-        threshold: of held-out nats in the last round.
+        chance: what noise alone wins of held-out nats in the last round.
+        threshold: what it exceeds with the rate of false alarms.
     """
 
     base: Look
     first: Look
     current: Look
-    accepted: list[tuple[Choice, Fit]] = field(default_factory=list)
+    accepted: list[Choice] = field(default_factory=list)
     fits: dict[Hypothesis, Fit] = field(default_factory=dict)
     left: dict[Hypothesis, Fit] = field(default_factory=dict)
     dropped: set[Hypothesis] = field(default_factory=set)
+    chance: Chance = field(default_factory=lambda: Chance(0.0, 1.0))
     threshold: float = 0.0
 
     @property
     def hypotheses(self) -> list[Hypothesis]:
         """The causes named."""
-        return [choice.hypothesis for choice, _ in self.accepted]
+        return [choice.hypothesis for choice in self.accepted]
 
 
 def refitted(bench: Bench, refit: str) -> list[int]:
@@ -113,7 +123,8 @@ class Search:
             if choice is None:
                 break
             choice, theta = self._refine(choice, fits, found)
-            found.accepted.append((choice, choice.fit))
+            p = p_value(choice.fit, len(fits), found.chance)
+            found.accepted.append(replace(choice, p_value=p))
             found.current = self.bench.look(theta)
             self._backward(found)
             taken_back = taken_back + 1 if choice.hypothesis in found.dropped else 0
@@ -205,13 +216,14 @@ class Search:
         beside = self.nuisance + parameters_of(bench.library, taken)
         open_names = [h for h in self.names if h not in taken and h not in found.dropped]
         sets = [bench.library.at(*h) for h in open_names]
-        found.threshold = current.evidence.null_quantile(sets, beside, self.alpha, self.rng)
+        found.chance = current.evidence.chance(sets, beside, self.rng)
+        found.threshold = found.chance.exceeded(self.alpha)
         fits = {h: current.evidence.fit(s, beside) for h, s in zip(open_names, sets, strict=True)}
         for h in [h for h in open_names if h[0] in _TIMES]:
             times = current.theta[list(fits[h].parameters)] + fits[h].values
             if np.all(np.abs(times) < self.shortest):
                 del fits[h]
-        gains = {c.hypothesis[0]: f.heldout_gain for c, f in found.accepted}
+        gains = {c.hypothesis[0]: c.fit.heldout_gain for c in found.accepted}
 
         def best(least: float) -> Choice | None:
             needed = max(found.threshold, least)
@@ -302,7 +314,7 @@ class Search:
         library, current = self.bench.library, found.current
         chosen = parameters_of(library, found.hypotheses)
         kept, theta = [], current.theta.copy()
-        for choice, fit in found.accepted:
+        for choice in found.accepted:
             own = library.at(*choice.hypothesis)
             others = [i for i in chosen if i not in own]
             weight = 0.0
@@ -310,7 +322,7 @@ class Search:
                 errors = current.evidence.fit(own, others).errors
                 weight = float(np.sum((current.theta[own] / np.maximum(errors, 1e-300)) ** 2)) / 2
             if weight > found.threshold:
-                kept.append((choice, fit))
+                kept.append(choice)
             else:
                 found.dropped.add(choice.hypothesis)
                 theta[own] = 0.0

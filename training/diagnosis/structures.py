@@ -26,6 +26,7 @@ from ...models.dynamics import Flow
 from ...models.effects.base import AXES
 from ...models.effects.extended import Extended, times
 from ...models.effects.unknown import MOTION, TWIST, Unknown, powers
+from .hypotheses import Chance
 from .looking import Bench, Look
 from .responses import through
 
@@ -71,12 +72,16 @@ class Group:
 
 @dataclass(frozen=True)
 class Matched:
-    """A group's gain: nats by run while its fold is left out, and the node that is best."""
+    """A group's gain: nats by run while its fold is left out, and the node that is best.
+
+    Noise alone wins `threshold` with the probability asked for, and as much as this with `p_value`.
+    """
 
     group: Group
     heldout: Float[np.ndarray, " runs"]
     node: int
     threshold: float
+    p_value: float = 1.0
 
     @property
     def gain(self) -> float:
@@ -219,10 +224,13 @@ class Screen:
         # self-normalised: runs that excite much win much, whatever is there
         spread = np.sqrt(np.sum(heldout**2))
         clear = min(CLEAR, 0.8 * np.sqrt(len(heldout)))
-        threshold = np.inf if draws else 0.0
-        if draws and heldout.sum() > max(_LEAST, clear * spread):
-            threshold = self._null(folds, free, group, size, alpha, rng, draws)
-        return Matched(group, heldout, node, threshold)
+        if not draws:
+            return Matched(group, heldout, node, 0.0)
+        if heldout.sum() <= max(_LEAST, clear * spread):
+            return Matched(group, heldout, node, np.inf)
+        chance = self._null(folds, free, group, size, rng, draws)
+        beyond = chance.beyond(float(heldout.sum()))
+        return Matched(group, heldout, node, chance.exceeded(alpha), beyond)
 
     def sparse(self, group: Group, most: int = 4) -> tuple[float, ...]:
         """The few columns that orthogonal matching takes first (Pati et al. 1993)."""
@@ -286,9 +294,9 @@ class Screen:
         return gains, picks
 
     def _null(
-        self, folds: np.ndarray, free: int, group: Group, size: np.ndarray, alpha: float,
+        self, folds: np.ndarray, free: int, group: Group, size: np.ndarray,
         rng: np.random.Generator, draws: int,
-    ) -> float:  # fmt: skip
+    ) -> Chance:  # fmt: skip
         """What white innovations win: mean and spread over draws, and a Gumbel tail."""
         gains = []
         roots = []
@@ -303,7 +311,7 @@ class Screen:
             gains.append(self._held_out(drawn, free, group, size)[0].sum())
         gains = np.array(gains)
         scale = max(float(gains.std()), 1.0)
-        return float(max(gains.mean(), 0.0) + scale * np.log(1 / alpha))
+        return Chance(max(float(gains.mean()), 0.0), scale)
 
 
 @eqx.filter_jit

@@ -42,11 +42,9 @@ def values_of(
 
 def cause(
     choice: Choice,
-    fit: Fit,
     bench: Bench,
     look: Look,
     joint: Fit,
-    tested: int,
     structure: result.Structure | None = None,
 ) -> result.Cause:
     """A named cause; `joint` is the fit of all accepted parameters together."""
@@ -57,7 +55,7 @@ def cause(
         name=name,
         where=where,
         parameters=values_of(bench, look.theta, bench.library.at(name, where), joint),
-        evidence=result.Support(min(1.0, fit.p_value * tested), fit.heldout_gain),
+        evidence=result.Support(choice.p_value, choice.fit.heldout_gain),
         rivals=rivals,
         indistinguishable_from=list(dict.fromkeys(h[0] for h in choice.ties if h[0] != name)),
         next_experiment=next_experiment(name, kind(name).family, others),

@@ -1,9 +1,8 @@
 """When to say `unknown`: structure that no name, nor all names together, explain as well."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Float
 
 from . import result
@@ -56,7 +55,11 @@ def screened(
         m = screen.match(group, alpha / len(tried), rng)
         if m.gain > m.threshold and (best is None or m.gain > best.gain):
             best = m
-    return None if best is None else (screen, best, best.gain * share)
+    if best is None:
+        return None
+    # of as many as were tried
+    best = replace(best, p_value=min(1.0, best.p_value * len(tried)))
+    return screen, best, best.gain * share
 
 
 def _best_name(bench: Bench, look: Look, fits: dict) -> float:
@@ -111,13 +114,10 @@ def accept(
     rows = [*own, *parameters_of(wider.library, found.hypotheses), *free]
     theta, _, joint = wider.polish(theta, rows, rounds=6)
     heldout = seen.matched.heldout * seen.gain / max(seen.matched.gain, 1e-300)
-    t = heldout.sum() / max(float(np.sqrt(np.sum(heldout**2))), 1e-300)
-    fit = Fit(
-        tuple(own), theta[own], {}, joint.errors[: len(own)], seen.gain, heldout,
-        float(scipy.stats.norm.sf(t)),
-    )  # fmt: skip
+    p = seen.matched.p_value
+    fit = Fit(tuple(own), theta[own], {}, joint.errors[: len(own)], seen.gain, heldout, p)
     ranked = tuple((h, f.heldout_gain) for h, f in rivals)
-    found.accepted.append((Choice(hypothesis, fit, (), ranked), fit))
+    found.accepted.append(Choice(hypothesis, fit, (), ranked, p))
     found.current = wider.look(theta)
     return wider
 

@@ -66,6 +66,42 @@ class Judged(NamedTuple):
     count: Float[np.ndarray, "h F"]
 
 
+class Scores(NamedTuple):
+    """Of each piece, by noise estimated without it.
+
+    Attributes:
+        density: log density of the innovations (nats) (R,).
+        record, diffusion: noise of the records, and of the disturbance (12, R), (6, R).
+    """
+
+    density: Float[np.ndarray, " R"]
+    record: Float[np.ndarray, "12 R"]
+    diffusion: Float[np.ndarray, "6 R"]
+
+
+def scores(bench: Bench, contender: Contender, estimated: bool) -> Scores:
+    """How well a model predicts each piece, fitted without it, over one step."""
+    data, theta = bench.data, contender.theta
+    p = predict(bench.model, bench.library, theta, data)
+    error, jacobian = np.asarray(p.error), np.asarray(p.jacobian)
+    if contender.box is not None:
+        h = data.step[:, None]
+        a = np.asarray(contender.box.acceleration(*arguments(data))).swapaxes(0, 1) * h
+        error = error - np.concatenate([a * h / 2, a], axis=1)
+    mass = bench.mass(theta.mean(axis=1))
+    density = np.zeros(len(data.fold))
+    record, diffusion = np.zeros((12, len(density))), np.zeros((6, len(density)))
+    for label in np.unique(data.fold):
+        own = data.fold == label
+        rest = data.weight * (~own if not own.all() else 1)
+        steps = Transition.along(jacobian, rest)
+        noise = estimate(error, rest, steps, mass, data.dt, estimated=estimated)
+        record[:, own], diffusion[:, own] = noise.record[:, None], noise.diffusion[:, None]
+        given = np.linalg.inv(mass), data.dt, data.step[:, own], data.weight[:, own]
+        density[own] = score_of(error[:, :, own], jacobian[..., own], noise, steps, *given)
+    return Scores(density, record, diffusion)
+
+
 def judge(
     bench: Bench,
     contender: Contender,
@@ -81,28 +117,12 @@ def judge(
     `estimated` is one answer for all folds and contenders.
     """
     data, theta = bench.data, contender.theta
-    p = predict(bench.model, bench.library, theta, data)
-    error, jacobian = np.asarray(p.error), np.asarray(p.jacobian)
-    if contender.box is not None:
-        h = data.step[:, None]
-        a = np.asarray(contender.box.acceleration(*arguments(data))).swapaxes(0, 1) * h
-        error = error - np.concatenate([a * h / 2, a], axis=1)
-    mass = bench.mass(theta.mean(axis=1))
-    score = np.zeros(len(data.fold))
-    record, diffusion = np.zeros((12, len(score))), np.zeros((6, len(score)))
-    for label in np.unique(data.fold):
-        own = data.fold == label
-        rest = data.weight * (~own if not own.all() else 1)
-        steps = Transition.along(jacobian, rest)
-        noise = estimate(error, rest, steps, mass, data.dt, estimated=estimated)
-        record[:, own], diffusion[:, own] = noise.record[:, None], noise.diffusion[:, None]
-        given = np.linalg.inv(mass), data.dt, data.step[:, own], data.weight[:, own]
-        score[own] = score_of(error[:, :, own], jacobian[..., own], noise, steps, *given)
+    density, record, diffusion = scores(bench, contender, estimated)
     kept = _spread(data.fold, _PIECES)
     levels = record[:, kept], diffusion[:, kept] * contender.white[:, None]
     kinds = {bench.library.entries[i][:2] for i in in_use}
     kinds |= {bench.library.entries[i][:2] for i in np.flatnonzero(np.any(theta != 0, axis=1))}
-    return _simulated(bench, contender, levels, kept, horizon, seed, score + contender.won, kinds)
+    return _simulated(bench, contender, levels, kept, horizon, seed, density + contender.won, kinds)
 
 
 def white_part(laws: Sequence[Law], bench: Bench) -> Float[np.ndarray, "6"]:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from ...models.effects.library import Library, kind
 from .beside import Beside
 from .disturbance import SLOW, laws_of, won_by
+from .gain import Contender, scores
 from .hypotheses import Chance, Fit
 from .identify import coefficients
 from .looking import Bench, Look
@@ -124,9 +125,14 @@ class Search:
                 break
             choice, theta = self._refine(choice, fits, found)
             p = p_value(choice.fit, len(fits), found.chance)
-            found.accepted.append(replace(choice, p_value=p))
-            found.current = self.bench.look(theta)
-            self._backward(found)
+            seen = self.bench.look(theta)
+            doubtful = choice.fit.p_value * len(fits) >= self.alpha
+            if doubtful and not self._holds(seen, choice.hypothesis, found):
+                found.dropped.add(choice.hypothesis)
+            else:
+                found.accepted.append(replace(choice, p_value=p))
+                found.current = seen
+                self._backward(found)
             taken_back = taken_back + 1 if choice.hypothesis in found.dropped else 0
             if taken_back == _TAKEN_BACK:
                 break
@@ -262,6 +268,20 @@ class Search:
         chosen = sorted({*parameters_of(library, names), *beside})
         seen = self.bench.look(current.theta, chosen, again=current)
         return {h: seen.evidence.fit(library.at(*h), beside) for h in names}
+
+    def _holds(self, seen: Look, named: Hypothesis, found: Found) -> bool:
+        """Whether a name predicts data left out of its fit better, by exact predictions.
+
+        Where few runs show it, what their responses promise may not be had: they bend.
+        """
+        bench, names = self.bench, found.hypotheses
+        rows = self.nuisance + parameters_of(bench.library, names)
+        own = parameters_of(bench.library, [named])
+        before, after = (
+            scores(bench, Contender(bench.without_each(look, used)), found.first.noise.estimated)
+            for look, used in ((found.current, rows), (seen, [*rows, *own]))
+        )
+        return bool(after.density.sum() > before.density.sum())
 
     def _start(self, fit: Fit, theta: np.ndarray) -> np.ndarray:
         moved = theta.copy()

@@ -125,7 +125,7 @@ def test_noise_is_found_and_innovations_are_white_on_a_null(null):
         assert np.abs(z.mean(axis=(0, 2)) * n).max() < 4.5
         acf = (z[1:] * z[:-1]).mean(axis=(0, 2)) / (z**2).mean(axis=(0, 2))
         assert np.abs(acf).max() * n < 6
-        assert diagnoser.data.steps == 20 * 120
+        assert diagnoser.data.steps == 20 * 110  # half a second is what thrusters remember
 
 
 def test_responses_of_instruments_are_derivatives_of_the_innovations(null):
@@ -362,8 +362,8 @@ def test_predictions_without_noise_have_no_error():
     X = np.concatenate([X0[None], np.asarray(X)[fine - 1 :: fine]])
     V = np.concatenate([np.zeros((1, 6, R)), np.asarray(V)[fine - 1 :: fine]])
     data = Data(
-        X, V, u, np.ones((N, R)), np.full((N, R), 0.05), np.ones((N, R)), np.zeros(R, int),
-        np.arange(R), ("one",), 0.05, "thruster_force", True,
+        X, V, u, u[:1], np.full((1, R), 0.05), np.ones((N, R)), np.full((N, R), 0.05),
+        np.ones((N, R)), np.zeros(R, int), np.arange(R), ("one",), 0.05, "thruster_force", True,
     )  # fmt: skip
     library = Library([KINDS["net_buoyancy"].neutral()])
     p = predict(model, library, np.zeros(library.size), data)
@@ -396,8 +396,9 @@ def test_steps_of_any_length_are_predicted_with_what_thrusters_remember():
     at = np.concatenate([np.zeros((1, R), int), np.cumsum(counts, axis=0)])
     X, V = (np.stack([a[at[:, r], :, r] for r in range(R)], axis=-1) for a in (X, V))
     data = Data(
-        X, V, level, np.ones((N, R)), fine * counts, np.ones((N, R)), np.zeros(R, int),
-        np.arange(R), ("one",), float(fine * counts.mean()), "thruster_force", True,
+        X, V, level, level[:1], fine * counts[:1], np.ones((N, R)), fine * counts, np.ones((N, R)),
+        np.zeros(R, int), np.arange(R), ("one",), float(fine * counts.mean()), "thruster_force",
+        True,
     )  # fmt: skip
     library = Library([KINDS["actuation_delay"].neutral(), KINDS["thruster_lag"].neutral()])
     theta = np.zeros(library.size)

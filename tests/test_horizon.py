@@ -96,7 +96,8 @@ def test_windows_are_records_and_their_commands():
     assert w.X.shape[:2] == (M + 1, 7)
     assert (w.scenario == 0).sum() == 2 * ((length - M) // 5 + 1)
     np.testing.assert_array_equal(w.X[..., 1], data.X[5 : 5 + M + 1, :, 0])
-    np.testing.assert_array_equal(w.before[:, 1], data.u[4, :, 0])
+    np.testing.assert_array_equal(w.past[-1, :, 1], data.u[4, :, 0])
+    np.testing.assert_array_equal(w.past[:-5, :, 1], data.past[5:, :, 0])
     errors = forecast_errors(bench, bench.believed, w)
     assert np.abs(errors).max() < 1e-9  # the truth forecasts itself
 

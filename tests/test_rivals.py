@@ -35,9 +35,9 @@ def drawn(runs=6, steps=200, dt=0.05, seed=1):
     X[:, 4:] = smooth(3)
     levels = np.repeat(rng.normal(0, 8, (-(-steps // 10), 8, runs)), 10, axis=0)[:steps]
     return Data(
-        X, smooth(6), levels, np.ones((steps, runs)), np.full((steps, runs), dt),
-        np.ones((steps, runs)), np.arange(runs), np.arange(runs), tuple("abcdef"[:runs]), dt,
-        "thruster_force", False,
+        X, smooth(6), levels, levels[:1], np.full((1, runs), dt), np.ones((steps, runs)),
+        np.full((steps, runs), dt), np.ones((steps, runs)), np.arange(runs), np.arange(runs),
+        tuple("abcdef"[:runs]), dt, "thruster_force", False,
     )  # fmt: skip
 
 

@@ -62,7 +62,7 @@ def inputs(
 def arguments(data: Data) -> tuple[Array, Array, Array, Array]:
     """Poses, twists, commands and the commands a step before, at every step: (·, N, R)."""
     u = data.u.swapaxes(0, 1)
-    before = np.concatenate([u[:, :1], u[:, :-1]], axis=1)
+    before = np.concatenate([data.past[-1][:, None], u[:, :-1]], axis=1)
     X, V = data.X[:-1].swapaxes(0, 1), data.V[:-1].swapaxes(0, 1)
     return jnp.asarray(X), jnp.asarray(V), jnp.asarray(u), jnp.asarray(before)
 

@@ -17,6 +17,8 @@ SEGMENT = 256
 """Longest piece (samples) that a run is cut into; pieces are filtered side by side."""
 _BLOCKS, _LEAST = 8, 16
 """Pieces that a single run is cut into at least, and samples of a piece at least."""
+_BEFORE, _OF_A_RUN = 0.5, 0.1
+"""Time (s) before a piece whose commands its actuators may remember; share of a run at most."""
 _MOST_FOLDS = 10
 _FEW_RUNS = 6
 _EVEN = 1e-6
@@ -36,6 +38,8 @@ class Data:
         X: recorded poses (N + 1, 7, R).
         V: recorded twists (N + 1, 6, R).
         u: commanded thruster forces (N), held from n to n + 1 (N, 8, R).
+        past: those of the steps before (N), oldest first (P, 8, R): what actuators remember.
+        past_step: how long each of these was held (s) (P, R).
         voltage: relative to the vehicle's nominal one (N, R).
         step: from sample n to n + 1 (s) (N, R).
         weight: 1 for steps that exist, else 0 (N, R).
@@ -50,6 +54,8 @@ class Data:
     X: Float[np.ndarray, "M 7 R"]
     V: Float[np.ndarray, "M 6 R"]
     u: Float[np.ndarray, "N n R"]
+    past: Float[np.ndarray, "P n R"]
+    past_step: Float[np.ndarray, "P R"]
     voltage: Float[np.ndarray, "N R"]
     step: Float[np.ndarray, "N R"]
     weight: Float[np.ndarray, "N R"]
@@ -95,6 +101,12 @@ class Data:
         """Steps of some pieces (s), as one column where all are equal."""
         return self.step[:, :1] if self.even else self.step[:, pieces]
 
+    def past_steps(
+        self, pieces: Int[np.ndarray, " K"] | slice = slice(None)
+    ) -> Float[np.ndarray, "P _"]:
+        """Likewise of the steps before."""
+        return self.past_step[:, :1] if self.even else self.past_step[:, pieces]
+
     @property
     def longest(self) -> float:
         """The longest step (s)."""
@@ -118,7 +130,8 @@ def make_data(
 
     Thruster forces are taken as they are; PWM goes through the vehicle's curve at the recorded
     voltage; a wrench is split over the thrusters with the least effort. Runs `without` (by number,
-    scenario by scenario) are left out, unless none would remain.
+    scenario by scenario) are left out, unless none would remain. What thrusters did before a run is
+    not known: its first half second (a tenth of it at most) is only what they remember.
 
     Raises:
         UserError: a channel of pose or twist is missing, or no run has two samples.
@@ -131,13 +144,15 @@ def make_data(
     name = next(c for c in ("thruster_force", "pwm", "F_Bo_B") if c in recording.commands)
     nominal = float(thrusters.nominal_voltage)
     lengths = recording.lengths
-    pieces: dict[str, list[Any]] = {"X": [], "V": [], "u": [], "voltage": [], "step": []}
+    names = ("X", "V", "u", "past", "past_step", "voltage", "step")
+    pieces: dict[str, list[Any]] = {name: [] for name in names}
     scenario, run, sizes = [], [], []
     has_voltage = "voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any())
     kept = lengths >= 3
     for number, at in enumerate(np.argwhere(lengths > 0)):
         kept[tuple(at)] &= number not in without
     kept = kept if kept.any() else lengths >= 3
+    behind = max(1, round(_BEFORE / recording.dt))
     if kept.sum() == 1:
         segment = min(segment, max(int(lengths.max()) // _BLOCKS, _LEAST))
     for number, (j, k) in enumerate(np.argwhere(kept).tolist()):
@@ -153,14 +168,19 @@ def make_data(
             measured = data["voltage"].to_numpy()[j, k, :length]
             volts = np.where(np.isfinite(measured), measured, nominal)
         u = _forces(values["command"], name, thrusters, volts)
-        count = -(-(length - 1) // segment)
-        edges = np.linspace(0, length - 1, count + 1).round().astype(int)
+        held = np.diff(times)
+        first = min(behind, int(_OF_A_RUN * (length - 1)))
+        count = -(-(length - 1 - first) // segment)
+        edges = np.linspace(first, length - 1, count + 1).round().astype(int)
         for a, b in itertools.pairwise(edges):
+            before = np.maximum(np.arange(a - behind, a), 0)
+            pieces["past"].append(u[before])
+            pieces["past_step"].append(held[before])
             pieces["X"].append(values["X"][a : b + 1])
             pieces["V"].append(values["V"][a : b + 1])
             pieces["u"].append(u[a:b])
             pieces["voltage"].append(volts[a:b] / nominal)
-            pieces["step"].append(times[a + 1 : b + 1] - times[a:b])
+            pieces["step"].append(held[a:b])
             sizes.append(b - a)
             scenario.append(j)
             run.append(number)
@@ -174,6 +194,8 @@ def make_data(
         X=_stack(pieces["X"], N + 1),
         V=_stack(pieces["V"], N + 1),
         u=_stack(pieces["u"], N),
+        past=np.stack(pieces["past"], axis=-1),
+        past_step=np.stack(pieces["past_step"], axis=-1),
         voltage=_stack(pieces["voltage"], N),
         step=step if recording.uneven else np.full(weight.shape, mean),
         weight=weight,

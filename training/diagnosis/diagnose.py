@@ -269,7 +269,7 @@ class Diagnoser:
             bench = search.run(found).bench
         for number in range(_MOST_UNKNOWN):
             self.progress(0.52 + 0.1 * number, "structure without a name")
-            seen = seek(bench, nuisance, found, config.alpha, self.rng)
+            seen = seek(bench, nuisance, found, config.alpha, self.rng, self.quiet)
             taken = {h[1] for h in found.hypotheses if h[0] == "unknown"}
             if seen is None or seen.matched.group.effect.acts_on in taken:
                 if number == 0 and not found.accepted:

@@ -29,7 +29,7 @@ class Learned(Protocol):
 def _forecast(
     model: Extended, arrays: Arrays, every: int, count: int, rest: Learned | None
 ) -> tuple[Array, Array]:
-    X, V, u, voltage, step = arrays
+    X, V, u, voltage, step, past, past_step = arrays
     inertia = model.inertia()
 
     def body(carry: Any, given: Any) -> Any:
@@ -47,8 +47,8 @@ def _forecast(
         )
         return (memory, x, v, a), model.observe(x, v, a)
 
-    start = (settle(model, u[0], step[:1], count), X[0], V[0], first_rate(V, step))
-    before = jnp.concatenate([u[:1], u[:-1]])
+    start = (settle(model, past, past_step[:, None]), X[0], V[0], first_rate(V, step))
+    before = jnp.concatenate([past[-1:], u[:-1]])
     xs = (jnp.arange(len(u)), X[:-1], V[:-1], u, before, voltage, step)
     return jax.lax.scan(body, start, xs)[1]
 

@@ -166,9 +166,10 @@ def _simulated(
     kinds: set[tuple[str, str]],
 ) -> Judged:
     data = bench.data
-    X, V, u, voltage, _ = as_arrays(data)
-    step = jnp.asarray(data.own_steps(kept))
-    arrays = X[..., kept], V[..., kept], u[..., kept], voltage[..., kept], step
+    X, V, u, voltage, _, past, _ = as_arrays(data)
+    step, past_step = jnp.asarray(data.own_steps(kept)), jnp.asarray(data.past_steps(kept))
+    now = X[..., kept], V[..., kept], u[..., kept], voltage[..., kept], step
+    arrays = *now, past[..., kept], past_step
     theta = contender.theta[:, kept]
     every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))
     effects = bench.library.filled(theta[:, None])
@@ -232,7 +233,7 @@ def _errors(
     coarse: int,
 ) -> Float[Array, "N 12 S R"]:
     """Recorded less simulated: lane 0 without noise, the others with it and that of the records."""
-    X, V, u, voltage, step = arrays
+    X, V, u, voltage, step, past, past_step = arrays
     model = model.with_effects(effects)
     random = model.with_effects(stirring)
     inertia = model.inertia()
@@ -285,10 +286,10 @@ def _errors(
 
     zero = jnp.zeros((1, S, R), V.dtype)
     rate = first_rate(V, step)[:, None] + zero
-    memory = settle(model, u[0][:, None] + zero, step[:1, None], coarse)
+    memory = settle(model, past[:, :, None] + zero[None], past_step[:, None, None])
     pushes = random.carried(u[0][:, None] + zero)[1]
     start = (memory, pushes, X[0][:, None] + zero, V[0][:, None] + zero, rate)
-    before = jnp.concatenate([u[:1], u[:-1]])
+    before = jnp.concatenate([past[-1:], u[:-1]])
     xs = (jnp.arange(len(u)), X[:-1], V[:-1], X[1:], V[1:], u, before, voltage, step)
     return jax.lax.scan(body, start, xs)[1]
 

@@ -42,7 +42,8 @@ class Windows:
     Attributes:
         X, V: records 0 … M (M + 1, 7, K), (M + 1, 6, K).
         u: thruster forces (M, n, K).
-        before: commands of the step before (n, K), for what remembers.
+        past: commands of the steps before, oldest first (P, n, K), for what remembers.
+        past_step: how long each was held (s) (P, K).
         voltage: relative (M, K).
         step: from record k to k + 1 (s) (M, K).
         block: which windows depend on each other (K,): those of one stretch of time.
@@ -52,7 +53,8 @@ class Windows:
     X: Float[np.ndarray, "M1 7 K"]
     V: Float[np.ndarray, "M1 6 K"]
     u: Float[np.ndarray, "M n K"]
-    before: Float[np.ndarray, "n K"]
+    past: Float[np.ndarray, "P n K"]
+    past_step: Float[np.ndarray, "P K"]
     voltage: Float[np.ndarray, "M K"]
     step: Float[np.ndarray, "M K"]
     block: Int[np.ndarray, " K"]
@@ -78,16 +80,19 @@ def windows(data: Data, horizon: float, every: float, block: float = 10.0) -> Wi
     """Windows of `horizon` s that start `every` s; those within `block` s hang together."""
     M, step = max(1, round(horizon / data.dt)), max(1, round(every / data.dt))
     parts: dict[str, list[np.ndarray]] = {
-        k: [] for k in ("X", "V", "u", "before", "voltage", "step")
+        k: [] for k in ("X", "V", "u", "past", "past_step", "voltage", "step")
     }
     blocks, scenarios = [], []
     for r in range(len(data.run)):
-        length = int(data.weight[:, r].sum())
+        length, behind = int(data.weight[:, r].sum()), len(data.past)
+        u = np.concatenate([data.past[..., r], data.u[..., r]])
+        held = np.concatenate([data.past_step[:, r], data.step[:, r]])
         for n in range(0, length - M + 1, step):
             parts["X"].append(data.X[n : n + M + 1, :, r])
             parts["V"].append(data.V[n : n + M + 1, :, r])
             parts["u"].append(data.u[n : n + M, :, r])
-            parts["before"].append(data.u[max(n - 1, 0), :, r])
+            parts["past"].append(u[n : n + behind])
+            parts["past_step"].append(held[n : n + behind])
             parts["voltage"].append(data.voltage[n : n + M, r])
             parts["step"].append(data.step[n : n + M, r])
             blocks.append((r, int(n * data.dt / block)))
@@ -98,7 +103,7 @@ def windows(data: Data, horizon: float, every: float, block: float = 10.0) -> Wi
 
 
 def _errors(model: Extended, arrays: tuple, count: int) -> Float[Array, "M 12 K"]:
-    X, V, u, before, voltage, step = arrays
+    X, V, u, past, past_step, voltage, step = arrays
     inertia = model.inertia()
 
     def body(carry: Any, given: Any) -> Any:
@@ -111,7 +116,7 @@ def _errors(model: Extended, arrays: tuple, count: int) -> Float[Array, "M 12 K"
         return (memory, x, v), jnp.concatenate([se3.local(X1, seen_X), seen_V - V1])
 
     start = (
-        settle(model, before, step[:1], count),
+        settle(model, past, past_step[:, None]),
         *model.infer(X[0], V[0], first_rate(V, step)),
     )
     return jax.lax.scan(body, start, (X[1:], V[1:], u, voltage, step))[1]
@@ -136,7 +141,7 @@ def _slopes(
 
 
 def _arrays(w: Windows) -> tuple:
-    return tuple(jnp.asarray(a) for a in (w.X, w.V, w.u, w.before, w.voltage, w.step))
+    return tuple(jnp.asarray(a) for a in (w.X, w.V, w.u, w.past, w.past_step, w.voltage, w.step))
 
 
 def small(bench: Bench, rows: Sequence[int], theta: np.ndarray) -> tuple[Library, list[int]]:

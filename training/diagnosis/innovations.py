@@ -24,13 +24,14 @@ def substeps(longest: float) -> int:
     return max(SUBSTEPS, math.ceil(longest / LONGEST - 1e-6))
 
 
-Arrays = tuple[Array, Array, Array, Array, Array]
-"""Poses, twists, commands, voltages and steps of `Data`."""
+Arrays = tuple[Array, Array, Array, Array, Array, Array, Array]
+"""Poses, twists, commands, voltages and steps of `Data`, commands and steps before them."""
 
 
 def as_arrays(data: Data) -> Arrays:
     """The arrays that compiled programs take; equal steps as one column, (N, 1)."""
-    arrays = (data.X, data.V, data.u, data.voltage, data.own_steps())
+    now = (data.X, data.V, data.u, data.voltage, data.own_steps())
+    arrays = (*now, data.past, data.past_steps())
     return tuple(jnp.asarray(a) for a in arrays)  # pyright: ignore[reportReturnType]
 
 
@@ -62,11 +63,18 @@ def difference(
     return jnp.concatenate(jnp.broadcast_arrays(se3.local(X, X2), V2 - V))
 
 
-def settle(model: Extended, command: Array, dt: Array, substeps: int) -> Memory:
-    """Initial memories broadcast to what a step makes of them."""
-    memory = model.remember(command)
-    after = jax.eval_shape(lambda m: model.actuate(m, command, dt, substeps)[0], memory)
-    return tuple(jnp.broadcast_to(m, s.shape) for m, s in zip(memory, after, strict=True))
+def settle(model: Extended, past: Float[Array, "P n *batch"], step: Array) -> Memory:
+    """Memories of commands, each held for a `step` (s), the first for ever before."""
+    memory = model.remember(past[0])
+    if not memory:
+        return ()
+
+    def after(memory: Memory, given: tuple[Array, Array]) -> tuple[Memory, None]:
+        return model.actuate(memory, *given, 1)[0], None
+
+    shapes = jax.eval_shape(lambda m: after(m, (past[0], step[0]))[0], memory)
+    memory = tuple(jnp.broadcast_to(m, s.shape) for m, s in zip(memory, shapes, strict=True))
+    return jax.lax.scan(after, memory, (past, step))[0]
 
 
 def first_rate(V: Float[Array, "M 6 R"], step: Float[Array, "N #R"]) -> Float[Array, "12 R"]:
@@ -77,7 +85,7 @@ def first_rate(V: Float[Array, "M 6 R"], step: Float[Array, "N #R"]) -> Float[Ar
 
 @eqx.filter_jit
 def _predict(model: Extended, effects: Any, arrays: Arrays, count: int) -> Predictions:
-    X, V, u, voltage, step = arrays
+    X, V, u, voltage, step, past, past_step = arrays
     model = model.with_effects(effects)
     inertia = model.inertia()
     plain = model.with_effects(())
@@ -95,7 +103,7 @@ def _predict(model: Extended, effects: Any, arrays: Arrays, count: int) -> Predi
         jacobian = _jacobian(plain, rest, x, (v + Vp) / 2, command, h)
         return (memory, a), Predictions(error, Xp, Vp, jacobian, a, (x, v))
 
-    start = settle(model, u[0], step[:1], count), first_rate(V, step)
+    start = settle(model, past, past_step[:, None]), first_rate(V, step)
     return jax.lax.scan(body, start, (X[:-1], V[:-1], X[1:], V[1:], u, voltage, step))[1]
 
 

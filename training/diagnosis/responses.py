@@ -45,7 +45,7 @@ def _respond(
     model = model.with_effects(effects)
     if not instruments:
         model, predictions, arrays, filters = _single((model, predictions, arrays, filters))
-    (X, V, u, voltage, step), (keep, whiten, weight) = arrays, filters
+    (X, V, u, voltage, step, past, past_step), (keep, whiten, weight) = arrays, filters
     inertia = model.inertia()
 
     def body(carry: Any, given: Any) -> Any:
@@ -75,7 +75,7 @@ def _respond(
         return (memory, nu, p.rate), through(white, nu) * exists[None, None]
 
     zero = jnp.zeros((12, lanes, V.shape[2]), V.dtype)
-    memory = () if instruments else settle(model, u[0][:, None], step[:1, None], 1)
+    memory = () if instruments else settle(model, past[:, :, None], past_step[:, None, None])
     start = (memory, zero, first_rate(V, step))
     xs = (predictions, X[:-1], V[:-1], u, voltage, step, keep, whiten, weight)
     z = jax.lax.scan(body, start, xs)[1].astype(jnp.float32)

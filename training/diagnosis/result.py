@@ -150,7 +150,7 @@ class Ratio:
 
 @dataclass(frozen=True)
 class DataSummary:
-    """What was there, what was missing, what could not be told."""
+    """What was there (`seconds` that are predicted), what was missing, what could not be told."""
 
     scenarios: list[str]
     runs: int

@@ -331,15 +331,17 @@ def _of_water(model: Extended, X: Array, V: Array, u: Array) -> Float[Array, "6 
 # ------------------------------------------------------------------------------- the groups
 
 
-def groups(bench: Bench, look: Look) -> Iterator[Group]:
-    """Everything that is tried."""
+def groups(bench: Bench, look: Look, quiet: Sequence[str] = ()) -> Iterator[Group]:
+    """Everything that is tried; what axes that are `quiet` do with their motion can't be told."""
     d = bench.data
     nodes = [(time, f) for time, frequencies in NODES.items() for f in frequencies]
+    moving = [i for i, axis in enumerate(AXES) if axis not in quiet]
     for i in _correlated(look):
-        for j in range(6):
-            if j != i:
+        for j in moving:
+            if j != i and i in moving:
                 yield _memory(bench, i, j, nodes)
-    for i, axis in enumerate(AXES):
+    for i in moving:
+        axis = AXES[i]
         yield _memory(bench, i, i, nodes)
         yield _of_state(bench, Unknown.neutral(kind="motion", acts_on=axis, numbers=_ALL_MOTION))
         yield _of_state(bench, Unknown.neutral(kind="pose", acts_on=axis))

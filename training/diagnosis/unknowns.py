@@ -1,5 +1,6 @@
 """When to say `unknown`: structure that no name, nor all names together, explain as well."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,12 +45,17 @@ def responses_of(bench: Bench, look: Look, rows: list[int]) -> Float[np.ndarray,
 
 
 def screened(
-    bench: Bench, look: Look, rows: list[int], alpha: float, rng: np.random.Generator
+    bench: Bench,
+    look: Look,
+    rows: list[int],
+    alpha: float,
+    rng: np.random.Generator,
+    quiet: Sequence[str] = (),
 ) -> tuple[Screen, Matched, float] | None:
     """The structure that wins most beside `rows`, of those that noise alone can't make."""
     screen = Screen(bench, look, responses_of(bench, look, rows))
     share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
-    tried = list(groups(bench, look))
+    tried = list(groups(bench, look, quiet))
     best: Matched | None = None
     for group in tried:
         m = screen.match(group, alpha / len(tried), rng)
@@ -68,17 +74,22 @@ def _best_name(bench: Bench, look: Look, fits: dict) -> float:
 
 
 def seek(
-    bench: Bench, nuisance: list[int], found: Found, alpha: float, rng: np.random.Generator
+    bench: Bench,
+    nuisance: list[int],
+    found: Found,
+    alpha: float,
+    rng: np.random.Generator,
+    quiet: Sequence[str] = (),
 ) -> Seen | None:
     """Structure in what the names leave; where it wins more than they do, in place of them.
 
     In the second case `found` is set back to the belief without names. Of estimated states none is
-    sought: what their estimator does has structure of its own.
+    sought: what their estimator does has structure of its own; nor in how `quiet` axes move.
     """
     if found.current.noise.estimated:
         return None
     rows = [*parameters_of(bench.library, found.hypotheses), *nuisance]
-    left = screened(bench, found.current, rows, alpha, rng)
+    left = screened(bench, found.current, rows, alpha, rng, quiet)
     if left is None:
         return None
     screen, best, gain = left
@@ -88,7 +99,7 @@ def seek(
         return None
     known = [h for h in found.hypotheses if h[0] != "unknown"]
     if known and len(known) == len(found.hypotheses):
-        at_first = screened(bench, found.first, nuisance, alpha, rng)
+        at_first = screened(bench, found.first, nuisance, alpha, rng, quiet)
         evidence = found.first.evidence
         owned = set(evidence.design.owner.tolist())
         own = [i for i in parameters_of(bench.library, known) if i in owned]

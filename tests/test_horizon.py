@@ -89,6 +89,16 @@ def test_drag_stays_passive_and_left_out_windows_are_not_used():
     np.testing.assert_array_equal(again.theta, fit.theta)
 
 
+def test_what_thrusters_did_before_a_run_shows_in_no_piece():
+    """A run that begins as commands step: thrusters follow what was commanded before it."""
+    bench = Bench.of(recording((KINDS["thruster_lag"].of(time_constant=0.15),)).cut(4.0), VEHICLE)
+    theta = bench.believed.copy()
+    theta[bench.library.index("thruster_lag", "all", "time_constant")] = 0.15
+    wrong, right = (np.abs(bench.errors(a)).max() for a in (bench.believed, theta))
+    assert len(bench.data.past) == 5
+    assert right < 1.1 * np.exp(-0.5 / 0.15) * wrong
+
+
 def test_windows_are_records_and_their_commands():
     bench = bench_of(recording(()))
     data, w = bench.data, windows(bench.data, 1.0, 0.5)

@@ -143,7 +143,8 @@ def share_of_gain(
     better: tuple[Extended, Learned | None],
 ) -> dict[str, float]:
     """The same of models with a learned rest beside them."""
-    data = make_data(read_csv(case.folder / "fresh", resample=False), vehicle, segment=10**9)
+    fresh = read_csv(case.folder / "fresh", resample=False)
+    data = make_data(fresh, vehicle, segment=10**9, remembered=0.0)
     truths = read_oracle(case.folder / "oracle")
     every = case.truth.every
     off = [_off(forecast(model, data, every, rest), truths) for model, rest in (base, better)]

@@ -17,7 +17,7 @@ SEGMENT = 256
 """Longest piece (samples) that a run is cut into; pieces are filtered side by side."""
 _BLOCKS, _LEAST = 8, 16
 """Pieces that a single run is cut into at least, and samples of a piece at least."""
-_BEFORE, _OF_A_RUN = 0.5, 0.1
+REMEMBERED, _OF_A_RUN = 0.5, 0.1
 """Time (s) before a piece whose commands its actuators may remember; share of a run at most."""
 _MOST_FOLDS = 10
 _FEW_RUNS = 6
@@ -124,14 +124,18 @@ class Data:
 
 
 def make_data(
-    recording: Recording, vehicle: Vehicle, segment: int = SEGMENT, without: Sequence[int] = ()
+    recording: Recording,
+    vehicle: Vehicle,
+    segment: int = SEGMENT,
+    without: Sequence[int] = (),
+    remembered: float = REMEMBERED,
 ) -> Data:
     """Cut a recording into pieces and turn its commands into thruster forces.
 
     Thruster forces are taken as they are; PWM goes through the vehicle's curve at the recorded
     voltage; a wrench is split over the thrusters with the least effort. Runs `without` (by number,
     scenario by scenario) are left out, unless none would remain. What thrusters did before a run is
-    not known: its first half second (a tenth of it at most) is only what they remember.
+    not known: its first `remembered` s (a tenth of it at most) are only what they remember.
 
     Raises:
         UserError: a channel of pose or twist is missing, or no run has two samples.
@@ -152,7 +156,7 @@ def make_data(
     for number, at in enumerate(np.argwhere(lengths > 0)):
         kept[tuple(at)] &= number not in without
     kept = kept if kept.any() else lengths >= 3
-    behind = max(1, round(_BEFORE / recording.dt))
+    behind = max(1, round(remembered / recording.dt))
     if kept.sum() == 1:
         segment = min(segment, max(int(lengths.max()) // _BLOCKS, _LEAST))
     for number, (j, k) in enumerate(np.argwhere(kept).tolist()):
@@ -169,7 +173,7 @@ def make_data(
             volts = np.where(np.isfinite(measured), measured, nominal)
         u = _forces(values["command"], name, thrusters, volts)
         held = np.diff(times)
-        first = min(behind, int(_OF_A_RUN * (length - 1)))
+        first = min(behind, int(_OF_A_RUN * (length - 1))) if remembered else 0
         count = -(-(length - 1 - first) // segment)
         edges = np.linspace(first, length - 1, count + 1).round().astype(int)
         for a, b in itertools.pairwise(edges):

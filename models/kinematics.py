@@ -13,12 +13,13 @@ from jaxtyping import Bool, Float
 
 from .resample import conjugate, continuous, multiply, rotate, rotation_log
 
-_WINDOW_S = 0.5
+_WINDOW_S, _LONGER_S = 0.5, (2.0, 5.0)
 _MOVES_M, _TURNS_RAD = 0.02, 0.02  # rms in a window below which nothing can be told
 _AGREED, _EXPLAINED, _DOUBTFUL, _CONTRADICTED = 0.98, 0.9, 0.8, 0.5
 _SHORT = (0.1, 5.0)  # m/s, rad/s: second difference that is no outlier yet
 _MOST = 0.5  # share of the windows that must contradict, all but faults of an instrument
 _SPIKE, _FEW = 20.0, 8  # times the usual second difference; samples that tell what is usual
+_SEVERAL = 4  # windows that tell noise from a mix-up that has no name
 _BETTER = 0.3  # a reading that leaves less than this part of the residual is the right one
 
 Arrays = tuple[np.ndarray, np.ndarray]
@@ -38,10 +39,13 @@ class Agreement:
 
 
 def agreement(
-    t: Float[np.ndarray, " N"], X_WB: Float[np.ndarray, "7 N"], V_WB_B: Float[np.ndarray, "6 N"]
+    t: Float[np.ndarray, " N"],
+    X_WB: Float[np.ndarray, "7 N"],
+    V_WB_B: Float[np.ndarray, "6 N"],
+    window: float = _WINDOW_S,
 ) -> tuple[Agreement, Agreement]:
     """Compare poses and body twists; return the linear and the angular agreement."""
-    moved, integrated = _increments(t, X_WB, V_WB_B)
+    moved, integrated = _increments(t, X_WB, V_WB_B, window)
     return (
         _agree(moved[:3], integrated[:3], _MOVES_M),
         _agree(moved[3:], integrated[3:], _TURNS_RAD),
@@ -58,7 +62,9 @@ def _agree(moved: np.ndarray, integrated: np.ndarray, least: float) -> Agreement
     return Agreement(slope, float(1 - np.sum((moved - integrated) ** 2) / size))
 
 
-def _increments(t: np.ndarray, X_WB: np.ndarray, V: np.ndarray) -> Arrays:
+def _increments(
+    t: np.ndarray, X_WB: np.ndarray, V: np.ndarray, length: float = _WINDOW_S
+) -> Arrays:
     """Displacements in B (m, rad) and integrals of the twist over windows, (6, windows)."""
     q = continuous(X_WB[:4])
     step = np.diff(t)
@@ -71,7 +77,7 @@ def _increments(t: np.ndarray, X_WB: np.ndarray, V: np.ndarray) -> Arrays:
         ]
     )
     integrated = 0.5 * (V[:, 1:] + V[:, :-1]) * step
-    window = np.floor((t[1:] - t[0]) / _WINDOW_S - 1e-9).astype(int)
+    window = np.floor((t[1:] - t[0]) / length - 1e-9).astype(int)
     edges = np.flatnonzero(np.concatenate([[True], np.diff(window) > 0]))
     return np.add.reduceat(moved, edges, axis=1), np.add.reduceat(integrated, edges, axis=1)
 
@@ -171,8 +177,8 @@ def contradictions(
     """Return (errors, doubts): sentences on poses and twists that can't both be right.
 
     An error names the reading that would make them agree, or says that none known does. Faults of
-    an instrument are no such mix-up: single outliers, and what at most half of the windows
-    contradicts, are doubts.
+    an instrument are no such mix-up: single outliers, what at most half of the windows contradicts,
+    and what does not grow with their length, as noise of positions does not, are doubts.
     """
     if t.size < 3:
         return [], []
@@ -197,7 +203,9 @@ def contradictions(
         if scores[best] > _EXPLAINED and 1 - scores[best] < _BETTER * (1 - now.explained):
             errors.append(f"{found}: {readings[best][0]}")
             break  # what follows from a wrong attitude need not be told again
-        if now.explained < _CONTRADICTED and _mostly(t, X_WB, V_WB_B, rows) < _CONTRADICTED:
+        longer = (agreement(t, X_WB, V_WB_B, s)[part].explained for s in _LONGER_S)
+        explained = [now.explained, _mostly(t, X_WB, V_WB_B, rows), *longer]
+        if np.nanmax(explained) < _CONTRADICTED and t[-1] - t[0] > _SEVERAL * _WINDOW_S:
             errors.append(f"{found}: check units, frames and the order of the quaternion")
             break
         if now.explained < _DOUBTFUL:

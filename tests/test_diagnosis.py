@@ -456,6 +456,19 @@ def test_a_swaying_mass_ahead_of_the_origin_is_seen_in_yaw(tmp_path):
     assert group.labels[seen[1].node][1] == pytest.approx(hertz, rel=0.1)
 
 
+def test_an_instrument_slower_than_the_rows_is_told(tmp_path):
+    """A DVL of 5 Hz in rows of 20 Hz repeats its samples: its mean delay is no clock's."""
+    from spinndrift.training.diagnosis.checks import problems
+
+    recording = recorded(tmp_path, 3, "null")[1]
+    V = recording.dataset["V_WB_B"].to_numpy()
+    V[:, :, :, :3] = V[:, :, np.arange(V.shape[2]) // 4 * 4, :3]
+    told, faulty = problems(recording)
+    assert len(told) == 1
+    assert told[0].startswith("u,v,w repeat the sample before in 75% of the rows")
+    assert not faulty
+
+
 def test_axes_that_are_not_driven_and_filled_samples_are_told(tmp_path):
     from hidden.faults import spoil
 

@@ -418,6 +418,7 @@ def test_a_memory_without_a_name_is_its_convolution(of):
         ("thruster", "3", (0.0,)),
         ("depth", "W", (-3.0, 0.5)),
         ("pose", "heave", (0.0,)),
+        ("damping", "heave", (-3.0, 0.5)),
     ],
 )
 def test_what_has_no_name_is_stored_and_moves_the_vehicle(tmp_path, kind, acts_on, numbers):

@@ -22,6 +22,17 @@ def test_true_motion_agrees_and_noise_of_real_sensors_is_no_contradiction():
     assert contradictions(T, noisy_X, noisy) == ([], [])
 
 
+def test_positions_that_are_mostly_noise_are_a_doubt():
+    """Half a second at 5 cm of noise tells nothing of units; five seconds do."""
+    X, V, _ = smooth_motion(T)
+    rng = np.random.default_rng(1)
+    X[4:] = X[4:] + rng.normal(size=(3, T.size)) * 0.3
+    assert agreement(T, X, V)[0].explained < 0.5
+    errors, doubts = contradictions(T, X, V)
+    assert not errors
+    assert len(doubts) == 1
+
+
 def test_a_vehicle_at_rest_contradicts_nothing():
     X, V, _ = smooth_motion(T)
     X[:] = X[:, :1]

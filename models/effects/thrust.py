@@ -108,7 +108,7 @@ class ThrustScale(Effect):
 
     name: ClassVar[str] = "thrust_scale"
     family: ClassVar = "actuation"
-    parameters: ClassVar = (Parameter("scale", "1", (0.03,), -0.8, 4.0),)
+    parameters: ClassVar = (Parameter("scale", "1", (0.03,), -0.8, 1000.0),)
     order: ClassVar[int] = 10
     source: ClassVar[str] = "bollard thrust of equal thrusters scatters by 10 to 20 %"
 

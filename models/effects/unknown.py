@@ -29,7 +29,7 @@ POWERS = ("|f|f", "f²", "f³")
 """Terms in a thruster's own force, in tens of newtons."""
 WORLD = ("east", "north", "up")
 _SIZES = {"flow": 0.004, "place": 0.1, "depth": 0.1}
-_PUSHES = ("motion", "pose", "place", "depth")
+_PUSHES = ("motion", "pose", "place", "depth", "damping")
 
 
 class Unknown(Effect):
@@ -40,7 +40,8 @@ class Unknown(Effect):
     and which of the six, the axis' own if left out. `thruster`: all of `POWERS` on one thruster.
     `place`: a force in W of bumps exp(-½ |p - c|² / s²) over the horizontal plane, east and north
     for each; numbers s (m) and centres. `flow`: the same as a velocity of the water. `depth`: a
-    force in W of (z - c) / s and its square, in three directions; numbers c and s (m).
+    force in W of (z - c) / s and its square, in three directions; numbers c and s (m). `damping`:
+    a wrench on an axis of (z - c) / s times its own velocity, and times that velocity's square.
     """
 
     name: ClassVar[str] = "unknown"
@@ -71,6 +72,9 @@ class Unknown(Effect):
             return POWERS
         if self.kind == "depth":
             return tuple(f"{d} z{p}" for p in ("", "²") for d in WORLD)
+        if self.kind == "damping":
+            own = TWIST[AXES.index(self.acts_on)]
+            return f"z {own}", f"z |{own}|{own}"
         count = len(self.numbers) // 2
         return tuple(f"{d} {i + 1}" for d in WORLD[:2] for i in range(count))
 
@@ -80,7 +84,7 @@ class Unknown(Effect):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        unit = "m/s" if self.kind == "flow" else "N or N·m a unit"
+        unit = "m/s" if self.kind == "flow" else "N a unit or N·m a unit"
         return tuple(Parameter(t, unit, (_SIZES.get(self.kind, 1.0),)) for t in self.terms)
 
     def size(self) -> int:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -108,6 +112,10 @@ class Unknown(Effect):
             c, s = self.numbers
             z = (X_WB[6] - c) / s
             return jnp.stack([z, z * z])
+        if self.kind == "damping":
+            c, s = self.numbers
+            z, v = (X_WB[6] - c) / s, V_CB_B[AXES.index(self.acts_on)]
+            return jnp.stack([z * v, z * jnp.abs(v) * v])
         width, centres = self.numbers[0], np.array(self.numbers[1:]).reshape(-1, 2)
         shape = (-1,) + (1,) * (X_WB.ndim - 1)
         x, y = (jnp.asarray(c.reshape(shape), X_WB.dtype) for c in centres.T)

@@ -10,6 +10,9 @@ from .data import Data
 
 _STUCK = 0.5  # s
 _FILLED = 3  # samples on a straight line
+_HELD = 0.25
+"""Share of the samples that repeat the one before where an instrument is slower than the rows."""
+_INSTRUMENTS = {"x,y,z": slice(4, 7), "u,v,w": slice(7, 10), "p,q,r": slice(10, 13)}
 _STILL = 0.02
 """Share of the strongest axis' command below which an axis counts as not driven."""
 _CHANNELS = {
@@ -26,11 +29,13 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
     is no fault if it does so in every run and is part of the pose (a vehicle held in place).
     Samples on a straight line in all velocities were filled in: a gap or a jump of the clock. An
     outlier is a single velocity far from both its neighbours, which agree: no blow is that short.
+    Where a quarter of the samples repeat those before, an instrument is slower than the rows.
     """
     stuck: dict[str, list[int]] = {}
     jumps: list[int] = []
     spiked: list[int] = []
     filled: list[int] = []
+    held: dict[str, list[float]] = {name: [] for name in _INSTRUMENTS}
     longest, count = 0.0, 0
     for number, run in enumerate(recording.trajectories()):
         count += 1
@@ -39,6 +44,10 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
                 still = _longest(np.diff(column) == 0) * recording.dt
                 if still > _STUCK and np.isfinite(column).all():
                     stuck.setdefault(f"{name}.{label}", []).append(number)
+        state = np.concatenate([run.X_WB, run.V_WB_B], axis=1)
+        for name, columns in _INSTRUMENTS.items():
+            same = (np.diff(state[:, columns], axis=0) == 0).all(axis=1)
+            held[name].append(float((same & run.V_WB_B[1:].any(axis=1)).mean()))
         moved = np.linalg.norm(np.diff(run.X_WB[:, 4:], axis=0), axis=1)
         elapsed = run.sensors.get(UNEVEN)
         step = recording.dt if elapsed is None else np.diff(elapsed)
@@ -57,6 +66,12 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
     found = [
         f"{channel} repeats one value for {_STUCK:g} s or more in {len(runs)} runs: stuck?"
         for channel, runs in stuck.items()
+    ]
+    found += [
+        f"{name} repeat the sample before in {np.median(shares):.0%} of the rows: the instrument "
+        "is slower, and what is late by that is no cause; give rows at its rate"
+        for name, shares in held.items()
+        if np.median(shares) > _HELD and not any(c in channel for channel in stuck for c in name)
     ]
     if jumps:
         found.append(f"the position jumps by far more than the velocity says in {len(jumps)} runs")
@@ -83,6 +98,8 @@ def _longest(holds: np.ndarray) -> int:
     return int((edges[1::2] - edges[::2]).max()) if edges.size else 0
 
 
+_ABOVE = 0.5
+"""Height (m) above the surface from which a vehicle does not dive."""
 SPARSE = 1.5
 """Steps between samples of commands from which these count as sparse."""
 
@@ -111,6 +128,12 @@ def limits(
         f"{axis} was not driven: its drag and inertia are not identifiable from these data"
         for axis in quiet
     ]
+    height = float(np.median(data.X[:-1, 6][data.weight > 0]))
+    if height > _ABOVE:
+        found.append(
+            f"positions lie {height:.1f} m above the surface (z is up, 0 there): what depends on "
+            "depth can't be told; if z is down in the files, give frames: NED/FRD"
+        )
     if data.command == "F_Bo_B":
         found.append("commands are wrenches: single thrusters can't be told apart")
     if not data.has_voltage:

@@ -196,8 +196,9 @@ def _simulated(
         own, exists = e[rows], weight[rows] > 0  # (K, 12, 1 + S, R), (K, R)
         drawn = own[:, :, 1:]
         apart = np.abs(drawn[:, :, 1:] - drawn[:, :, :-1])
-        far = np.sqrt((drawn**2).sum(axis=1)).mean(axis=1)
-        far -= np.sqrt((apart**2).sum(axis=1)).mean(axis=1) / 2
+        with np.errstate(invalid="ignore", over="ignore"):  # of forecasts that diverge
+            far = np.sqrt((drawn**2).sum(axis=1)).mean(axis=1)
+            far -= np.sqrt((apart**2).sum(axis=1)).mean(axis=1) / 2
         ordered = np.sort(drawn, axis=2)
         for f, label in enumerate(labels):
             w = exists * (fold == label)

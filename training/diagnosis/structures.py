@@ -351,6 +351,8 @@ def groups(bench: Bench, look: Look, quiet: Sequence[str] = ()) -> Iterator[Grou
     z = d.X[:-1, 6][d.weight > 0]
     numbers = (float(z.mean()), float(z.std() + 1e-3))
     yield _of_state(bench, Unknown.neutral(kind="depth", acts_on="W", numbers=numbers))
+    for i in moving:
+        yield _of_state(bench, Unknown.neutral(kind="damping", acts_on=AXES[i], numbers=numbers))
     bumps = _bumps(d.X[:-1, 4][d.weight > 0], d.X[:-1, 5][d.weight > 0])
     if len(bumps) > 9:
         for kind in ("place", "flow"):
@@ -360,7 +362,7 @@ def groups(bench: Bench, look: Look, quiet: Sequence[str] = ()) -> Iterator[Grou
 _ALL_MOTION = tuple(float(i) for i in range(len(MOTION)))
 _VARIABLES = {
     "motion": TWIST, "pose": ("heading", "roll", "pitch"), "depth": ("z",), "place": ("x", "y"),
-    "flow": ("x", "y"),
+    "flow": ("x", "y"), "damping": ("z",),
 }  # fmt: skip
 
 
@@ -492,6 +494,9 @@ def described(effect: Unknown, weights: np.ndarray, bench: Bench) -> dict[str, A
         told = f"the force of thruster {where} against its command"
     elif effect.kind == "pose":
         told = f"a wrench on {where} that depends on heading, roll or pitch"
+    elif effect.kind == "damping":
+        variables = ("z", TWIST[AXES.index(where)])
+        told = f"damping of {where} that depends on depth"
     elif effect.kind == "depth":
         told = "a force in W that depends on depth"
     else:

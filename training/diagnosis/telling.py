@@ -27,6 +27,12 @@ def quantile(fit: Fit) -> float:
     return float(scipy.stats.t.ppf(0.975, max(len(fit.heldout) - len(fit.parameters), 1)))
 
 
+def unit(of: str, where: str) -> str:
+    """The unit on one axis, of a parameter whose unit differs between moving and turning."""
+    both = of.split(" or ")
+    return both[where in AXES[3:]] if len(both) == 2 else of
+
+
 def values_of(
     bench: Bench, theta: Float[np.ndarray, " p"], rows: Sequence[int], joint: Fit
 ) -> dict[str, result.Value]:
@@ -36,7 +42,8 @@ def values_of(
     for i in rows:
         p, v = bench.library.entries[i].parameter, float(theta[i])
         error = t * float(joint.errors[joint.parameters.index(i)])
-        found[p.name] = result.Value(v, p.unit, (v - error, v + error))
+        told = unit(p.unit, bench.library.entries[i].where)
+        found[p.name] = result.Value(v, told, (v - error, v + error))
     return found
 
 
@@ -72,7 +79,7 @@ def refitted(bench: Bench, look: Look, rows: Sequence[int], joint: Fit) -> list[
         old = bench.believes(e.cause, e.where)
         new = old + float(look.theta[i] - bench.believed[i])
         error = t * float(joint.errors[joint.parameters.index(i)])
-        value = result.Value(new, e.parameter.unit, (new - error, new + error))
+        value = result.Value(new, unit(e.parameter.unit, e.where), (new - error, new + error))
         found.append(result.Refitted(e.cause, e.where, e.parameter.name, old, value))
     return found
 
@@ -119,7 +126,7 @@ def law_cause(
 def _law_values(law: Law, bench: Bench, look: Look) -> dict[str, result.Value]:
     """A law's numbers in the units of its effect, with intervals by the delta method."""
     data = bench.data
-    units = {p.name: p.unit for p in kind(law.name).parameters}
+    units = {p.name: unit(p.unit, law.where) for p in kind(law.name).parameters}
     if law.errors is not None:
         spreads = {name: 1.96 * law.errors[name] for name in law.parameters}
         return {

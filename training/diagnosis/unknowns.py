@@ -17,7 +17,7 @@ from .structures import Matched, Screen, described, groups, refined
 
 BEATS = 1.5
 """Times the best name's gain that structure without a name must win."""
-_TOGETHER, _OF_A_LAW = 1.1, 1.0
+_TOGETHER, _OF_A_LAW = 1.1, 0.7
 """Times what all names win together; share of what the best law wins."""
 
 

@@ -35,9 +35,24 @@ from spinndrift.training.diagnosis.noise import (
     process_covariance,
 )
 from spinndrift.training.diagnosis.responses import respond
-from spinndrift.training.diagnosis.result import Diagnosis, Interval, Ratio, Value, schema
+from spinndrift.training.diagnosis.result import (
+    AxisResidual,
+    Cause,
+    Diagnosis,
+    Interval,
+    Ratio,
+    Support,
+    Value,
+    schema,
+)
 from spinndrift.training.diagnosis.search import Found, Search
-from spinndrift.training.diagnosis.telling import with_coefficients_off
+from spinndrift.training.diagnosis.telling import (
+    CHANNELS,
+    left_over,
+    sentence,
+    verdict,
+    with_coefficients_off,
+)
 from spinndrift.training.diagnosis.transition import Transition
 
 VEHICLE = load_vehicle("bluerov2_heavy")
@@ -454,6 +469,26 @@ def test_a_swaying_mass_ahead_of_the_origin_is_seen_in_yaw(tmp_path):
     assert (group.effect.kind, group.effect.acts_on, group.variables) == ("memory", "yaw", ("v",))
     hertz = hidden["parameters"]["frequency"]["value"]
     assert group.labels[seen[1].node][1] == pytest.approx(hertz, rel=0.1)
+
+
+def test_errors_that_follow_each_other_are_not_called_adequate():
+    """Of velocities alone: a filter's estimates err slowly in positions too, a law has a name."""
+
+    def left(position, velocity, causes=()):
+        sizes = 3 * [position] + 3 * [0.0] + 3 * [velocity] + 3 * [0.0]
+        residual = {
+            name: AxisResidual(1.0, size, 0.0) for name, size in zip(CHANNELS, sizes, strict=True)
+        }
+        return left_over(residual, causes)
+
+    assert left(0.0, 0.1) == left(0.8, 0.8) == []
+    (told,) = left(0.0, 0.8)
+    assert told.startswith("errors of u, v, w follow each other")
+    assert verdict((), [told]) == "unexplained"
+    assert told in sentence((), (), False, [told])
+    law = Cause("disturbance_colour", "surge", {}, Support(0.0, 9.0), [], [], "")
+    assert left(0.0, 0.8, [law]) == []
+    assert verdict([law], [told]) == "partly_explained"
 
 
 def test_an_instrument_slower_than_the_rows_is_told(tmp_path):

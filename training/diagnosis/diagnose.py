@@ -173,15 +173,17 @@ class Diagnoser:
             causes.append(law_cause)
             stirring.append(effect)
         gain = self._gain(bench, found, fitted, rows, shaped, tuple(stirring), bool(causes))
+        residual = telling.residual(bench, final)
+        left = telling.left_over(residual, causes)
         d = bench.data
         diagnosis = result.Diagnosis(
             version=result.VERSION,
-            verdict=telling.verdict(causes),
-            sentence=telling.sentence(causes, self.faults, bool(nuisance)),
+            verdict=telling.verdict(causes, left),
+            sentence=telling.sentence(causes, self.faults, bool(nuisance), left),
             causes=causes,
             refitted=[] if joint is None else telling.refitted(bench, final, nuisance, joint),
             ratios=ratios(bench, fitted, rows) if config.refit == "all" else [],
-            residual=telling.residual(bench, final),
+            residual=residual,
             gain=gain,
             left_out=d.left_out if len(np.unique(d.fold)) > 1 else "nothing",
             data=result.DataSummary(

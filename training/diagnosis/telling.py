@@ -1,6 +1,6 @@
 """A finding in words and numbers: causes with intervals, what is left, what was refitted."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -20,6 +20,8 @@ from .search import Found
 
 CHANNELS = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
 _NAN = float("nan")
+_FOLLOWING, _SEVERAL = 0.5, 3
+"""Correlation of neighbouring errors that is no chance, and velocities that have it."""
 
 
 def quantile(fit: Fit) -> float:
@@ -93,6 +95,27 @@ def residual(bench: Bench, look: Look) -> dict[str, result.AxisResidual]:
         mean = float(z.sum() / np.sqrt(n))
         found[name] = result.AxisResidual(float((z**2).sum()) / n, float(correlation[i]), mean)
     return found
+
+
+def left_over(
+    residual: Mapping[str, result.AxisResidual], causes: Sequence[result.Cause]
+) -> list[str]:
+    """What errors that follow each other say: velocities' alone, and of no law that was named.
+
+    A filter's estimates err slowly in the positions too.
+    """
+    lasting = ("disturbance", "environment")
+    if any(kind(c.name).family in lasting for c in causes if c.name != "unknown"):
+        return []
+    alike = {name: residual[name].autocorrelation for name in CHANNELS}
+    of = [name for name in CHANNELS[6:] if alike[name] > _FOLLOWING]
+    if len(of) < _SEVERAL or max(abs(alike[name]) for name in CHANNELS[:3]) > _FOLLOWING / 2:
+        return []
+    return [
+        f"errors of {', '.join(of)} follow each other (correlations up to "
+        f"{max(alike[n] for n in of):.2f}): the simulation lacks something large that has no name "
+        "here, or commands have other units, signs or frames than it believes"
+    ]
 
 
 # ------------------------------------------------------------------------------------- laws
@@ -182,20 +205,25 @@ def _responses(bench: Bench, look: Look, axis: str) -> tuple[float, float]:
 # -------------------------------------------------------------------------------- sentences
 
 
-def verdict(causes: Sequence[result.Cause]) -> result.Verdict:
-    """What the causes amount to."""
+def verdict(causes: Sequence[result.Cause], left: Sequence[str] = ()) -> result.Verdict:
+    """What the causes amount to, and what they leave (`left_over`)."""
     unknown = [c.name == "unknown" for c in causes]
     if not causes:
-        return "adequate"
+        return "unexplained" if left else "adequate"
     if not any(unknown):
-        return "explained"
+        return "partly_explained" if left else "explained"
     return "unexplained" if all(unknown) else "partly_explained"
 
 
 def sentence(
-    causes: Sequence[result.Cause], problems: Sequence[str], refitted: bool = False
+    causes: Sequence[result.Cause],
+    problems: Sequence[str],
+    refitted: bool = False,
+    left: Sequence[str] = (),
 ) -> str:
     """The finding in a line or two; `refitted` if coefficients were fitted first."""
+    if not causes and left:
+        return f"No name explains the data: {left[0]}."
     first = f"The data have faults ({len(problems)}), see there first. " if problems else ""
     if not causes and refitted:
         return first + "With its coefficients refitted, your model is adequate at this noise."
@@ -207,6 +235,7 @@ def sentence(
     for c in causes:
         if c.structure is not None:
             told += f" No name explains {c.structure.description}."
+    told += "".join(f" But {one}." for one in left)
     return first + told.strip()
 
 

@@ -127,7 +127,7 @@ class LearnedPlant(LeafSystem):
             self.DeclareStateOutputPort("X_WB_seen", self._X)
             self.DeclareStateOutputPort("V_WB_B_seen", self._V)
             return
-        see = VectorFunction(self._effects.model.observe, [7, 6, 6], [7, 6])
+        see = VectorFunction(self._effects.seen, [7, 6, 6], [7, 6])
         for name, size, part in (("X_WB_seen", 7, slice(0, 7)), ("V_WB_B_seen", 6, slice(7, 13))):
 
             def show(context: Context, output: BasicVector, part: slice = part) -> None:
@@ -211,7 +211,7 @@ class LearnedPlant(LeafSystem):
         for i, name in enumerate(("X_WB_seen", "V_WB_B_seen")):
             outputs[name] = shown(i)
             if effects is not None and effects.reads:
-                outputs[name] = lambda state, _, i=i: effects.model.observe(*state[:3])[i]
+                outputs[name] = lambda state, _, i=i: effects.seen(*state[:3])[i]
         outputs["state"] = lambda state, _: jnp.concatenate(state[:2])
         if self._thrusters is not None:
             n = self._neutral.size

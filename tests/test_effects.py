@@ -12,6 +12,7 @@ from spinndrift.models.checkpoint import load_model, save_model
 from spinndrift.models.effects import KINDS, Extended, Library
 from spinndrift.models.effects.drag import COUPLINGS
 from spinndrift.models.effects.predict import advance
+from spinndrift.models.effects.recent import Recent
 from spinndrift.models.effects.thrust import REFERENCE
 from spinndrift.models.effects.unknown import Unknown
 from spinndrift.models.errors import UserError
@@ -54,9 +55,12 @@ def test_all_effects_at_zero_change_nothing(everything):
 
     @jax.jit
     def both(model, X, V, u):
-        a = advance(model, model.inertia(), model.remember(u), *model.infer(X, V, V), u, 0.05, 2)
+        recent = Recent.steady(V, 0.05)
+        state = model.infer(X, V, recent)
+        a = advance(model, model.inertia(), model.remember(u), *state, u, 0.05, 2)
         b = advance(PLAIN, PLAIN.inertia(), (), X, V, u, 0.05, 2)
-        return model.observe(*a[1:]), b[1:3]
+        recent = recent.after(Recent.over(state[1], a[2], a[3], 0.05))
+        return model.observe(*a[1:3], recent), b[1:3]
 
     with_all, without = both(model, X, V, U)
     for a, b in zip(with_all, without, strict=True):
@@ -272,45 +276,57 @@ def test_a_steady_current_carries_the_vehicle_like_the_base_in_moving_water():
 )
 def test_measurement_effects_invert(name, where, values):
     effect = KINDS[name].of(where, **values)
-    A = 0.3 * V[::-1]
-    X1, V1 = effect.measure(X, V, A)
+    recent = Recent.steady(0.3 * V[::-1], 0.05)
+    X1, V1 = effect.measure(X, V, recent)
     assert np.abs(np.asarray(X1 - X)).max() + np.abs(np.asarray(V1 - V)).max() > 1e-4
-    X2, V2 = effect.unmeasure(X1, V1, A)
+    X2, V2 = effect.unmeasure(X1, V1, recent)
     np.testing.assert_allclose(X2, X, atol=1e-5)
     np.testing.assert_allclose(V2, V, atol=1e-12)
 
 
 def test_measurements_by_hand():
-    none = jnp.zeros_like(V)
+    none = Recent.steady(jnp.zeros_like(V), 0.05)
     _, far = KINDS["dvl_lever_arm"].of("x", offset=0.3).measure(X, V, none)
     arm = np.array([0.3, 0, 0])[:, None]
     np.testing.assert_allclose(far[:3], np.asarray(V[:3]) + cross(V[3:], arm))
     _, turned = KINDS["dvl_misalignment"].of("yaw", angle=0.3).measure(X, V, none)
     np.testing.assert_allclose(turned[0], np.cos(0.3) * V[0] + np.sin(0.3) * V[1])
-    X0, V0 = X[:, :1], V[:, :1]
-    A = 0.3 * V0[::-1]
-    late = 0.04
-    X1, _ = KINDS["clock_offset"].of("pose", delay=late).measure(X0, V0, A)
-    fine = 100  # a twist that changes evenly, backwards in small steps
-    past = X0
-    for k in range(fine):
-        past = se3.retract(past, -late / fine * (V0 - A * (k + 0.5) * late / fine))
-    np.testing.assert_allclose(X1, past, atol=2e-6)
-    _, V1 = KINDS["clock_offset"].of("linear", delay=late).measure(X0, V0, A)
-    np.testing.assert_allclose(V1, [*(V0 - late * A)[:3], *V0[3:]], atol=1e-15)
-    J = jnp.asarray([3.0, -2.0, 1.0, 4.0, 5.0, -6.0])[:, None]
-    both = jnp.concatenate([A, J])
-    _, V2 = KINDS["clock_offset"].of("twist", delay=late).measure(X0, V0, both)
-    np.testing.assert_allclose(V2, V0 - late * A + late**2 / 2 * J, atol=1e-15)
-    X2, _ = KINDS["clock_offset"].of("pose", delay=late).measure(X0, V0, both)
-    past = X0
-    for k in range(fine):
-        s = (k + 0.5) * late / fine
-        past = se3.retract(past, -late / fine * (V0 - A * s + J * s**2 / 2))
-    np.testing.assert_allclose(X2, past, atol=5e-6)
-    assert np.abs(np.asarray(X2 - X1)).max() > 2e-5  # the second derivative is in it
+
     off, _ = KINDS["heading_error"].of(sine=0.1).measure(X, V, none)
     np.testing.assert_allclose(se3.yaw(off), se3.yaw(X) + 0.1 * np.sin(se3.yaw(X)), atol=1e-12)
+
+
+@pytest.mark.parametrize("late", [0.03, 0.08, 0.23, -0.02])
+def test_late_instruments_show_what_was(late):
+    """Against a twist known at all times, sines of 1 to 3 rad/s, in steps of unequal length."""
+    rate = jnp.asarray([1.0, 1.4, 1.8, 2.2, 2.6, 3.0])[:, None]
+
+    def twist(t, order=0):
+        return 0.4 * rate**order * jnp.sin(rate * t + order * jnp.pi / 2)
+
+    step, now = jnp.asarray([0.05, 0.07, 0.04, 0.1, 0.06]), 1.0
+    ends = now - np.concatenate([[0.0], np.cumsum(step)])
+    recent = Recent.steady(twist(ends[-1], 1), 0.05)
+    for start, end, h in zip(ends[:0:-1], ends[-2::-1], step[::-1], strict=True):
+        rates = jnp.concatenate([twist(end, 1), twist(end, 2)])
+        recent = recent.after(Recent.over(twist(start), twist(end), rates, float(h)))
+    X0, V0 = X[:, :1], twist(now)
+    _, V1 = KINDS["clock_offset"].of("linear", delay=late).measure(X0, V0, recent)
+    np.testing.assert_allclose(V1, [*twist(now - late)[:3], *V0[3:]], atol=3e-5)
+    X1, _ = KINDS["clock_offset"].of("pose", delay=late).measure(X0, V0, recent)
+    fine, past = 400, X0
+    for k in range(fine):
+        past = se3.retract(past, -late / fine * twist(now - (k + 0.5) * late / fine))
+    # the second term of Magnus is δ³ [V, V'] / 12
+    np.testing.assert_allclose(X1, past, atol=1e-6 + abs(late) ** 3 / 12)
+
+
+def test_an_instrument_later_than_what_is_remembered_is_extrapolated():
+    A = jnp.asarray([0.1, -0.2, 0.3, 0.4, -0.5, 0.6])[:, None]
+    recent = Recent.steady(A, 0.05)
+    change, way = recent.back(jnp.asarray([[0.9]]))
+    np.testing.assert_allclose(change, -0.9 * A, atol=1e-14)
+    np.testing.assert_allclose(way, -(0.9**2) / 2 * A, atol=1e-14)
 
 
 def test_noise_laws_have_their_moments():

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from .. import se3
 from .base import XYZ, Effect, Parameter
+from .recent import Recent
 
 
 class GyroBias(Effect):
@@ -27,7 +28,7 @@ class GyroBias(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         return X_WB, V_WB_B + self._bias(V_WB_B)
 
@@ -35,7 +36,7 @@ class GyroBias(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         return X_WB, V_WB_B - self._bias(V_WB_B)
 
@@ -65,7 +66,7 @@ class HeadingError(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         return _turned(X_WB, self._error(X_WB, *_heading(X_WB))), V_WB_B
 
@@ -73,7 +74,7 @@ class HeadingError(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         sine, cosine = _heading(X_WB)
         error = self._error(X_WB, sine, cosine)
@@ -86,8 +87,8 @@ class HeadingError(Effect):
 class ClockOffset(Effect):
     """One channel's stamps are late by δ: what is recorded at t is the value of t - δ.
 
-    `linear`, `angular`: velocities of an instrument, `twist` both: V(t - δ) ≈ V - δ V' + δ² V''/2;
-    `pose`: X exp(-δ V + δ² V'/2 - δ³ V''/6). All against the command's clock.
+    `linear`, `angular`: velocities of an instrument, `twist` both; `pose`: X exp(-Ω), Ω being the
+    integral of the twist over δ, the first term of Magnus (1954). All against the command's clock.
     """
 
     name: ClassVar[str] = "clock_offset"
@@ -98,28 +99,24 @@ class ClockOffset(Effect):
     order: ClassVar[int] = 10
     source: ClassVar[str] = "5 to 50 ms between computers"
 
-    def _moved(self, X: Array, V: Array, A: Array, sign: float) -> tuple[Array, Array]:
+    def _delays(self, V: Array) -> tuple[Array, Array]:
+        """Of the twist's six components, and of the pose."""
         twist, pose, linear, angular = (self.part(i, V)[None] for i in range(4))
-        late = jnp.concatenate([twist + linear] * 3 + [twist + angular] * 3)
-        first, second = A[:6], A[6:] if len(A) == 12 else jnp.zeros_like(A)
-        moved = pose * (V - pose / 2 * (first - pose / 3 * second))
-        return se3.retract(X, sign * moved), V + sign * late * (first - late / 2 * second)
+        return jnp.concatenate([twist + linear] * 3 + [twist + angular] * 3), pose
 
     def measure(
-        self,
-        X_WB: Float[Array, "7 *#batch"],
-        V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        self, X_WB: Float[Array, "7 *#batch"], V_WB_B: Float[Array, "6 *#batch"], recent: Recent
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        return self._moved(X_WB, V_WB_B, A_WB_B, -1.0)
+        late, pose = self._delays(V_WB_B)
+        way = pose * V_WB_B + recent.back(pose)[1]
+        return se3.retract(X_WB, -way), V_WB_B + recent.back(late)[0]
 
     def unmeasure(
-        self,
-        X_WB: Float[Array, "7 *#batch"],
-        V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        self, X_WB: Float[Array, "7 *#batch"], V_WB_B: Float[Array, "6 *#batch"], recent: Recent
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        return self._moved(X_WB, V_WB_B, A_WB_B, 1.0)
+        late, pose = self._delays(V_WB_B)
+        V = V_WB_B - recent.back(late)[0]
+        return se3.retract(X_WB, pose * V + recent.back(pose)[1]), V
 
 
 def _heading(X: Array) -> tuple[Array, Array]:

@@ -28,6 +28,7 @@ from jaxtyping import Array, Float
 
 from ..errors import UserError
 from ..networks import expand
+from .recent import Recent
 
 Family = Literal["actuation", "body", "environment", "disturbance", "measurement"]
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
@@ -285,23 +286,20 @@ class Effect(eqx.Module):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        """What is recorded of a pose and twist; A: dV/dt by components, d²V/dt² after it if known.
-
-        So A has 6 rows or 12.
-        """
-        del A_WB_B
+        """What is recorded of a pose and twist that came about as `recent` says."""
+        del recent
         return X_WB, V_WB_B
 
     def unmeasure(
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         """The pose and twist of a record: the inverse of `measure`."""
-        del A_WB_B
+        del recent
         return X_WB, V_WB_B
 
 

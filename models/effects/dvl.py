@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from .. import se3
 from .base import XYZ, Effect, Parameter
+from .recent import Recent
 
 
 def _turn(angles: Float[Array, "3 *batch"]) -> Float[Array, "7 *batch"]:
@@ -33,7 +34,7 @@ class DvlLeverArm(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         return X_WB, V_WB_B + self._lever(V_WB_B)
 
@@ -41,7 +42,7 @@ class DvlLeverArm(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         return X_WB, V_WB_B - self._lever(V_WB_B)
 
@@ -60,7 +61,7 @@ class DvlMisalignment(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         v = se3.rotate_inverse(_turn(self.column(V_WB_B)), V_WB_B[:3])
         omega = jnp.broadcast_to(V_WB_B[3:], v.shape)
@@ -70,7 +71,7 @@ class DvlMisalignment(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         v = se3.rotate(_turn(self.column(V_WB_B)), V_WB_B[:3])
         omega = jnp.broadcast_to(V_WB_B[3:], v.shape)
@@ -95,7 +96,7 @@ class DvlScale(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         return X_WB, V_WB_B * self._factor(V_WB_B)
 
@@ -103,6 +104,6 @@ class DvlScale(Effect):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         return X_WB, V_WB_B / self._factor(V_WB_B)

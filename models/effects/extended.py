@@ -12,6 +12,7 @@ from ..dynamics import Coefficients, Dynamics, Flow, Memory
 from ..spd import ConstantSpd, Spd
 from ..thrusters import Thrusters
 from .base import Effect, Plant
+from .recent import Recent
 
 Random = tuple[Array, ...]
 """One array (s, *batch) for each effect with a random state, in the model's order."""
@@ -363,24 +364,24 @@ class Extended(Dynamics):
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        """What is recorded of a state, without noise; A as `Effect.measure` has it."""
+        """What is recorded of a state that came about as `recent` says, without noise."""
         for effect in self.effects:
             if effect.acts("measure"):
-                X_WB, V_WB_B = effect.measure(X_WB, V_WB_B, A_WB_B)
+                X_WB, V_WB_B = effect.measure(X_WB, V_WB_B, recent)
         return X_WB, V_WB_B
 
     def infer(
         self,
         X_WB: Float[Array, "7 *#batch"],
         V_WB_B: Float[Array, "6 *#batch"],
-        A_WB_B: Float[Array, "m *#batch"],
+        recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         """The state of a record: the inverse of `observe`."""
         for effect in reversed(self.effects):
             if effect.acts("measure"):
-                X_WB, V_WB_B = effect.unmeasure(X_WB, V_WB_B, A_WB_B)
+                X_WB, V_WB_B = effect.unmeasure(X_WB, V_WB_B, recent)
         return X_WB, V_WB_B
 
     # -------------------------------------------------------------------------- simulation

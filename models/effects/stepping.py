@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from .. import integrate, se3
 from ..dynamics import Flow
 from .extended import FOR_EVER, Extended
+from .recent import Recent
 
 
 class Stepper:
@@ -46,6 +47,12 @@ class Stepper:
     def lags(self) -> bool:
         """Whether the model says itself how thrusters follow their command."""
         return any(effect.name == "thruster_lag" for effect in self.model.effects)
+
+    def seen(
+        self, X_WB: Float[Array, "7"], V_WB_B: Float[Array, "6"], A_WB_B: Float[Array, "6"]
+    ) -> tuple[Float[Array, "7"], Float[Array, "6"]]:
+        """Pose and twist as instruments show them, of a state that accelerates by A."""
+        return self.model.observe(X_WB, V_WB_B, Recent.steady(A_WB_B, self.period))
 
     def __call__(
         self,

@@ -10,8 +10,9 @@ from jaxtyping import Array, Float
 
 from ...models.effects.extended import Extended, times
 from ...models.effects.predict import advance
+from ...models.effects.recent import Recent
 from .data import Data
-from .innovations import Arrays, as_arrays, first_rate, settle, substeps
+from .innovations import Arrays, as_arrays, at_first, settle, substeps
 
 
 @runtime_checkable
@@ -33,21 +34,22 @@ def _forecast(
     inertia = model.inertia()
 
     def body(carry: Any, given: Any) -> Any:
-        memory, x, v, rate = carry
+        memory, x, v, recent = carry
         n, X0, V0, command, before, volts, h = given
-        fresh = model.infer(X0, V0, rate)
+        fresh = model.infer(X0, V0, recent)
         starts = n % every == 0
         x, v = (jnp.where(starts, a, b) for a, b in zip(fresh, (x, v), strict=True))
         push = None
         if rest is not None:
             lacking = rest.acceleration(*(k[:, None] for k in (x, v, command, before)))
             push = times(inertia.matrix, lacking[:, 0])
-        memory, x, v, a = advance(
+        memory, x, Vp, a = advance(
             model, inertia, memory, x, v, command, h[None], count, volts[None], push
         )
-        return (memory, x, v, a), model.observe(x, v, a)
+        recent = recent.after(Recent.over(v, Vp, a, h[None]))
+        return (memory, x, Vp, recent), model.observe(x, Vp, recent)
 
-    start = (settle(model, past, past_step[:, None]), X[0], V[0], first_rate(V, step))
+    start = (settle(model, past, past_step[:, None]), X[0], V[0], at_first(V, step))
     before = jnp.concatenate([past[-1:], u[:-1]])
     xs = (jnp.arange(len(u)), X[:-1], V[:-1], u, before, voltage, step)
     return jax.lax.scan(body, start, xs)[1]

@@ -18,10 +18,11 @@ from ...models import se3
 from ...models.effects.base import AXES, Effect
 from ...models.effects.extended import FOR_EVER, Extended, times
 from ...models.effects.predict import advance
+from ...models.effects.recent import Recent
 from ..metrics import BANDS, order_statistics
 from . import result
 from .blackbox import BlackBox, arguments
-from .innovations import Arrays, as_arrays, difference, first_rate, predict, settle, substeps
+from .innovations import Arrays, as_arrays, at_first, difference, predict, settle, substeps
 from .laws import Law
 from .looking import Bench
 from .noise import estimate, score_of
@@ -258,12 +259,12 @@ def _errors(
         return se3.retract(X, n[:6]), V + n[6:]
 
     def body(carry: Any, given: Any) -> Any:
-        memory, pushes, x, v, rate = carry
+        memory, pushes, x, v, recent = carry
         n, X0, V0, X1, V1, command, before, volts, h = given
         dt = h[None, None]
         draw = jax.random.normal(jax.random.fold_in(key, n), (30 + 2 * more, S, R), V.dtype)
         start = read(X0[:, None], V0[:, None], draw[:12])
-        fresh = model.infer(*start, rate)
+        fresh = model.infer(*start, recent)
         starts = n % every == 0
         x, v = (jnp.where(starts, a, b) for a, b in zip(fresh, (x, v), strict=True))
         push = None
@@ -277,19 +278,20 @@ def _errors(
             pushes = tuple(jnp.where(starts, a, b) for a, b in zip(drawn, pushes, strict=True))
             pushes, stirred = stir(pushes, x, v, w[more:], jnp.broadcast_to(h, (R,)))
             push = stirred if push is None else push + stirred
-        memory, x, v, a = advance(
+        memory, x, Vp, a = advance(
             model, inertia, memory, x, v, command[:, None], dt, coarse, volts[None, None], push
         )
-        v = kicked(v, jnp.sqrt(dt) * draw[12:18])
-        seen = model.observe(x, v, a)
+        recent = recent.after(Recent.over(v, Vp, a, dt))
+        v = kicked(Vp, jnp.sqrt(dt) * draw[12:18])
+        seen = model.observe(x, v, recent)
         e = difference(*read(*seen, draw[18:30]), X1[:, None], V1[:, None])
-        return (memory, pushes, x, v, a), e.astype(jnp.float32)
+        return (memory, pushes, x, v, recent), e.astype(jnp.float32)
 
     zero = jnp.zeros((1, S, R), V.dtype)
-    rate = first_rate(V, step)[:, None] + zero
+    recent = jax.tree.map(lambda a: jnp.repeat(a[..., None, :], S, axis=-2), at_first(V, step))
     memory = settle(model, past[:, :, None] + zero[None], past_step[:, None, None])
     pushes = random.carried(u[0][:, None] + zero)[1]
-    start = (memory, pushes, X[0][:, None] + zero, V[0][:, None] + zero, rate)
+    start = (memory, pushes, X[0][:, None] + zero, V[0][:, None] + zero, recent)
     before = jnp.concatenate([past[-1:], u[:-1]])
     xs = (jnp.arange(len(u)), X[:-1], V[:-1], X[1:], V[1:], u, before, voltage, step)
     return jax.lax.scan(body, start, xs)[1]

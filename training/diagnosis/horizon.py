@@ -27,8 +27,9 @@ from ...models import se3
 from ...models.effects.extended import Extended
 from ...models.effects.library import Library
 from ...models.effects.predict import advance
+from ...models.effects.recent import Recent
 from .data import Data
-from .innovations import first_rate, settle, substeps
+from .innovations import at_first, settle, substeps
 from .looking import Bench, mass
 
 _ENOUGH = 1e-3
@@ -107,18 +108,18 @@ def _errors(model: Extended, arrays: tuple, count: int) -> Float[Array, "M 12 K"
     inertia = model.inertia()
 
     def body(carry: Any, given: Any) -> Any:
-        memory, x, v = carry
+        memory, x, v, recent = carry
         X1, V1, command, volts, h = given
-        memory, x, v, a = advance(
+        memory, x, Vp, a = advance(
             model, inertia, memory, x, v, command, h[None], count, volts[None]
         )
-        seen_X, seen_V = model.observe(x, v, a)
-        return (memory, x, v), jnp.concatenate([se3.local(X1, seen_X), seen_V - V1])
+        recent = recent.after(Recent.over(v, Vp, a, h[None]))
+        seen_X, seen_V = model.observe(x, Vp, recent)
+        return (memory, x, Vp, recent), jnp.concatenate([se3.local(X1, seen_X), seen_V - V1])
 
-    start = (
-        settle(model, past, past_step[:, None]),
-        *model.infer(X[0], V[0], first_rate(V, step)),
-    )
+    recent = at_first(V, step)
+    state = model.infer(X[0], V[0], recent)
+    start = (settle(model, past, past_step[:, None]), *state, recent)
     return jax.lax.scan(body, start, (X[1:], V[1:], u, voltage, step))[1]
 
 

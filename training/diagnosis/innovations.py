@@ -13,6 +13,7 @@ from ...models import se3
 from ...models.effects.extended import Extended, Memory
 from ...models.effects.library import Library
 from ...models.effects.predict import advance
+from ...models.effects.recent import Recent
 from .data import Data
 
 SUBSTEPS, LONGEST = 2, 0.0125
@@ -43,8 +44,7 @@ class Predictions(NamedTuple):
         X: predicted pose itself, before it is observed (N, 7, R).
         V: predicted twist (N, 6, R).
         jacobian: A_n, of errors (pose in B, twist) over a step (N, 12, 12, R).
-        rate: predicted dV/dt and d²V/dt² at the step's end, under the command that ends there
-            (N, 12, R).
+        latest: how the twist came there, of one step (N, 1, 3, 6, R).
         start: pose and twist of the samples themselves, what instruments did to them taken off.
     """
 
@@ -52,7 +52,7 @@ class Predictions(NamedTuple):
     X: Float[Array, "N 7 R"]
     V: Float[Array, "N 6 R"]
     jacobian: Float[Array, "N 12 12 R"]
-    rate: Float[Array, "N 12 R"]
+    latest: Recent
     start: tuple[Float[Array, "N 7 R"], Float[Array, "N 6 R"]]
 
 
@@ -77,10 +77,9 @@ def settle(model: Extended, past: Float[Array, "P n *batch"], step: Array) -> Me
     return jax.lax.scan(after, memory, (past, step))[0]
 
 
-def first_rate(V: Float[Array, "M 6 R"], step: Float[Array, "N #R"]) -> Float[Array, "12 R"]:
-    """First and second derivative of the twist before anything was predicted: of two records."""
-    rate = (V[1] - V[0]) / step[:1]
-    return jnp.concatenate([rate, jnp.zeros_like(rate)])
+def at_first(V: Float[Array, "M 6 R"], step: Float[Array, "N #R"]) -> Recent:
+    """What the twist did before anything was predicted, of two records."""
+    return Recent.steady((V[1] - V[0]) / step[:1], step[:1])
 
 
 @eqx.filter_jit
@@ -91,19 +90,21 @@ def _predict(model: Extended, effects: Any, arrays: Arrays, count: int) -> Predi
     plain = model.with_effects(())
     rest = plain.inertia()
 
-    def body(carry: tuple[Memory, Array], given: Any) -> Any:
-        memory, rate = carry
+    def body(carry: tuple[Memory, Recent], given: Any) -> Any:
+        memory, recent = carry
         X0, V0, X1, V1, command, volts, h = given
-        # what late instruments missed happened under the command before
-        x, v = model.infer(X0, V0, rate)
+        # what late instruments missed happened under the commands before
+        x, v = model.infer(X0, V0, recent)
         memory, Xp, Vp, a = advance(
             model, inertia, memory, x, v, command, h[None], count, volts[None]
         )
-        error = difference(*model.observe(Xp, Vp, a), X1, V1)
+        latest = Recent.over(v, Vp, a, h[None])
+        recent = recent.after(latest)
+        error = difference(*model.observe(Xp, Vp, recent), X1, V1)
         jacobian = _jacobian(plain, rest, x, (v + Vp) / 2, command, h)
-        return (memory, a), Predictions(error, Xp, Vp, jacobian, a, (x, v))
+        return (memory, recent), Predictions(error, Xp, Vp, jacobian, latest, (x, v))
 
-    start = settle(model, past, past_step[:, None]), first_rate(V, step)
+    start = settle(model, past, past_step[:, None]), at_first(V, step)
     return jax.lax.scan(body, start, (X[:-1], V[:-1], X[1:], V[1:], u, voltage, step))[1]
 
 

@@ -15,8 +15,9 @@ from ...models import se3
 from ...models.effects.base import Effect
 from ...models.effects.extended import Extended
 from ...models.effects.library import Library, kind
+from ...models.effects.recent import Recent
 from .data import Data
-from .innovations import Arrays, Predictions, as_arrays, first_rate, settle
+from .innovations import Arrays, Predictions, as_arrays, at_first, settle
 from .noise import Filter
 
 LANES, FEW, INSTRUMENTS = 28, 8, 18
@@ -49,16 +50,17 @@ def _respond(
     inertia = model.inertia()
 
     def body(carry: Any, given: Any) -> Any:
-        memory, nu, rate = carry
+        memory, nu, recent = carry
         p, X0, V0, command, volts, h, gap, white, exists = given
         dt = h[None, None]
         kept = through(gap, nu)
         if instruments:
             # states that instruments show otherwise go their way, and are read at its end
-            away = _apart(model.infer(X0[:, None], V0[:, None], rate[:, None]))
+            away = _apart(model.infer(X0[:, None], V0[:, None], _wide(recent)))
             away = jnp.sum(p.jacobian[:, :, None] * away[None], axis=1)
             x, v = se3.retract(p.X[:, None], away[:6]), p.V[:, None] + away[6:]
-            direct = _apart(model.observe(x, v, p.rate[:, None]))
+            recent = recent.after(p.latest)
+            direct = _apart(model.observe(x, v, _wide(recent)))
             moved = kept
         else:
             x, v = (a[:, None] for a in p.start)
@@ -72,14 +74,19 @@ def _respond(
         nu = jnp.sum(p.jacobian[:, :, None] * moved[None], axis=1) - direct
         nu = nu.at[:, 0].add(p.error)
         # lane 0 carries the base's own innovation: nothing was changed there
-        return (memory, nu, p.rate), through(white, nu) * exists[None, None]
+        return (memory, nu, recent), through(white, nu) * exists[None, None]
 
     zero = jnp.zeros((12, lanes, V.shape[2]), V.dtype)
     memory = () if instruments else settle(model, past[:, :, None], past_step[:, None, None])
-    start = (memory, zero, first_rate(V, step))
+    start = (memory, zero, at_first(V, step))
     xs = (predictions, X[:-1], V[:-1], u, voltage, step, keep, whiten, weight)
     z = jax.lax.scan(body, start, xs)[1].astype(jnp.float32)
     return jnp.moveaxis(z, 2, 0).reshape(lanes, -1, z.shape[3])
+
+
+def _wide(recent: Recent) -> Recent:
+    """The same for all lanes."""
+    return jax.tree.map(lambda a: a[..., None, :], recent)
 
 
 def _single(tree: Any) -> Any:

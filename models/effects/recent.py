@@ -1,0 +1,75 @@
+"""How a twist came to be what it is: what instruments that are late still show."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+STEPS = 4
+"""Steps that are remembered; what was before is extrapolated."""
+
+
+class Recent(eqx.Module):
+    """The twist of the last steps against that of now, a cubic over each step, latest first.
+
+    Within a step V(t - τ) = V(t) - c₁ τ + c₂ τ²/2 + c₃ τ³, where t is the step's end.
+
+    Attributes:
+        bends: c₁, c₂ and c₃ (m/s², rad/s² and per s more).
+        step: lengths of the steps (s).
+    """
+
+    bends: Float[Array, "S 3 6 *batch"]
+    step: Float[Array, "S 1 *batch"]
+
+    @classmethod
+    def steady(
+        cls,
+        A_WB_B: Float[Array, "6 *batch"],
+        step: float | Float[Array, "1 *#batch"],
+    ) -> "Recent":
+        """One acceleration (dV/dt by components) for ever; steps of `step` s will follow."""
+        zero = jnp.zeros_like(A_WB_B)
+        bends = jnp.stack([A_WB_B, zero, zero])
+        step = jnp.broadcast_to(jnp.asarray(step, zero.dtype), zero[:1].shape)
+        return cls(jnp.stack([bends] * STEPS), jnp.stack([step] * STEPS))
+
+    @classmethod
+    def over(
+        cls,
+        V0: Float[Array, "6 *#batch"],
+        V1: Float[Array, "6 *#batch"],
+        rates: Float[Array, "12 *#batch"],
+        step: float | Float[Array, "1 *#batch"],
+    ) -> "Recent":
+        """One step of `step` s from V0 to V1, at whose end dV/dt and d²V/dt² are `rates`."""
+        rate, second = rates[:6], rates[6:]
+        third = (V0 - V1 + step * (rate - step / 2 * second)) / step**3
+        bends = jnp.stack(jnp.broadcast_arrays(rate, second, third))[None]
+        step = jnp.broadcast_to(jnp.asarray(step, bends.dtype), bends[0, 0, :1].shape)
+        return cls(bends, step[None])
+
+    def after(self, latest: "Recent") -> "Recent":
+        """The same when the steps of `latest` have followed."""
+        n = len(latest.step)
+        return Recent(
+            jnp.concatenate([latest.bends, self.bends[:-n]]),
+            jnp.concatenate([latest.step, self.step[:-n]]),
+        )
+
+    def back(
+        self, late: Float[Array, "#6 *#batch"]
+    ) -> tuple[Float[Array, "6 *#batch"], Float[Array, "6 *#batch"]]:
+        """V(t - δ) - V(t), and its integral over the last δ = `late` s; δ < 0 lies ahead.
+
+        What lies ahead has the derivatives of now, what lies before the first step those there.
+        """
+        change = way = jnp.zeros_like(self.bends[0, 0])
+        last = len(self.step) - 1
+        for i, (bends, step) in enumerate(zip(self.bends, self.step, strict=True)):
+            t = late if i == 0 else jnp.maximum(late, 0.0)
+            t = t if i == last else jnp.minimum(t, step)
+            late = late - t
+            third = jnp.maximum(t, 0.0) ** 3 * bends[2]
+            way = way + t * change - t**2 / 2 * (bends[0] - t / 3 * bends[1]) + t / 4 * third
+            change = change - t * (bends[0] - t / 2 * bends[1]) + third
+        return change, way

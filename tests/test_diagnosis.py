@@ -251,6 +251,9 @@ def test_a_lag_is_named_measured_and_extended(tmp_path):
     assert said.verdict == "explained"
     assert "quadratic_drag of surge 8 (believed: 2); linear_drag" in said.sentence
     assert "inertia of" not in said.sentence
+    turned = Ratio("thrust", "heave", 3.0, Value(-3.0, "m/s²", (-3.1, -2.9)))
+    said = with_coefficients_off(replace(nothing, ratios=[*ratios, turned]))
+    assert "the most: thrust of heave -3 m/s² (believed: 3); quadratic_drag" in said.sentence
 
 
 def check(value, rule, root=None):

@@ -148,6 +148,22 @@ def test_the_ranges_are_physical_and_wrenches_have_no_curve():
     assert "voltage_exponent" not in names  # no voltage was recorded
 
 
+def test_a_command_of_the_other_sign_shows_in_the_ratios():
+    belief = load_vehicle("bluerov2_heavy")
+    X, V, _ = dive(runs=1, seconds=2.0)
+    F = np.random.default_rng(1).normal(size=(len(X), 6)) * [9.0, 9.0, 9.0, 1.0, 1.0, 1.0]
+    run = Trajectory("one", X[:, 0], V[:, 0], {"F_Bo_B": F})
+    bench = Bench.of(Recording(assemble([run], DT)), belief).with_effect(AxisThrust.neutral())
+    theta = bench.believed.copy()
+    rows = bench.library.at("axis_thrust", "heave")
+    theta[rows] = -1.5
+    found = {(r.name, r.where): r for r in ratios(bench, bench.look(theta, rows), rows)}
+    for axis, share in (("heave", -0.5), ("surge", 1.0), ("yaw", 1.0)):
+        r = found["thrust", axis]
+        assert r.believed > 0
+        assert r.found.value == pytest.approx(share * r.believed)
+
+
 def test_the_table_is_linear_between_its_knots_and_in_proportion_beyond():
     values = np.linspace(-0.5, 0.4, 2 * len(KNOTS))
     table = ThrustTable(jnp.asarray(values))

@@ -49,7 +49,9 @@ def _forecast(
         recent = recent.after(Recent.over(v, Vp, a, h[None]))
         return (memory, x, Vp, recent), model.observe(x, Vp, recent)
 
-    start = (settle(model, past, past_step[:, None]), X[0], V[0], at_first(V, step))
+    memory = settle(model, past, past_step[:, None])
+    first = at_first(model, inertia, memory, X[0], V[0], past[-1], voltage[:1], step[:1])
+    start = (memory, X[0], V[0], first)
     before = jnp.concatenate([past[-1:], u[:-1]])
     xs = (jnp.arange(len(u)), X[:-1], V[:-1], u, before, voltage, step)
     return jax.lax.scan(body, start, xs)[1]

@@ -288,8 +288,11 @@ def _errors(
         return (memory, pushes, x, v, recent), e.astype(jnp.float32)
 
     zero = jnp.zeros((1, S, R), V.dtype)
-    recent = jax.tree.map(lambda a: jnp.repeat(a[..., None, :], S, axis=-2), at_first(V, step))
     memory = settle(model, past[:, :, None] + zero[None], past_step[:, None, None])
+    recent = at_first(
+        model, inertia, memory, X[0][:, None] + zero, V[0][:, None] + zero,
+        past[-1][:, None] + zero, voltage[:1, None], step[:1, None],
+    )  # fmt: skip
     pushes = random.carried(u[0][:, None] + zero)[1]
     start = (memory, pushes, X[0][:, None] + zero, V[0][:, None] + zero, recent)
     before = jnp.concatenate([past[-1:], u[:-1]])

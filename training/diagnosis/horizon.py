@@ -117,9 +117,9 @@ def _errors(model: Extended, arrays: tuple, count: int) -> Float[Array, "M 12 K"
         seen_X, seen_V = model.observe(x, Vp, recent)
         return (memory, x, Vp, recent), jnp.concatenate([se3.local(X1, seen_X), seen_V - V1])
 
-    recent = at_first(V, step)
-    state = model.infer(X[0], V[0], recent)
-    start = (settle(model, past, past_step[:, None]), *state, recent)
+    memory = settle(model, past, past_step[:, None])
+    first = at_first(model, inertia, memory, X[0], V[0], past[-1], voltage[:1], step[:1])
+    start = (memory, *model.infer(X[0], V[0], first), first)
     return jax.lax.scan(body, start, (X[1:], V[1:], u, voltage, step))[1]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...models import se3
-from ...models.effects.extended import Extended, Memory
+from ...models.effects.extended import Extended, Inertia, Memory
 from ...models.effects.library import Library
 from ...models.effects.predict import advance
 from ...models.effects.recent import Recent
@@ -46,6 +46,7 @@ class Predictions(NamedTuple):
         jacobian: A_n, of errors (pose in B, twist) over a step (N, 12, 12, R).
         latest: how the twist came there, of one step (N, 1, 3, 6, R).
         start: pose and twist of the samples themselves, what instruments did to them taken off.
+        first: how the twist came to be that of the first sample.
     """
 
     error: Float[Array, "N 12 R"]
@@ -54,6 +55,7 @@ class Predictions(NamedTuple):
     jacobian: Float[Array, "N 12 12 R"]
     latest: Recent
     start: tuple[Float[Array, "N 7 R"], Float[Array, "N 6 R"]]
+    first: Recent | None = None
 
 
 def difference(
@@ -77,9 +79,13 @@ def settle(model: Extended, past: Float[Array, "P n *batch"], step: Array) -> Me
     return jax.lax.scan(after, memory, (past, step))[0]
 
 
-def at_first(V: Float[Array, "M 6 R"], step: Float[Array, "N #R"]) -> Recent:
-    """What the twist did before anything was predicted, of two records."""
-    return Recent.steady((V[1] - V[0]) / step[:1], step[:1])
+def at_first(
+    model: Extended, inertia: Inertia, memory: Memory, X: Float[Array, "7 *#b"],
+    V: Float[Array, "6 *#b"], before: Float[Array, "n *#b"], voltage: Array, step: Array,
+) -> Recent:  # fmt: skip
+    """What the twist did before anything was predicted: under the command `before` the first."""
+    level = model.actuate(memory, before, step, 1)[1][..., 0]
+    return Recent.steady(model.drift(inertia, X, V, level, voltage), step)
 
 
 @eqx.filter_jit
@@ -104,8 +110,10 @@ def _predict(model: Extended, effects: Any, arrays: Arrays, count: int) -> Predi
         jacobian = _jacobian(plain, rest, x, (v + Vp) / 2, command, h)
         return (memory, recent), Predictions(error, Xp, Vp, jacobian, latest, (x, v))
 
-    start = settle(model, past, past_step[:, None]), at_first(V, step)
-    return jax.lax.scan(body, start, (X[:-1], V[:-1], X[1:], V[1:], u, voltage, step))[1]
+    memory = settle(model, past, past_step[:, None])
+    first = at_first(model, inertia, memory, X[0], V[0], past[-1], voltage[:1], step[:1])
+    xs = (X[:-1], V[:-1], X[1:], V[1:], u, voltage, step)
+    return jax.lax.scan(body, (memory, first), xs)[1]._replace(first=first)
 
 
 def _jacobian(model: Extended, inertia: Any, X: Array, V: Array, u: Array, dt: Array) -> Array:

@@ -33,6 +33,7 @@ _UNITS = {
     "quadratic_drag": ("1/m", "1"),
     "linear_drag": ("1/s", "1/s"),
     "half_thrust": ("m/s²", "rad/s²"),
+    "thrust": ("m/s²", "rad/s²"),
     "restoring": ("", "rad/s²"),
     "net_buoyancy": ("m/s²", ""),
 }
@@ -44,7 +45,8 @@ def ratios(bench: Bench, look: Look, rows: Sequence[int]) -> list[result.Ratio]:
 
     `inertia` is in proportion to surge's (of rotations to roll's), everything else over the
     axis' inertia; `half_thrust` is the acceleration when all thrusters push along the axis at
-    half command, for commands by PWM. Empty for a base without constant coefficients.
+    half command, for commands by PWM, `thrust` that at the commands' RMS where they are forces or
+    wrenches. Empty for a base without constant coefficients.
     """
     if not isinstance(bench.model.base, FossenDynamics) or not rows:
         return []
@@ -86,7 +88,8 @@ def _numbers(bench: Bench) -> Callable[[np.ndarray], dict[tuple[str, str], float
     nominal = float(thrusters.nominal_voltage)
     identity = se3.identity(jnp.float64)
     B = np.asarray(bench.model.allocate(jnp.eye(data.u.shape[1])))
-    half = 1500.0 + _HALF * np.sign(np.round(B, 9))
+    along = np.sign(np.round(B, 9))
+    usual = np.sqrt((data.u**2 * data.weight[:, None]).sum(axis=(0, 2)) / data.weight.sum())
 
     @eqx.filter_jit
     def at_rest(model: Extended, effects: tuple, X: Array) -> Array:
@@ -96,16 +99,17 @@ def _numbers(bench: Bench) -> Callable[[np.ndarray], dict[tuple[str, str], float
         return wrench + model.extra_wrench(X, still)
 
     @eqx.filter_jit
-    def pushed(model: Extended, effects: tuple, pwm: Array) -> Array:
+    def pushed(model: Extended, effects: tuple, commands: Array) -> Array:
         """Wrenches (6, 6) of commands for all thrusters (6, n)."""
         still, model = jnp.zeros(6), model.with_effects(effects)
 
-        def wrench(pwm: Array) -> Array:
-            force = thrusters.force(pwm, jnp.full(len(pwm), volts * nominal))
+        def wrench(command: Array) -> Array:
+            volt = jnp.full(len(command), volts * nominal)
+            force = thrusters.force(command, volt) if data.command == "pwm" else command
             given = model.thrust(force, still, jnp.array([volts]))
             return model.together(model.allocate(given))
 
-        return jax.vmap(wrench)(pwm)
+        return jax.vmap(wrench)(commands)
 
     def numbers(theta: Float[np.ndarray, " p"]) -> dict[tuple[str, str], float]:
         effects = bench.library.filled(theta)
@@ -117,10 +121,11 @@ def _numbers(bench: Bench) -> Callable[[np.ndarray], dict[tuple[str, str], float
                 change = theta[bench.library.index(name, axis, "change")]
                 value = bench.believes(name, axis) + change
                 found[name, axis] = float(value / inertia[i])
-        if data.command == "pwm":
-            F = np.asarray(pushed(bench.model, effects, jnp.asarray(half)))
-            for i, axis in enumerate(AXES):
-                found["half_thrust", axis] = float(F[i, i] / inertia[i])
+        pwm = data.command == "pwm"
+        commands = 1500.0 + _HALF * along if pwm else usual * along
+        F = np.asarray(pushed(bench.model, effects, jnp.asarray(commands)))
+        for i, axis in enumerate(AXES):
+            found["half_thrust" if pwm else "thrust", axis] = float(F[i, i] / inertia[i])
         for i, axis in ((3, "roll"), (4, "pitch")):
             tilted = se3.retract(identity, jnp.zeros(6).at[i].set(_TILT))
             less = level[i] - at_rest(bench.model, effects, tilted)[i]

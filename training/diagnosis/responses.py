@@ -17,7 +17,7 @@ from ...models.effects.extended import Extended
 from ...models.effects.library import Library, kind
 from ...models.effects.recent import Recent
 from .data import Data
-from .innovations import Arrays, Predictions, as_arrays, at_first, settle
+from .innovations import Arrays, Predictions, as_arrays, settle
 from .noise import Filter
 
 LANES, FEW, INSTRUMENTS = 28, 8, 18
@@ -46,6 +46,7 @@ def _respond(
     model = model.with_effects(effects)
     if not instruments:
         model, predictions, arrays, filters = _single((model, predictions, arrays, filters))
+    first, predictions = predictions.first, predictions._replace(first=None)
     (X, V, u, voltage, step, past, past_step), (keep, whiten, weight) = arrays, filters
     inertia = model.inertia()
 
@@ -78,7 +79,7 @@ def _respond(
 
     zero = jnp.zeros((12, lanes, V.shape[2]), V.dtype)
     memory = () if instruments else settle(model, past[:, :, None], past_step[:, None, None])
-    start = (memory, zero, at_first(V, step))
+    start = (memory, zero, first)
     xs = (predictions, X[:-1], V[:-1], u, voltage, step, keep, whiten, weight)
     z = jax.lax.scan(body, start, xs)[1].astype(jnp.float32)
     return jnp.moveaxis(z, 2, 0).reshape(lanes, -1, z.shape[3])

@@ -28,6 +28,7 @@ from ...models.effects.extended import Extended, times
 from ...models.effects.unknown import MOTION, TWIST, Unknown, powers
 from .hypotheses import Chance
 from .looking import Bench, Look
+from .naming import CLEAR
 from .responses import through
 
 LANES = 24
@@ -45,8 +46,9 @@ _CORRELATED, _MOST_CORRELATED = 0.1, 2
 """Correlation of neighbouring innovations from which an axis may remember other velocities, and so
 many axes at most."""
 _PRIORS = (0.3, 3.0, 30.0)
-_LEAST, CLEAR = 8.0, 2.5
-"""Nats, and standard errors between runs, below which a gain is not looked at further."""
+_LEAST, _ROBUST = 8.0, 2.5
+"""Nats below which a gain is not looked at further, and standard errors between runs below which it
+must be as clear as a name's (`naming.CLEAR`)."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +201,7 @@ class Screen:
     ) -> Matched:
         """Held-out gain of a group, and what noise alone wins at most with probability α.
 
-        That threshold is infinite where the gain is small, or not clear between runs.
+        That threshold is infinite where the gain is small, and larger where runs disagree.
         """
         J = self.responses(group)
         columns = np.concatenate([self.z, J]).astype(np.float64)
@@ -221,16 +223,18 @@ class Screen:
             before = np.einsum("rij,i,j->r", G[own], w0, w0)
             after = np.einsum("rij,i,j->r", G[own], w, w)
             np.add.at(heldout, of_run[own], (before - after) / 2)
-        # self-normalised: runs that excite much win much, whatever is there
-        spread = np.sqrt(np.sum(heldout**2))
-        clear = min(CLEAR, 0.8 * np.sqrt(len(heldout)))
+        gain = float(heldout.sum())
         if not draws:
             return Matched(group, heldout, node, 0.0)
-        if heldout.sum() <= max(_LEAST, clear * spread):
+        if gain <= _LEAST:
             return Matched(group, heldout, node, np.inf)
         chance = self._null(folds, free, group, size, rng, draws)
-        beyond = chance.beyond(float(heldout.sum()))
-        return Matched(group, heldout, node, chance.exceeded(alpha), beyond)
+        # self-normalised: runs that excite much win much, whatever is there
+        robust = min(_ROBUST, 0.8 * np.sqrt(len(heldout))) * np.sqrt(np.sum(heldout**2))
+        above = 1.0 if gain > robust else CLEAR
+        return Matched(
+            group, heldout, node, above * chance.exceeded(alpha), chance.beyond(gain / above)
+        )
 
     def sparse(self, group: Group, most: int = 4) -> tuple[float, ...]:
         """The few columns that orthogonal matching takes first (Pati et al. 1993)."""

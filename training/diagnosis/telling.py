@@ -243,12 +243,15 @@ def with_coefficients_off(diagnosis: result.Diagnosis) -> result.Diagnosis:
     """The finding on a belief whose coefficients explain what it gets wrong."""
 
     def factor(r: result.Ratio) -> float:
-        return abs(np.log(r.found.value / r.believed))
+        """How far off; what has the other sign counts for most."""
+        share = r.found.value / r.believed
+        return abs(np.log(share)) if share > 0 else np.inf
 
     off: dict[str, result.Ratio] = {}  # of each kind the one that is off most
     for r in diagnosis.ratios:
         low, high = r.found.interval95
-        if r.believed * r.found.value > 0 and not low <= r.believed <= high:
+        turned = r.believed * r.found.value < 0 and not low <= 0 <= high
+        if turned or (r.believed * r.found.value > 0 and not low <= r.believed <= high):
             off[r.name] = max(off.get(r.name, r), r, key=factor)
     units = {"1": ""}
     told = "; ".join(

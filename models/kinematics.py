@@ -82,6 +82,19 @@ def _increments(
     return np.add.reduceat(moved, edges, axis=1), np.add.reduceat(integrated, edges, axis=1)
 
 
+def dead_reckoned(
+    t: Float[np.ndarray, " N"], X_WB: Float[np.ndarray, "N 7"], V_WB_B: Float[np.ndarray, "N 6"]
+) -> Float[np.ndarray, "N 7"]:
+    """Poses with coordinates that were not measured (NaN) integrated from the twist, from zero.
+
+    Velocities are turned into W by the recorded attitude; trapezoids from sample to sample.
+    """
+    v_W = rotate(X_WB[:, :4].T, V_WB_B[:, :3].T).T
+    moved = np.cumsum((v_W[1:] + v_W[:-1]) / 2 * np.diff(t)[:, None], axis=0)
+    path = np.concatenate([np.zeros((1, 3)), moved])
+    return np.concatenate([X_WB[:, :4], np.where(np.isnan(X_WB[:, 4:]), path, X_WB[:, 4:])], axis=1)
+
+
 def _flip(x: np.ndarray, rows: tuple[int, ...]) -> np.ndarray:
     sign = np.ones((x.shape[0], 1))
     sign[list(rows)] = -1

@@ -46,7 +46,7 @@ def residual_figure(finding: Finding) -> Figure:
         variance = (z**2).sum(axis=(0, 2)) / w.sum()
         memory = (z[1:] * z[:-1]).sum(axis=(0, 2)) / np.maximum((z**2).sum(axis=(0, 2)), 1e-300)
         for ax, values in zip(axes[0], (variance, memory), strict=True):
-            ax.bar(x + 0.38 * (k - 0.5), values, 0.36, color=color, label=name)
+            ax.bar(x + 0.38 * (k - 0.5), values * finding.data.told, 0.36, color=color, label=name)
     axes[0, 0].axhline(1, color=INK, lw=1, ls="--")
     axes[0, 0].set_title("Variance against the noise's (1)")
     axes[0, 1].set_title("Correlation at one step (0)")

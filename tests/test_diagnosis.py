@@ -12,6 +12,7 @@ from hidden.draw import draw
 from hidden.scenarios import Plan
 
 from spinndrift.models.effects import KINDS, Extended, Library
+from spinndrift.models.errors import UserError
 from spinndrift.models.recording import Recording
 from spinndrift.models.recording_csv import read_csv
 from spinndrift.models.vehicle import load_vehicle
@@ -49,6 +50,8 @@ from spinndrift.training.diagnosis.search import Found, Search
 from spinndrift.training.diagnosis.telling import (
     CHANNELS,
     left_over,
+    noise_words,
+    residual,
     sentence,
     verdict,
     with_coefficients_off,
@@ -505,6 +508,36 @@ def test_an_instrument_slower_than_the_rows_is_told(tmp_path):
     assert len(told) == 1
     assert told[0].startswith("u,v,w repeat the sample before in 75% of the rows")
     assert not faulty
+
+
+def test_positions_that_were_not_measured_tell_nothing_and_ask_for_nothing(tmp_path):
+    """A lever arm is in what is dead-reckoned as well, so that must not count as a second witness."""
+    case, recording = recorded(tmp_path, 2, names=("dvl_lever_arm",), size=2.0)
+    hidden = recording.dataset.copy(deep=True)
+    hidden["X_WB"][..., 4:6] = np.nan
+    diagnoser = Diagnoser(Recording(hidden), VEHICLE)
+    bench = diagnoser.bench
+    assert bench.data.unmeasured == ("x", "y")
+    assert not diagnoser.faults
+    look = bench.look(bench.believed)
+    elsewhere = bench.data.X.copy()
+    elsewhere[:, 4] += np.sin(bench.data.times)
+    moved = replace(bench, data=replace(bench.data, X=elsewhere))
+    np.testing.assert_allclose(moved.look(bench.believed).z, look.z, atol=2e-3)
+    assert np.abs(look.z[:, :3]).max() < 0.01
+    rows = [bench.library.index("dvl_lever_arm", axis, "offset") for axis in "xyz"]
+    theta, after, fit = bench.polish(bench.believed, rows)
+    arm = np.array([p["value"] for p in case.effects[0].parameters().values()])
+    assert np.all(np.abs(theta[rows] - arm) < 3 * fit.errors)
+    assert np.all(fit.errors < 0.02)
+    np.testing.assert_allclose((after.z[:, 3:] ** 2).mean(axis=(0, 2)), 1.0, atol=0.15)
+    left = residual(bench, after)
+    assert all(np.isnan(left[name].variance_ratio) for name in "xyz")
+    assert "position_m" not in noise_words(bench, after)
+    assert "x, y of the position were not measured" in limits(bench.data, [], False)[0]
+    hidden["V_WB_B"][..., 0] = np.nan
+    with pytest.raises(UserError, match="V_WB_B u is missing; a diagnosis needs"):
+        Diagnoser(Recording(hidden), VEHICLE)
 
 
 def test_axes_that_are_not_driven_and_filled_samples_are_told(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from motion import smooth_motion
 
-from spinndrift.models.kinematics import agreement, contradictions
+from spinndrift.models.kinematics import agreement, contradictions, dead_reckoned
 from spinndrift.models.resample import conjugate, rotate
 
 T = np.arange(0.0, 20.0, 0.05)
@@ -95,3 +95,18 @@ def test_mix_ups_are_named(mix_up, sentence, seed):
     errors, _ = contradictions(T, *mix_up(*smooth_motion(T, seed=seed)))
     assert len(errors) == 1
     assert sentence in errors[0]
+
+
+def test_dead_reckoning_is_of_second_order_and_keeps_what_was_measured():
+    errors = []
+    for step in (0.1, 0.05):
+        t = np.arange(0.0, 20.0, step)
+        X, V, _ = smooth_motion(t)
+        lacking = X.T.copy()
+        lacking[:, 4:6] = np.nan
+        found = dead_reckoned(t, lacking, V.T)
+        np.testing.assert_array_equal(found[:, [0, 1, 2, 3, 6]], X.T[:, [0, 1, 2, 3, 6]])
+        np.testing.assert_array_equal(found[0, 4:6], 0.0)
+        errors.append(np.abs(found[:, 4:6] - (X[4:6] - X[4:6, :1]).T).max())
+    assert errors[1] < 0.02
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)

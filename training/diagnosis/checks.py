@@ -53,7 +53,8 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
         step = recording.dt if elapsed is None else np.diff(elapsed)
         speed = np.linalg.norm(run.V_WB_B[:-1, :3], axis=1) * step
         excess = np.abs(moved - speed)
-        if np.nansum(excess > 30 * np.nanmedian(excess) + 0.1):
+        excess = excess[np.isfinite(excess)]
+        if excess.size and np.any(excess > 30 * np.median(excess) + 0.1):
             jumps.append(number)
         if spikes(run.V_WB_B.T).any():
             spiked.append(number)
@@ -136,6 +137,12 @@ def limits(
         )
     if data.command == "F_Bo_B":
         found.append("commands are wrenches: single thrusters can't be told apart")
+    if data.unmeasured:
+        found.append(
+            f"{', '.join(data.unmeasured)} of the position were not measured (dead-reckoned from "
+            "the velocities): what velocities and positions tell together can't be told: the "
+            "scale and direction of the DVL, errors of the heading"
+        )
     if not data.has_voltage:
         found.append("no voltage was recorded: voltage_sag can't be told")
     if resampled:

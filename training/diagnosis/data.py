@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ...models.errors import UserError
+from ...models.kinematics import dead_reckoned
 from ...models.recording import Recording
 from ...models.vehicle import Vehicle
 
@@ -49,6 +50,8 @@ class Data:
         dt: mean step (s).
         command: what the commands were made of: thruster_force, pwm or F_Bo_B.
         has_voltage: whether the voltage was recorded.
+        unmeasured: coordinates of the position that are integrals of the velocity alone. Then no
+            coordinate tells of errors: in B they are mixed.
     """
 
     X: Float[np.ndarray, "M 7 R"]
@@ -65,6 +68,14 @@ class Data:
     dt: float
     command: str
     has_voltage: bool
+    unmeasured: tuple[str, ...] = ()
+
+    @property
+    def told(self) -> Float[np.ndarray, "12"]:
+        """1 for errors (pose in B, twist) that records tell, 0 for others."""
+        found = np.ones(12)
+        found[:3] = not self.unmeasured
+        return found
 
     @property
     def left_out(self) -> Literal["scenario", "run", "block"]:
@@ -136,13 +147,20 @@ def make_data(
     voltage; a wrench is split over the thrusters with the least effort. Runs `without` (by number,
     scenario by scenario) are left out, unless none would remain. What thrusters did before a run is
     not known: its first `remembered` s (a tenth of it at most) are only what they remember.
+    Positions that were not measured are dead-reckoned.
 
     Raises:
-        UserError: a channel of pose or twist is missing, or no run has two samples.
+        UserError: attitude or a channel of the twist is missing, or no run has two samples.
     """
-    if lacking := recording.missing:
+    lacking = recording.missing
+    of_pose = lacking.get("X_WB", ())
+    unmeasured = tuple(c for c in of_pose if c in ("x", "y", "z"))
+    if "V_WB_B" in lacking or unmeasured != of_pose:
         channels = ", ".join(f"{name} {'/'.join(which)}" for name, which in lacking.items())
-        raise UserError(f"recording: {channels} is missing; a diagnosis needs pose and twist")
+        raise UserError(
+            f"recording: {channels} is missing; a diagnosis needs attitude and all of the twist. "
+            "Without a DVL give u, v, w from measured positions (differences, turned into B)"
+        )
     thrusters = vehicle.thrusters()
     data = recording.dataset
     name = next(c for c in ("thruster_force", "pwm", "F_Bo_B") if c in recording.commands)
@@ -162,9 +180,10 @@ def make_data(
     for number, (j, k) in enumerate(np.argwhere(kept).tolist()):
         length = int(lengths[j, k])
         times = recording.elapsed(j, k)
+        V = data["V_WB_B"].to_numpy()[j, k, :length]
         values = {
-            "X": data["X_WB"].to_numpy()[j, k, :length],
-            "V": data["V_WB_B"].to_numpy()[j, k, :length],
+            "X": dead_reckoned(times, data["X_WB"].to_numpy()[j, k, :length], V),
+            "V": V,
             "command": data[name].to_numpy()[j, k, :length],
         }
         volts = np.full(length, nominal)
@@ -209,6 +228,7 @@ def make_data(
         dt=mean,
         command=name,
         has_voltage=has_voltage,
+        unmeasured=unmeasured,
     )
 
 

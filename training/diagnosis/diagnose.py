@@ -196,7 +196,7 @@ class Diagnoser:
                 limits=limits(
                     d, self.quiet, self.resampled, final.noise.estimated, self.command_period
                 ),
-                noise=telling.noise_words(final),
+                noise=telling.noise_words(bench, final),
             ),
             tested=tested,
             threshold=found.threshold,

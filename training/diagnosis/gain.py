@@ -88,7 +88,7 @@ def scores(bench: Bench, contender: Contender, estimated: bool) -> Scores:
     if contender.box is not None:
         h = data.step[:, None]
         a = np.asarray(contender.box.acceleration(*arguments(data))).swapaxes(0, 1) * h
-        error = error - np.concatenate([a * h / 2, a], axis=1)
+        error = error - np.concatenate([a * h / 2, a], axis=1) * data.told[:, None]
     mass = bench.mass(theta.mean(axis=1))
     density = np.zeros(len(data.fold))
     record, diffusion = np.zeros((12, len(density))), np.zeros((6, len(density)))

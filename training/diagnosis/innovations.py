@@ -147,4 +147,5 @@ def _jacobian(model: Extended, inertia: Any, X: Array, V: Array, u: Array, dt: A
 def predict(model: Extended, library: Library, theta: np.ndarray, data: Data) -> Predictions:
     """Predictions of all samples with the effects' values `theta`: (p,), or (p, R) by piece."""
     effects = library.filled(theta.reshape(len(theta), -1))
-    return _predict(model, effects, as_arrays(data), substeps(data.longest))
+    found = _predict(model, effects, as_arrays(data), substeps(data.longest))
+    return found._replace(error=found.error * data.told[None, :, None]) if data.unmeasured else found

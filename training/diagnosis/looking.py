@@ -291,7 +291,7 @@ class Bench:
         C = np.einsum("nir,njr->ij", error, error) / self.data.weight.sum()
         if apart:
             C[:6, 6:], C[6:, :6] = 0.0, 0.0
-        return C
+        return C + np.diag(self.data.told == 0)
 
     def merit(self, C: Float[np.ndarray, "12 12"]) -> float:
         """Minus the log likelihood of errors of that covariance."""

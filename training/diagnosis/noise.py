@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .data import all_equal
 from .likely_noise import most_likely
@@ -30,6 +30,8 @@ these axes are correlated that much. States that are known exactly have none of 
 nor has what noise hides."""
 _LONGEST = 0.98
 """Largest correlation of neighbouring errors that is believed."""
+_DEAF = 10.0
+"""Standard deviation (m, rad) of a pose that was not measured: it tells nothing."""
 _BELOW = 0.1
 """Share of `FLOOR` that is the least when the most likely noise is sought: a floor of the order of
 what the process makes of a pose within a step would be taken from the process."""
@@ -51,6 +53,7 @@ class Noise:
         memory: how many samples tell as much as one independent one (12,).
         error: standard error of b; half of b where data are too few, zero for estimated states.
         estimated: whether the records are states that a filter has estimated.
+        silent: poses that never err (12,), such as those that were not measured.
     """
 
     record: Float[np.ndarray, "12"]
@@ -59,6 +62,12 @@ class Noise:
     memory: Float[np.ndarray, "12"] = field(default_factory=lambda: np.ones(12))
     error: Float[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
     estimated: bool = False
+    silent: Bool[np.ndarray, "12"] = field(default_factory=lambda: np.zeros(12, bool))
+
+    @property
+    def trusted(self) -> Float[np.ndarray, "12"]:
+        """Standard deviations of the records that a filter counts on."""
+        return np.where(self.silent, _DEAF, self.record)
 
     def with_diffusion(self, values: Mapping[int, float]) -> "Noise":
         """The same with another b of some axes."""
@@ -132,6 +141,8 @@ def estimate(
     `estimated` is told by the errors unless it is known.
     """
     held = {} if held is None else held
+    silent = np.zeros(12, bool)
+    silent[:6] = np.max(np.abs(error[:, :6] * weight[:, None]), axis=(0, 2)) == 0
     C = []
     for lag in range(3):
         w = weight[lag:] * weight[: len(weight) - lag]
@@ -147,7 +158,8 @@ def estimate(
     if estimated is None:
         estimated = bool(np.sum(none[6:]) >= _SMOOTH or np.sum(near) >= _SMOOTH_OF_ALL)
     if estimated:
-        return _of_estimates(C[0], C[1], variance, A, inverse, unit, dt).with_diffusion(held)
+        of_estimates = _of_estimates(C[0], C[1], variance, A, inverse, unit, dt)
+        return replace(of_estimates.with_diffusion(held), silent=silent)
     C0 = C[0] - (C[2] + C[2].T) / 2
     Q = C0 - np.diag(variance) - transition.of(np.diag(variance))
     least = 1e-8 * np.diag(C[0])[6:] / unit
@@ -159,7 +171,8 @@ def estimate(
         start[12 + i], fixed[i] = b**2, True
     found, errors = most_likely(error, weight, transition, units, start, bounds, fixed)
     b = np.sqrt(found[12:])
-    return Noise(np.maximum(np.sqrt(found[:12]), FLOOR), b, error=errors / (2 * b))
+    record = np.maximum(np.sqrt(found[:12]), FLOOR)
+    return Noise(record, b, error=errors / (2 * b), silent=silent)
 
 
 def _of_estimates(
@@ -201,8 +214,8 @@ def make_filter(
     process = _process(noise, transition.mean, mass_inverse, dt, step)
     if all_equal(step, dt):
         found, P = _filter(noise, process, step[:, :1], dt, transition)
-        share = np.diag(transition.added(P)) / (np.diag(transition.of(P)) + noise.record**2)
-        if jacobian is None or np.max(share) < _MUCH:
+        share = np.diag(transition.added(P)) / (np.diag(transition.of(P)) + noise.trusted**2)
+        if jacobian is None or np.max(share[~noise.silent]) < _MUCH:
             return found
     return _filter(noise, process, step, dt, transition, jacobian)[0]
 
@@ -220,7 +233,7 @@ def _filter(
     jacobian: Float[np.ndarray, "N 12 12 R"] | None = None,
 ) -> tuple[Filter, Float[np.ndarray, "12 12"]]:
     """A filter for each column of `step`, and the first one's last covariance."""
-    R, eye = np.diag(noise.record**2), np.eye(12)
+    R, eye = np.diag(noise.trusted**2), np.eye(12)
     count = step.shape[1]
     P = np.repeat(R[None], count, 0)
     gap = np.zeros_like(P)  # I - K: the first record is believed as it is

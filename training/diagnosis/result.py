@@ -88,7 +88,8 @@ class AxisResidual:
     """What is left on an axis, against what the noise explains.
 
     Attributes:
-        variance_ratio: innovations' variance over the predicted one; 1 is all explained.
+        variance_ratio: innovations' variance over the predicted one; 1 is all explained, null
+            (all three) what was not measured.
         autocorrelation: at one step; 0 for white.
         mean: in standard errors of a mean of independent numbers.
     """

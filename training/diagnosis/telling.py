@@ -87,13 +87,14 @@ def refitted(bench: Bench, look: Look, rows: Sequence[int], joint: Fit) -> list[
 
 
 def residual(bench: Bench, look: Look) -> dict[str, result.AxisResidual]:
-    """What is left, channel by channel."""
+    """What is left, channel by channel; not a number where nothing was measured."""
     n, correlation = bench.data.weight.sum(), look.correlation
     found = {}
     for i, name in enumerate(CHANNELS):
         z = look.z[:, i]
         mean = float(z.sum() / np.sqrt(n))
-        found[name] = result.AxisResidual(float((z**2).sum()) / n, float(correlation[i]), mean)
+        values = float((z**2).sum()) / n, float(correlation[i]), mean
+        found[name] = result.AxisResidual(*(values if bench.data.told[i] else [np.nan] * 3))
     return found
 
 
@@ -109,7 +110,7 @@ def left_over(
         return []
     alike = {name: residual[name].autocorrelation for name in CHANNELS}
     of = [name for name in CHANNELS[6:] if alike[name] > _FOLLOWING]
-    if len(of) < _SEVERAL or max(abs(alike[name]) for name in CHANNELS[:3]) > _FOLLOWING / 2:
+    if len(of) < _SEVERAL or any(abs(alike[name]) > _FOLLOWING / 2 for name in CHANNELS[:3]):
         return []
     return [
         f"errors of {', '.join(of)} follow each other (correlations up to "
@@ -267,10 +268,12 @@ def with_coefficients_off(diagnosis: result.Diagnosis) -> result.Diagnosis:
     )
 
 
-def noise_words(look: Look) -> dict[str, float]:
+def noise_words(bench: Bench, look: Look) -> dict[str, float]:
     """Levels of noise, mean over the axes of a sensor."""
     groups = ("position_m", "attitude_rad", "velocity_m_s", "rate_rad_s")
     found = {g: float(np.mean(look.noise.record[3 * i : 3 * i + 3])) for i, g in enumerate(groups)}
+    if bench.data.unmeasured:
+        del found["position_m"]
     return found | {
         f"diffusion_{a}": float(b) for a, b in zip(AXES, look.noise.diffusion, strict=True)
     }

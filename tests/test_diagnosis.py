@@ -511,7 +511,7 @@ def test_an_instrument_slower_than_the_rows_is_told(tmp_path):
 
 
 def test_positions_that_were_not_measured_tell_nothing_and_ask_for_nothing(tmp_path):
-    """A lever arm is in what is dead-reckoned as well, so that must not count as a second witness."""
+    """A lever arm is in what is dead-reckoned too: that must not count as a second witness."""
     case, recording = recorded(tmp_path, 2, names=("dvl_lever_arm",), size=2.0)
     hidden = recording.dataset.copy(deep=True)
     hidden["X_WB"][..., 4:6] = np.nan

@@ -156,6 +156,7 @@ class Diagnoser:
             least += _RESAMPLED * bench.data.steps
         # what the names leave of their own is no law
         least = max(least, OF_OTHERS * sum(choice.fit.heldout_gain for choice in found.accepted))
+        least = max(least, found.left_undescribed)
         laws = [] if final.noise.estimated else all_laws(bench, final, least)
         groups = told_laws(laws, bench, final, least)
         shaped = [law for group in groups for law in group if law.name != LEVEL]

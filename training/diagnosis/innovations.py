@@ -148,4 +148,6 @@ def predict(model: Extended, library: Library, theta: np.ndarray, data: Data) ->
     """Predictions of all samples with the effects' values `theta`: (p,), or (p, R) by piece."""
     effects = library.filled(theta.reshape(len(theta), -1))
     found = _predict(model, effects, as_arrays(data), substeps(data.longest))
-    return found._replace(error=found.error * data.told[None, :, None]) if data.unmeasured else found
+    return (
+        found._replace(error=found.error * data.told[None, :, None]) if data.unmeasured else found
+    )

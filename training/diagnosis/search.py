@@ -36,6 +36,9 @@ _CLOSE = 0.7
 _TAKEN_BACK = 2
 _OF_A_LAW = 0.02
 """Share of what the best law wins that a name must win where the law wins more."""
+_OF_A_DESCRIPTION = 0.02
+"""Share of what structure without a name wins that a name or law must win beside it: a few bumps or
+one frequency describe no more exactly."""
 _LEFT = 0.05
 """Share of what the laws win that is hardly anything."""
 _OF_ESTIMATES = 0.05
@@ -74,6 +77,12 @@ class Found:
     def hypotheses(self) -> list[Hypothesis]:
         """The causes named."""
         return [choice.hypothesis for choice in self.accepted]
+
+    @property
+    def left_undescribed(self) -> float:
+        """Nats that descriptions of structure without a name may leave of it."""
+        described = (c.fit.heldout_gain for c in self.accepted if c.hypothesis[0] == "unknown")
+        return _OF_A_DESCRIPTION * sum(described)
 
 
 def refitted(bench: Bench, refit: str) -> list[int]:
@@ -232,7 +241,7 @@ class Search:
         gains = {c.hypothesis[0]: c.fit.heldout_gain for c in found.accepted}
 
         def best(least: float) -> Choice | None:
-            needed = max(found.threshold, least)
+            needed = max(found.threshold, found.left_undescribed, least)
             return choose(bench.library, current.theta, fits, needed, self.alpha, gains, strict)
 
         def chosen() -> Choice | None:

@@ -126,7 +126,7 @@ def test_what_a_name_wins_exactly_is_likelihood(tmp_path):
     data, scores = bench.data, []
     for one in (look, seen):
         error, jacobian = (np.asarray(a) for a in (one.predictions.error, one.predictions.jacobian))
-        steps = Transition.along(jacobian, data.weight)
+        steps = Transition.along(jacobian, data.weight, np.zeros(6))
         inverse = np.linalg.inv(bench.mass(one.theta))
         given = one.noise, steps, inverse, data.dt, data.step, data.weight
         scores.append(score_of(error, jacobian, *given).sum())

@@ -109,7 +109,10 @@ def test_a_level_is_told_from_pushes_that_last(believed):
     steps = Transition.constant(A)
     alone = estimate(error, weight, steps, MASS, DT)
     assert np.all(alone.diffusion[[0, 2, 3]] > 1.2 * b[[0, 2, 3]])
-    units, start = unit_processes(A, inverse, DT), np.concatenate([alone.record, alone.diffusion])
+    units, start = (
+        unit_processes(steps, inverse, DT),
+        np.concatenate([alone.record, alone.diffusion]),
+    )
     left, lost = beside_pushes(
         error, weight, steps, units, once, DT, start**2, believed * b, [0, 1, 3]
     )
@@ -151,7 +154,7 @@ def test_a_transition_carries_what_jacobians_that_change_make_of_errors():
     weight[40:, 3] = 0
     P = np.diag(RECORD**2) + 1e-5
     exact = np.einsum("nijr,jk,nlkr,nr->il", jacobian, P, jacobian, weight) / weight.sum()
-    steps = Transition.along(jacobian, weight)
+    steps = Transition.along(jacobian, weight, np.zeros(6))
     np.testing.assert_allclose(steps.of(P), exact, rtol=1e-10, atol=1e-16)
     np.testing.assert_allclose(Transition.constant(A).of(P), A @ P @ A.T, rtol=1e-12)
 
@@ -193,3 +196,29 @@ def test_innovations_are_white_where_instruments_drown_the_process(tmp_path, hid
     assert np.abs(z.mean(axis=(0, 2)) * n).max() < 4.5
     acf = (z[1:] * z[:-1]).mean(axis=(0, 2)) / (z**2).mean(axis=(0, 2))
     assert np.abs(acf).max() * n < 6
+
+
+def test_pushes_reach_a_late_pose_late():
+    """Twists that are mostly process: innovations are white for a filter that knows of it."""
+    rng = np.random.default_rng(5)
+    b, fine, late, N, R = 0.1, 25, 10, 120, 150
+    ds = DT / fine
+    W = np.cumsum(rng.normal(size=(N * fine + fine, 6, R)) * b * np.sqrt(ds), axis=0)
+    X = np.cumsum(W, axis=0) * ds
+    at = fine + fine * np.arange(N)
+    error = rng.normal(size=(N, 12, R)) * np.repeat([1e-3, 5e-3], 6)[:, None]
+    record = np.concatenate([X[at - late], W[at]], axis=1) + error
+    A = np.eye(12) + DT * np.eye(12, k=6)
+    off = record[1:] - np.einsum("ij,njr->nir", A, record[:-1])
+    weight, step = np.ones((N - 1, R)), np.full((N - 1, R), DT)
+    jacobian = np.broadcast_to(A[None, :, :, None], (N - 1, 12, 12, R))
+    noise = Noise(np.repeat([1e-3, 5e-3], 6), np.full(6, b))
+    correlation, variance = [], []
+    for delay in (0.0, late * ds):
+        steps = Transition.along(jacobian, weight, np.full(6, delay))
+        z = filtered(off, jacobian, make_filter(noise, steps, np.eye(6), DT, step))[20:]
+        correlation.append(np.abs((z[1:, :6] * z[:-1, 6:]).mean()))
+        variance.append((z**2).mean(axis=(0, 2)))
+    assert correlation[0] > 0.1
+    assert correlation[1] < 0.2 * correlation[0]
+    assert np.abs(variance[1] - 1).max() < 0.1 < np.abs(variance[0] - 1).max()

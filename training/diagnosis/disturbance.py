@@ -162,7 +162,7 @@ def _without_blows(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
     near[1:] |= hit[:-1]
     near[:-1] |= hit[1:]
     weight = data.weight * ~near
-    steps = Transition.along(jacobian, weight)
+    steps = Transition.along(jacobian, weight, look.predictions.late)
     mass = bench.mass(look.theta)
     return estimate(error, weight, steps, mass, data.dt, estimated=False).diffusion
 

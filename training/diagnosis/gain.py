@@ -95,7 +95,7 @@ def scores(bench: Bench, contender: Contender, estimated: bool) -> Scores:
     for label in np.unique(data.fold):
         own = data.fold == label
         rest = data.weight * (~own if not own.all() else 1)
-        steps = Transition.along(jacobian, rest)
+        steps = Transition.along(jacobian, rest, p.late)
         noise = estimate(error, rest, steps, mass, data.dt, estimated=estimated)
         record[:, own], diffusion[:, own] = noise.record[:, None], noise.diffusion[:, None]
         given = np.linalg.inv(mass), data.dt, data.step[:, own], data.weight[:, own]

@@ -47,6 +47,7 @@ class Predictions(NamedTuple):
         latest: how the twist came there, of one step (N, 1, 3, 6, R).
         start: pose and twist of the samples themselves, what instruments did to them taken off.
         first: how the twist came to be that of the first sample.
+        late: by how much poses are recorded later than twists, by axis (s).
     """
 
     error: Float[Array, "N 12 R"]
@@ -56,6 +57,7 @@ class Predictions(NamedTuple):
     latest: Recent
     start: tuple[Float[Array, "N 7 R"], Float[Array, "N 6 R"]]
     first: Recent | None = None
+    late: Any = None
 
 
 def difference(
@@ -144,10 +146,23 @@ def _jacobian(model: Extended, inertia: Any, X: Array, V: Array, u: Array, dt: A
     return whole + jnp.einsum("ijr,jkr->ikr", JJ, J) / 6
 
 
+def _late(library: Library, theta: np.ndarray) -> Float[np.ndarray, "6"]:
+    """By how much poses are recorded later than twists, by axis (s); the mean over pieces."""
+    if not library.has("clock_offset"):
+        return np.zeros(6)
+
+    def delay(where: str) -> float:
+        return float(np.mean(theta[library.index("clock_offset", where, "delay")]))
+
+    own = [delay("linear")] * 3 + [delay("angular")] * 3
+    return delay("pose") - delay("twist") - np.array(own)
+
+
 def predict(model: Extended, library: Library, theta: np.ndarray, data: Data) -> Predictions:
     """Predictions of all samples with the effects' values `theta`: (p,), or (p, R) by piece."""
     effects = library.filled(theta.reshape(len(theta), -1))
     found = _predict(model, effects, as_arrays(data), substeps(data.longest))
+    found = found._replace(late=_late(library, theta))
     return (
         found._replace(error=found.error * data.told[None, :, None]) if data.unmeasured else found
     )

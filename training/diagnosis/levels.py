@@ -49,7 +49,7 @@ def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
     for k, label in enumerate(labels):
         own = data.fold == label
         rest = data.weight * (~own if not own.all() else 1)
-        steps = Transition.along(jacobian, rest)
+        steps = Transition.along(jacobian, rest, look.predictions.late)
         noise = estimate(error, rest, steps, mass, data.dt, estimated=False)
         levels[k] = noise.diffusion
         best = score(own, noise, steps)
@@ -78,14 +78,15 @@ def beside_slow(levels: Sequence[Law], bench: Bench, look: Look, least: float) -
     They lose more than `least` nats where the believed one is held, and differ to the same side.
     """
     data, believed = bench.data, believed_levels(bench)
-    steps = Transition.along(np.asarray(look.predictions.jacobian), data.weight)
+    p = look.predictions
+    steps = Transition.along(np.asarray(p.jacobian), data.weight, p.late)
     inverse = np.linalg.inv(bench.mass(look.theta))
     left, lost = beside_pushes(
-        np.asarray(look.predictions.error),
+        np.asarray(p.error),
         data.weight,
         steps,
-        unit_processes(steps.mean, inverse, data.dt),
-        _pushed(steps.mean, inverse, data.dt),
+        unit_processes(steps, inverse, data.dt),
+        _pushed(steps, inverse, data.dt),
         data.dt,
         np.concatenate([look.noise.record, look.noise.diffusion]) ** 2,
         believed,
@@ -103,9 +104,10 @@ def beside_slow(levels: Sequence[Law], bench: Bench, look: Look, least: float) -
 
 def process_share(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
     """Share of the variance of each twist's innovation that the process on its axis makes."""
-    steps = Transition.along(np.asarray(look.predictions.jacobian), bench.data.weight)
+    p = look.predictions
+    steps = Transition.along(np.asarray(p.jacobian), bench.data.weight, p.late)
     inverse = np.linalg.inv(bench.mass(look.theta))
-    own = unit_processes(steps.mean, inverse, bench.data.dt)
+    own = unit_processes(steps, inverse, bench.data.dt)
     own *= look.noise.diffusion[:, None, None] ** 2
     # whitened squares are divided by `memory`: one as many would be
     whiten = look.kalman.whiten.mean(axis=-1) * np.sqrt(look.kalman.memory)[:, None]
@@ -118,11 +120,12 @@ def process_share(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
 
 
 def _pushed(
-    A: Float[np.ndarray, "12 12"], mass_inverse: Float[np.ndarray, "6 6"], dt: float
+    transition: Transition, mass_inverse: Float[np.ndarray, "6 6"], dt: float
 ) -> Float[np.ndarray, "6 12"]:
     """What a constant unit wrench makes of an error within a step: ∫ exp(J s) ds [0; M⁻¹]."""
-    J = np.real(scipy.linalg.logm(A)) / dt
+    J = np.real(scipy.linalg.logm(transition.mean)) / dt
     both = np.zeros((18, 18))
     both[:12, :12] = J
+    both[:6, 12:] = -transition.late[:, None] * mass_inverse
     both[6:12, 12:] = mass_inverse
     return scipy.linalg.expm(both * dt)[:12, 12:].T

@@ -177,7 +177,7 @@ class Bench:
         if not np.isfinite(error[:, :, weight.any(axis=0)]).all():
             raise FloatingPointError("predictions diverge")
         jacobian = np.asarray(p.jacobian)
-        steps = Transition.along(jacobian, weight)
+        steps = Transition.along(jacobian, weight, p.late)
         mass = self.mass(theta)
         noise = estimate(error, weight, steps, mass, self.data.dt)
         if kalman is not None:

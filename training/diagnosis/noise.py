@@ -106,10 +106,15 @@ def process_covariance(
     diffusion: Float[np.ndarray, "6"],
     dt: float,
     slip: Float[np.ndarray, "6"] | None = None,
+    late: Float[np.ndarray, "6"] | None = None,
 ) -> Float[np.ndarray, "12 12"]:
-    """Q = ∫ exp(J s) B Bᵀ exp(J s)ᵀ ds over a step, by three Gauss points, and the slip's."""
+    """Q = ∫ exp(J s) B Bᵀ exp(J s)ᵀ ds over a step, by three Gauss points, and the slip's.
+
+    Of records whose poses are `late` against their twists (s): see `transition`.
+    """
     J = np.real(scipy.linalg.logm(A)) / dt
-    B = np.concatenate([np.zeros((6, 6)), mass_inverse * diffusion])
+    push = mass_inverse * diffusion
+    B = np.concatenate([np.zeros((6, 6)) if late is None else -late[:, None] * push, push])
     Q = np.zeros((12, 12))
     for x, w in zip(*np.polynomial.legendre.leggauss(3), strict=True):
         E = scipy.linalg.expm(J * dt * (1 + x) / 2) @ B
@@ -120,10 +125,11 @@ def process_covariance(
 
 
 def unit_processes(
-    A: Float[np.ndarray, "12 12"], mass_inverse: Float[np.ndarray, "6 6"], dt: float
+    transition: Transition, mass_inverse: Float[np.ndarray, "6 6"], dt: float
 ) -> Float[np.ndarray, "6 12 12"]:
     """Covariance of a step's process for b = 1 of each axis alone."""
-    return np.stack([process_covariance(A, mass_inverse, b, dt) for b in np.eye(6)])
+    A, late = transition.mean, transition.late
+    return np.stack([process_covariance(A, mass_inverse, b, dt, None, late) for b in np.eye(6)])
 
 
 def estimate(
@@ -151,14 +157,14 @@ def estimate(
     A, inverse = transition.mean, np.linalg.inv(mass)
     R = np.diag(-np.linalg.solve(A, C[1] - C[2]))
     variance = np.maximum(R, FLOOR**2)
-    units = unit_processes(A, inverse, dt)
+    units = unit_processes(transition, inverse, dt)
     unit = np.diag(units.sum(axis=0))[6:]
     alike = np.diag(C[1]) > _ALIKE * np.diag(C[0])
     none, near = (alike & ((times * FLOOR) ** 2 >= R) for times in (1.0, _NEAR))
     if estimated is None:
         estimated = bool(np.sum(none[6:]) >= _SMOOTH or np.sum(near) >= _SMOOTH_OF_ALL)
     if estimated:
-        of_estimates = _of_estimates(C[0], C[1], variance, A, inverse, unit, dt)
+        of_estimates = _of_estimates(C[0], C[1], variance, transition, inverse, unit, dt)
         return replace(of_estimates.with_diffusion(held), silent=silent)
     C0 = C[0] - (C[2] + C[2].T) / 2
     Q = C0 - np.diag(variance) - transition.of(np.diag(variance))
@@ -179,14 +185,15 @@ def _of_estimates(
     C0: np.ndarray,
     C1: np.ndarray,
     variance: np.ndarray,
-    A: np.ndarray,
+    transition: Transition,
     inverse: np.ndarray,
     unit: np.ndarray,
     dt: float,
 ) -> Noise:
     """Noise of states that were estimated: all in the process, with its correlation."""
     square = np.maximum(np.diag(C0)[6:] / unit, 1e-300)
-    own = process_covariance(A, inverse, np.sqrt(square), dt)
+    A = transition.mean
+    own = process_covariance(A, inverse, np.sqrt(square), dt, None, transition.late)
     left = np.diag(C0 - np.diag(variance) - A * variance @ A.T - own)[:6]
     correlation = np.clip(np.diag(C1) / np.maximum(np.diag(C0), 1e-300), 0.0, _LONGEST)
     return Noise(
@@ -211,7 +218,7 @@ def make_filter(
     The transition is that of a step of `dt` s. Where all are equal, one filter serves all pieces,
     unless what Jacobians differ by is much of what is seen: then each piece has one with its own.
     """
-    process = _process(noise, transition.mean, mass_inverse, dt, step)
+    process = _process(noise, transition, mass_inverse, dt, step)
     if all_equal(step, dt):
         found, P = _filter(noise, process, step[:, :1], dt, transition)
         share = np.diag(transition.added(P)) / (np.diag(transition.of(P)) + noise.trusted**2)
@@ -259,13 +266,15 @@ def _filter(
 
 
 def _process(
-    noise: Noise, A: np.ndarray, mass_inverse: np.ndarray, dt: float, step: np.ndarray
+    noise: Noise, transition: Transition, mass_inverse: np.ndarray, dt: float, step: np.ndarray
 ) -> Process:
     """Ā and Q of any steps among these, interpolated between Chebyshev nodes."""
 
     def of_step(A: np.ndarray, h: float) -> np.ndarray:
-        return process_covariance(A, mass_inverse, noise.diffusion, h, noise.slip)
+        late = transition.late
+        return process_covariance(A, mass_inverse, noise.diffusion, h, noise.slip, late)
 
+    A = transition.mean
     if all_equal(step, dt):
         alone = A[None], of_step(A, dt)[None]
         return lambda h: alone
@@ -278,12 +287,12 @@ def _process(
     inverse = np.linalg.inv(np.polynomial.chebyshev.chebvander(at, _NODES - 1))
     series = np.tensordot(inverse, values, 1)
 
-    def transition(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def of_steps(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x = (2 * h - low - high) / (high - low)
         both = np.tensordot(np.polynomial.chebyshev.chebvander(x, _NODES - 1), series, 1)
         return both[:, 0], both[:, 1]
 
-    return transition
+    return of_steps
 
 
 def filtered(

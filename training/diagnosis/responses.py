@@ -46,7 +46,7 @@ def _respond(
     model = model.with_effects(effects)
     if not instruments:
         model, predictions, arrays, filters = _single((model, predictions, arrays, filters))
-    first, predictions = predictions.first, predictions._replace(first=None)
+    first, predictions = predictions.first, predictions._replace(first=None, late=None)
     (X, V, u, voltage, step, past, past_step), (keep, whiten, weight) = arrays, filters
     inertia = model.inertia()
 

@@ -3,6 +3,10 @@
 Where instruments are noisy against the process, the noise enters the next error through Jacobians
 that change from sample to sample (Munk's moment turns an error of the velocity into pitch, with the
 speed's sign): E[A P Aᵀ] is more than its mean makes of P.
+
+A push moves a late pose later than the twist beside it: of records X - δ V and V it makes
+T = [[1, -δ], [0, 1]] of what it makes of X and V. (Pushes within δ before a sample, of the order of
+δ^3/2, come in the next step; they are small against the pose's own noise.)
 """
 
 from typing import NamedTuple
@@ -15,14 +19,24 @@ _SAMPLES = 4000
 
 
 class Transition(NamedTuple):
-    """Mean of A, and E[(A - Ā)_ij (A - Ā)_kl]."""
+    """Of a step.
+
+    Attributes:
+        mean: Ā.
+        spread: E[(A - Ā)_ij (A - Ā)_kl].
+        late: by how much poses are recorded later than twists, by axis (s).
+    """
 
     mean: Float[np.ndarray, "12 12"]
     spread: Float[np.ndarray, "12 12 12 12"]
+    late: Float[np.ndarray, "6"] = np.zeros(6)
 
     @classmethod
     def along(
-        cls, jacobian: Float[np.ndarray, "N 12 12 R"], weight: Float[np.ndarray, "N R"]
+        cls,
+        jacobian: Float[np.ndarray, "N 12 12 R"],
+        weight: Float[np.ndarray, "N R"],
+        late: Float[np.ndarray, "6"],
     ) -> "Transition":
         """That of all steps that exist.
 
@@ -36,11 +50,12 @@ class Transition(NamedTuple):
         some = slice(None, None, max(1, -(-len(n) // _SAMPLES)))
         off = (jacobian[n[some], :, :, r[some]] - mean).reshape(-1, 144)
         share = weight[n[some], r[some]] / weight[n[some], r[some]].sum()
-        return cls(mean, np.einsum("sa,s,sb->ab", off, share, off, optimize=True).reshape([12] * 4))
+        spread = np.einsum("sa,s,sb->ab", off, share, off, optimize=True).reshape([12] * 4)
+        return cls(mean, spread, late)
 
     @classmethod
     def constant(cls, A: Float[np.ndarray, "12 12"]) -> "Transition":
-        """The same A at all steps."""
+        """The same A at all steps, of instruments that are in time."""
         return cls(A, np.zeros([12] * 4))
 
     def added(self, P: Float[np.ndarray, "*b 12 12"]) -> Float[np.ndarray, "*b 12 12"]:

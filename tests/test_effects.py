@@ -152,6 +152,21 @@ def test_lag_and_delay_are_exact_over_held_commands():
             np.testing.assert_allclose(means.T, pieces, atol=2e-6)
 
 
+@pytest.mark.parametrize("tau", [0.02, 0.08])
+def test_thrust_that_builds_up_within_a_substep_keeps_the_order(tau):
+    """Held at its mean it would act too late where yaw drag is stiff, and leave second order."""
+    model = PLAIN.with_effects((KINDS["thruster_lag"].of(time_constant=tau),))
+    inertia, before = model.inertia(), model.remember(U)
+    turning = V.at[5].set(1.5)
+
+    def end(substeps):
+        return np.asarray(advance(model, inertia, before, X, turning, -U, 0.05, substeps)[2])
+
+    fine = end(256)
+    errors = [np.abs(end(substeps) - fine).max() for substeps in (4, 8)]
+    assert 10 < errors[0] / errors[1] < 28
+
+
 def wrench(name, where=None, **parameters):
     return np.asarray(KINDS[name].of(where, **parameters).wrench(X, V, PLANT))
 

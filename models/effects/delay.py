@@ -5,6 +5,7 @@ import math
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -55,22 +56,24 @@ class ActuationDelay(Effect):
         held = memory[n * K :]
         delay = self.each(0, memory)
         h = dt / S
-        means = []
-        for s in range(S):
+
+        def mean(s: Array, level: Array) -> Array:
             # the shifted substep, from the step's start
             start, end = s * h - delay, (s + 1) * h - delay
-            total = _overlap(start, end, jnp.zeros_like(dt), dt) * level[..., s]
+            total = _overlap(start, end, jnp.zeros_like(dt), dt) * level
             high = jnp.zeros_like(held[:1])
             for k, command in enumerate(commands):
                 low = high - held[k : k + 1] if k < K - 1 else -jnp.inf * jnp.ones_like(high)
                 total = total + _overlap(start, end, low, high) * command
                 high = low
-            means.append(total / h)
+            return total / h
+
+        means = jax.vmap(mean, (0, -1), -1)(jnp.arange(S, dtype=h.dtype), level)
         batch = jnp.broadcast_shapes(level.shape[1:-1], memory.shape[1:], jnp.shape(dt)[1:])
         now = jnp.broadcast_to(dt, (1, *batch)) if jnp.ndim(dt) else jnp.full((1, *batch), dt)
         kept = [level[..., 0], *commands[:-1], now, held[:-1]]
         kept = [jnp.broadcast_to(part, (part.shape[0], *batch)) for part in kept]
-        return jnp.concatenate(kept), jnp.stack(jnp.broadcast_arrays(*means), axis=-1)
+        return jnp.concatenate(kept), means
 
 
 def _overlap(start: Array, end: Array, low: Array, high: Array) -> Array:

@@ -109,10 +109,8 @@ def test_a_level_is_told_from_pushes_that_last(believed):
     steps = Transition.constant(A)
     alone = estimate(error, weight, steps, MASS, DT)
     assert np.all(alone.diffusion[[0, 2, 3]] > 1.2 * b[[0, 2, 3]])
-    units, start = (
-        unit_processes(steps, inverse, DT),
-        np.concatenate([alone.record, alone.diffusion]),
-    )
+    units = unit_processes(steps, inverse, DT)
+    start = np.concatenate([alone.record, alone.diffusion])
     left, lost = beside_pushes(
         error, weight, steps, units, once, DT, start**2, believed * b, [0, 1, 3]
     )

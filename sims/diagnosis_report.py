@@ -3,12 +3,15 @@
 from ..training.diagnosis.diagnose import Finding
 from ..training.diagnosis.result import Diagnosis, Interval, Value
 from .figures_diagnosis import (
+    experiments_figure,
     horizon_figure,
     innovations_figure,
     map_figure,
     names_figure,
     residual_figure,
 )
+from .figures_simulated import axes_figure, bands_figure, runs_figure, simulated_map_figure
+from .figures_structure import memory_figure, repeats_figure, state_space_figure
 from .pages import Page
 
 _LEFT_OUT = {
@@ -71,15 +74,50 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
             ("coefficient", "where", "believed", "fitted (95 %)"),
         )  # fmt: skip
     page.figure(names_figure(finding), "Each name alone, fitted on the other scenarios.")
+    following = experiments_figure(d)
+    if following is not None:
+        page.figure(
+            following,
+            "What each maneuver of a set is expected to tell about a cause, beside its closest "
+            "rivals: simulated by the model with the causes, looked at as these data were.",
+        )
+    page.section("Simulations beside the records")
+    page.figure(
+        bands_figure(finding),
+        "The run with the median error in the scenario that the belief forecasts worst. Bands hold "
+        "the disturbance and the records' noise.",
+    )
+    page.figure(
+        axes_figure(finding),
+        "Root mean square error of noise-free simulations from recorded states, axis by axis.",
+    )
+    page.figure(runs_figure(finding), "Root mean square of all axes, run by run.")
     page.section(
         "Where the error lives",
         "Innovations are the errors of one-step predictions, in units of what the noise explains.",
     )
     page.figure(
         map_figure(finding),
-        "How much of each axis' error depends on each state and input. Pale is noise.",
+        "How much of each axis' innovations depends on each state and input. Pale is noise.",
+    )
+    page.figure(
+        simulated_map_figure(finding),
+        "The same of the errors at the ends of simulations, against the means over each of them.",
+    )
+    page.figure(
+        state_space_figure(finding),
+        "Where in state space: the axes with most structure, over what tells most of each.",
+    )
+    page.section("Error or noise")
+    page.figure(
+        repeats_figure(finding),
+        "What repeats is error, what doesn't is noise. Dashed: as much as noise alone makes.",
     )
     page.figure(innovations_figure(finding), "Repeated runs average the noise, errors stay.")
+    page.figure(
+        memory_figure(finding),
+        "What innovations remember, and at which frequencies they are. Grey and dashed: noise.",
+    )
     page.figure(residual_figure(finding), "What is left by channel.")
     page.section("Gain", _LEFT_OUT[d.left_out])
     page.table(

@@ -1,5 +1,7 @@
 """Figures of a diagnosis: what is wrong, which name explains it, what naming it wins."""
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
@@ -56,7 +58,8 @@ def residual_figure(finding: Finding) -> Figure:
     return figure
 
 
-def _variables(finding: Finding) -> dict[str, Float[np.ndarray, "N R"]]:
+def variables(finding: Finding) -> dict[str, Float[np.ndarray, "N R"]]:
+    """What errors may depend on: states, commands, voltage, time, where each step begins."""
     d = finding.data
     qw, qx, qy, qz = (d.X[:-1, i] for i in range(4))
     found = {n: d.V[:-1, i] for i, n in enumerate(("u", "v", "w", "p", "q", "r"))}
@@ -69,49 +72,90 @@ def _variables(finding: Finding) -> dict[str, Float[np.ndarray, "N R"]]:
 
 
 def error_map(
-    look: Look, variables: dict[str, np.ndarray], weight: np.ndarray
-) -> Float[np.ndarray, "6 k"]:
+    z: Float[np.ndarray, "n a"], variables: Mapping[str, Float[np.ndarray, " n"]], most: int = _BINS
+) -> Float[np.ndarray, "a k"]:
     """Nats by axis and variable: ½ Σ n m² of means m in bins of equal counts, less the bins.
 
-    White innovations give about zero; what depends on a variable gives much.
+    White errors of unit variance give about zero; what depends on a variable gives much.
     """
-    exists = weight > 0
-    found = np.zeros((6, len(variables)))
+    found = np.zeros((z.shape[1], len(variables)))
     for k, values in enumerate(variables.values()):
-        own = values[exists]
-        edges = np.unique(np.quantile(own, np.linspace(0, 1, _BINS + 1)))
+        edges = np.unique(np.quantile(values, np.linspace(0, 1, most + 1)))
         if len(edges) < 3:
             continue
-        bins = np.clip(np.searchsorted(edges, own, side="right") - 1, 0, len(edges) - 2)
+        bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
         counts = np.bincount(bins, minlength=len(edges) - 1)
-        for i in range(6):
-            z = look.z[:, 6 + i][exists]
-            sums = np.bincount(bins, weights=z, minlength=len(counts))
+        for i in range(z.shape[1]):
+            sums = np.bincount(bins, weights=z[:, i], minlength=len(counts))
             nats = (sums**2 / np.maximum(counts, 1)).sum() / 2 - len(counts) / 2
             found[i, k] = max(float(nats), 0.0)
     return found
 
 
-@styled
-def map_figure(finding: Finding) -> Figure:
-    """Where the error lives: axis against state and input, belief and explained."""
-    variables = _variables(finding)
-    figure, axes = panels(1, 2, 3.1, sharey=True)
-    maps = [error_map(k, variables, finding.data.weight) for k in (finding.base, finding.final)]
-    top = max(10.0, float(np.max(maps[0])))
+def draw_map(
+    maps: Sequence[Float[np.ndarray, "a k"]],
+    titles: Sequence[str],
+    variables: Sequence[str],
+    axes_of: Sequence[str],
+) -> Figure:
+    """Maps of nats side by side, on one scale."""
+    height = 1.2 + 0.32 * len(axes_of)
+    figure, axes = panels(1, len(maps), height, sharey=True)
+    top = max(10.0, float(np.max(maps)))
     images = []
-    for ax, values, title in zip(axes[0], maps, ("Belief", "With the causes"), strict=True):
+    for ax, values, title in zip(axes[0], maps, titles, strict=True):
         image = ax.imshow(np.log10(1 + values), vmin=0, vmax=np.log10(1 + top), cmap="PuBu")
         images.append(image)
         ax.set_aspect("auto")
         ax.set_xticks(range(len(variables)), list(variables), rotation=60)
-        ax.set_yticks(range(6), _TWIST)
+        ax.set_yticks(range(len(axes_of)), axes_of)
         ax.grid(visible=False)
         ax.set_title(title)
     bar = figure.colorbar(images[0], ax=axes[0].tolist(), shrink=0.9)
     ticks = [t for t in range(8) if t <= np.log10(1 + top)]
     bar.set_ticks(ticks, labels=[f"{10**t:g}" for t in ticks])
     bar.set_label("nats")
+    return figure
+
+
+def innovations_of(finding: Finding, look: Look) -> Float[np.ndarray, "n 6"]:
+    """Whitened innovations of the twist at all steps that exist."""
+    return look.z[:, 6:].swapaxes(1, 2)[finding.data.weight > 0].astype(float)
+
+
+def where_they_are(finding: Finding) -> dict[str, Float[np.ndarray, " n"]]:
+    """What innovations may depend on, at all steps that exist."""
+    exists = finding.data.weight > 0
+    return {name: values[exists] for name, values in variables(finding).items()}
+
+
+@styled
+def map_figure(finding: Finding) -> Figure:
+    """Where the error lives: axis against state and input, belief and explained."""
+    known = where_they_are(finding)
+    looks = (finding.base, finding.final)
+    maps = [error_map(innovations_of(finding, look), known) for look in looks]
+    return draw_map(maps, ("Belief", "With the causes"), list(known), _TWIST)
+
+
+@styled
+def experiments_figure(diagnosis: Diagnosis) -> Figure | None:
+    """What each maneuver of the set is expected to tell about each cause; None if it makes none."""
+    causes = [c for c in diagnosis.causes if c.experiments]
+    if not causes:
+        return None
+    trials = list(dict.fromkeys(name for c in causes for name in c.experiments))
+    figure, axes = panels(1, len(causes), 0.9 + 0.22 * len(trials), sharey=True)
+    for ax, c in zip(axes[0], causes, strict=True):
+        nats = np.array([c.experiments.get(name, 0.0) for name in trials])
+        colors = [FLOWN if n == nats.max() else QUIET for n in nats]
+        ax.barh(range(len(trials)), np.maximum(nats, 0.01), color=colors, height=0.7)
+        ax.set_xscale("log")
+        ax.set_xlim(left=0.01)
+        ax.set_xlabel("nats a minute")
+        ax.set_title(f"{c.name.replace('_', ' ')} · {c.where}")
+    axes[0, 0].set_yticks(range(len(trials)), trials)
+    axes[0, 0].invert_yaxis()
     return figure
 
 

@@ -28,7 +28,7 @@ from spinndrift.training.diagnosis.diagnose import (
 from spinndrift.training.diagnosis.hypotheses import Fit
 from spinndrift.training.diagnosis.innovations import predict
 from spinndrift.training.diagnosis.laws import find_laws
-from spinndrift.training.diagnosis.naming import admissible, choose
+from spinndrift.training.diagnosis.naming import admissible, choose, is_itself
 from spinndrift.training.diagnosis.noise import (
     Noise,
     filtered,
@@ -49,7 +49,7 @@ from spinndrift.training.diagnosis.result import (
 from spinndrift.training.diagnosis.search import Found, Search
 from spinndrift.training.diagnosis.telling import (
     CHANNELS,
-    left_over,
+    following,
     noise_words,
     residual,
     sentence,
@@ -485,7 +485,7 @@ def test_errors_that_follow_each_other_are_not_called_adequate():
         residual = {
             name: AxisResidual(1.0, size, 0.0) for name, size in zip(CHANNELS, sizes, strict=True)
         }
-        return left_over(residual, causes)
+        return following(residual, causes)
 
     assert left(0.0, 0.1) == left(0.8, 0.8) == []
     (told,) = left(0.0, 0.8)
@@ -595,7 +595,12 @@ def test_a_name_nested_in_another_keeps_the_data(tmp_path):
     search = Search(bench, [], 0.01, 1, np.random.default_rng(0), lambda fraction, remark: None)
     search.run(found)
     assert found.hypotheses == [("net_buoyancy", "all")]
-    assert ("tether", "W") in [h for h, _ in found.accepted[0].rivals]
+    fits, won = found.fits, found.accepted[0].fit.heldout_gain
+    tether = fits["tether", "W"]
+    assert tether.heldout_gain > won - 10
+    assert not is_itself(bench.library, look.theta, tether), "a tether pulls sideways or tautens"
+    held = replace(tether, values=np.array([0.5, *tether.values[1:]]))
+    assert is_itself(bench.library, look.theta, held)
 
 
 def test_bands_hold_what_a_law_of_the_disturbance_adds(tmp_path):

@@ -16,13 +16,20 @@ from spinndrift.models.recording_csv import read_csv
 from spinndrift.models.vehicle import load_vehicle
 from spinndrift.training.diagnosis.beside import Beside
 from spinndrift.training.diagnosis.diagnose import Diagnoser
-from spinndrift.training.diagnosis.disturbance import SLOW, _grown, all_laws, laws_of, told
+from spinndrift.training.diagnosis.disturbance import (
+    SLOW,
+    _grown,
+    all_laws,
+    laws_of,
+    told,
+    won_by,
+)
 from spinndrift.training.diagnosis.laws import Law
 from spinndrift.training.diagnosis.levels import LEVEL
 from spinndrift.training.diagnosis.noise import estimate, score_of
 from spinndrift.training.diagnosis.search import Found, Search
 from spinndrift.training.diagnosis.transition import Transition
-from spinndrift.training.diagnosis.waves import beside_laws, find_waves
+from spinndrift.training.diagnosis.waves import beside_laws, find_current, find_waves
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 LEVELS = np.array([1.0] * 3 + [0.03] * 3)
@@ -121,7 +128,7 @@ def test_what_a_name_wins_exactly_is_likelihood(tmp_path):
     search = Search(bench, [], 0.01, 6, np.random.default_rng(0), lambda fraction, remark: None)
     found, h = Found(look, look, look), ("thruster_lag", "all")
     fit = search._chosen(found)[1][h]
-    theta, seen = search._fitted(h, {h: fit}, found, None)
+    theta, seen, _ = search._fitted(h, {h: fit}, found, None)
     exact = search._exact(fit, theta, seen, found)
     data, scores = bench.data, []
     for one in (look, seen):
@@ -292,3 +299,19 @@ def test_a_belief_that_diverges_on_the_data_is_told(tmp_path):
     belief = Extended.create(VEHICLE.dynamics(), (drag,), VEHICLE.thrusters())
     with pytest.raises(UserError, match="unstable on these data"):
         Diagnoser(read_csv(tmp_path / "data"), VEHICLE, belief).run()
+
+
+def test_a_current_that_wanders_is_one_motion_of_the_water(tmp_path):
+    """Not pushes on every axis: its size and time constant within three standard errors."""
+    case = draw(4, names=("current_varying",), plan=Plan(runs=3))
+    case.write(tmp_path / "data")
+    bench = Diagnoser(read_csv(tmp_path / "data", resample=False), VEHICLE).bench
+    look = bench.look(bench.believed)
+    laws = all_laws(bench, look, 20.0)
+    assert laws[0].name == "current_varying"
+    assert laws[0].heldout_gain > won_by("disturbance_colour", laws)
+    law = find_current(bench, look)
+    assert law.errors is not None
+    for name, found in case.answer()["causes"][0]["parameters"].items():
+        if np.isfinite(law.errors[name]):
+            assert abs(law.parameters[name] - found["value"]) < 3 * law.errors[name]

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 
 from spinndrift.models import se3
 from spinndrift.models.checkpoint import load_model, save_model
@@ -180,6 +181,11 @@ def on(axis, values):
 def test_wrenches_of_body_and_environment():
     v = np.asarray(V)
     np.testing.assert_allclose(wrench("net_buoyancy", force=2.0)[:3], 2 * UP)
+    at_Cb = wrench("net_buoyancy", "centre_of_buoyancy", force=2.0)
+    np.testing.assert_allclose(at_Cb[:3], 2 * UP)
+    lever = np.asarray(PLANT.p_BoCb_B)[:, None]
+    assert lever[2] > 0
+    np.testing.assert_allclose(at_Cb[3:], cross(lever, 2 * UP), atol=1e-12)
     shift = wrench("centre_of_gravity", "y", shift=0.01)
     lever = np.array([0, 0.01, 0])[:, None]
     np.testing.assert_allclose(shift[3:], cross(lever, -VEHICLE.weight * UP), atol=1e-12)
@@ -466,3 +472,29 @@ def test_what_has_no_name_is_stored_and_moves_the_vehicle(tmp_path, kind, acts_o
     plain = drift(PLAIN)
     np.testing.assert_allclose(drift(PLAIN.with_effects((effect,))), plain, atol=1e-12)
     assert np.abs(drift(model) - plain).max() > 1e-4
+
+
+def test_a_late_twist_that_differs_from_the_prediction_keeps_what_drag_leaves():
+    """Of V' = S (V - V∞): the twist of now from one that is seen late, after a push."""
+    S = np.diag([-1.0, -2.0, -3.0, -6.0, -8.0, -9.0])
+    S[3, 1], S[4, 2] = 1.5, -2.0
+    late, push = 0.04, np.array([0.02, -0.01, 0.03, 0.1, -0.2, 0.1])
+    V0, limit = np.linspace(-1, 1, 6), np.linspace(0.5, -0.5, 6)
+
+    def after(V, t):
+        return limit + scipy.linalg.expm(S * t) @ (V - limit)
+
+    h = 0.05
+    V1 = after(V0, h)
+    rate = S @ (V1 - limit)
+    rates = jnp.asarray(np.concatenate([rate, S @ rate])[:, None])
+    slope = jnp.asarray(S[:, :, None])
+    recent = Recent.over(jnp.asarray(V0[:, None]), jnp.asarray(V1[:, None]), rates, h)
+    pushed = after(V0, h - late) + push  # seen, δ before now
+    seen, now = jnp.asarray(pushed[:, None]), after(pushed, late)
+    late = jnp.full((6, 1), late)
+    kept = recent.keeping(jnp.asarray(V1[:, None]), slope).now(seen, late)[:, 0]
+    without = recent.now(seen, late)[:, 0]
+    # a cubic over the step leaves |S|⁴ δ³ (h - δ) / 4! of what decays fastest, 1.5 m/s or less
+    np.testing.assert_allclose(kept, now, atol=1.5 * 9**4 * 0.04**3 * 0.01 / 24)
+    assert np.abs(without - now).max() > 0.03

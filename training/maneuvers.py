@@ -49,17 +49,17 @@ def maneuver_wrench(
     axes = np.sign(direction)[:, None] * np.eye(6)
     wrench = np.array(
         [
-            d * _largest(thrusters, axis) if d else 0.0
+            d * largest(thrusters, axis) if d else 0.0
             for d, axis in zip(direction, axes, strict=True)
         ]
     )
     wrench = np.abs(wrench) * np.sign(direction)
-    most = _largest(thrusters, wrench)
+    most = largest(thrusters, wrench)
     forces = thrusters.allocate(jnp.asarray(effort * most * wrench, thrusters.allocation.dtype))
     return np.asarray(thrusters.wrench(forces), float), np.asarray(forces, float)
 
 
-def _largest(thrusters: Thrusters, direction: Float[np.ndarray, "6"]) -> float:
+def largest(thrusters: Thrusters, direction: Float[np.ndarray, "6"]) -> float:
     """The largest s for which the thrusters can give s · direction."""
     huge = 1e4
     forces = thrusters.allocate(jnp.asarray(huge * direction, thrusters.allocation.dtype))

@@ -115,7 +115,7 @@ class ClockOffset(Effect):
         self, X_WB: Float[Array, "7 *#batch"], V_WB_B: Float[Array, "6 *#batch"], recent: Recent
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         late, pose = self._delays(V_WB_B)
-        V = V_WB_B - recent.back(late)[0]
+        V = recent.now(V_WB_B, late)
         return se3.retract(X_WB, pose * V + recent.back(pose)[1]), V
 
 

@@ -69,6 +69,8 @@ class Plant(NamedTuple):
     rigid_mass: Float[Array, ""]
     drag: Callable[[Array], Array]
     """The drag wrench at a velocity relative to the water."""
+    p_BoCb_B: Float[Array, "3"]
+    """The centre of buoyancy."""
 
 
 class Effect(eqx.Module):
@@ -81,6 +83,7 @@ class Effect(eqx.Module):
         places: where it can act (axis, thruster number, frame).
         simpler: names that explain the same data with less; they win unless clearly beaten.
         echoes: names of one family that leave traces of one another.
+        essential: parameters of which one at least must differ from zero for it to be this cause.
         absorber: it soaks up slow structure of any origin, so it is ranked last.
         order: actuation and measurement effects apply from small to large.
         source: where the admissible range comes from.
@@ -94,6 +97,7 @@ class Effect(eqx.Module):
     places: ClassVar[tuple[str, ...]] = ("all",)
     simpler: ClassVar[tuple[str, ...]] = ()
     echoes: ClassVar[tuple[str, ...]] = ()
+    essential: ClassVar[tuple[str, ...]] = ()
     absorber: ClassVar[bool] = False
     order: ClassVar[int] = 0
     source: ClassVar[str] = ""

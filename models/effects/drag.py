@@ -89,8 +89,8 @@ class DragCoupling(Effect):
     name: ClassVar[str] = "drag_coupling"
     family: ClassVar = "body"
     parameters: ClassVar = (
-        Parameter("quadratic", "N·s²/m² and the like", (0.5,), -100.0, 100.0),
-        Parameter("linear", "N·s/m and the like", (0.2,), -100.0, 100.0),
+        Parameter("quadratic", "N·s²/m²", (0.5,), -100.0, 100.0),
+        Parameter("linear", "N·s/m", (0.2,), -100.0, 100.0),
     )
     places: ClassVar = tuple(name for name, _, _ in COUPLINGS)
     source: ClassVar[str] = "centre of pressure a few cm from Bo"

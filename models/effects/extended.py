@@ -150,7 +150,9 @@ class Extended(Dynamics):
         weight = getattr(self.base, "weight", self.base.displaced_mass * 9.80665)
         rigid = self.base.rigid_inertia[0, 0]
         drag = self.base.drag_wrench
-        return Plant(self.positions, self.directions, mass, jnp.asarray(weight), rigid, drag)
+        weight = jnp.asarray(weight)
+        buoyant = self.base.p_BoCb_B
+        return Plant(self.positions, self.directions, mass, weight, rigid, drag, buoyant)
 
     @property
     def remembers(self) -> bool:

@@ -16,17 +16,25 @@ def up_in_body(X_WB: Float[Array, "7 *batch"]) -> Float[Array, "3 *batch"]:
 
 
 class NetBuoyancy(Effect):
-    """A constant upward force ΔB at Bo (N)."""
+    """A constant upward force ΔB (N), at Bo or at the centre of buoyancy.
+
+    The second is what another displaced volume makes of Fossen's restoring forces (2011, eq. 4.6):
+    a moment p_BoCb × ΔB besides.
+    """
 
     name: ClassVar[str] = "net_buoyancy"
     family: ClassVar = "body"
     parameters: ClassVar = (Parameter("force", "N", (0.5,), -60.0, 60.0),)
+    places: ClassVar = ("all", "centre_of_buoyancy")
     source: ClassVar[str] = "0.2 to 4 N: trim, foam, water density"
 
     def wrench(
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
     ) -> Float[Array, "6 *#batch"]:
-        return force_only(self.part(0, V_CB_B)[None] * up_in_body(X_WB))
+        up = up_in_body(X_WB)
+        at_Bo, at_Cb = (self.part(i, V_CB_B)[None] * up for i in range(2))
+        r = plant.p_BoCb_B.reshape(3, *(1,) * (at_Cb.ndim - 1))
+        return force_only(at_Bo + at_Cb) + _hung(r, at_Cb)
 
 
 class CentreOfGravity(Effect):
@@ -84,6 +92,7 @@ class Payload(Effect):
         Parameter("height", "m", (0.05,), -1.0, 1.0),
     )
     simpler: ClassVar = ("net_buoyancy", "centre_of_gravity")
+    essential: ClassVar = ("mass", "weight")
     source: ClassVar[str] = "0.1 to 3 kg"
 
     def inertia(self, plant: Plant) -> Float[Array, "6 6 *batch"]:

@@ -16,10 +16,14 @@ class Recent(eqx.Module):
     Attributes:
         bends: c₁, c₂ and c₃ (m/s², rad/s² and per s more).
         step: lengths of the steps (s).
+        V: the twist of now that these steps led to, where records may say otherwise.
+        slope: what a difference from that makes of the acceleration, ∂a/∂V (1/s, m/s and rad/s).
     """
 
     bends: Float[Array, "S 3 6 *batch"]
     step: Float[Array, "S 1 *batch"]
+    V: Float[Array, "6 *batch"] | None = None
+    slope: Float[Array, "6 6 *batch"] | None = None
 
     @classmethod
     def steady(
@@ -54,7 +58,34 @@ class Recent(eqx.Module):
         return Recent(
             jnp.concatenate([latest.bends, self.bends[:-n]]),
             jnp.concatenate([latest.step, self.step[:-n]]),
+            latest.V,
+            latest.slope,
         )
+
+    def keeping(self, V: Float[Array, "6 *batch"], slope: Float[Array, "6 6 *batch"]) -> "Recent":
+        """The same with the twist of now and what becomes of differences from it."""
+        return Recent(self.bends, self.step, V, slope)
+
+    def now(
+        self, seen: Float[Array, "6 *#batch"], late: Float[Array, "#6 *#batch"]
+    ) -> Float[Array, "6 *#batch"]:
+        """V(t) of the twist that is seen of it δ = `late` s later: V(t - δ).
+
+        What is seen differs from what these steps led to by pushes and noise, of which exp(∂a/∂V δ)
+        is left until now: exact for each component by itself, to first order between them.
+        """
+        change = self.back(late)[0]
+        V = seen - change
+        if self.V is None or self.slope is None:
+            return V
+        late = jnp.broadcast_to(late, V.shape)
+        own = jnp.stack([self.slope[i, i] for i in range(6)])
+        apart = 1 - jnp.eye(6, dtype=own.dtype).reshape(6, 6, *(1,) * (own.ndim - 1))
+        grown = jnp.minimum((own[:, None] + own[None]) / 2 * late[:, None], 1.0)
+        between = apart * self.slope * late[:, None] * jnp.exp(grown)
+        d = V - self.V
+        alone = jnp.expm1(jnp.minimum(own * late, 1.0)) * d
+        return V + alone + jnp.sum(between * d[None], axis=1)
 
     def back(
         self, late: Float[Array, "#6 *#batch"]

@@ -29,6 +29,7 @@ class Tether(Effect):
     )
     places: ClassVar = ("W",)
     simpler: ClassVar = ("current_steady", "net_buoyancy")
+    essential: ClassVar = ("stiffness", "pull_east", "pull_north")
     source: ClassVar[str] = "11 N for 10 m of cable broadside at 0.5 m/s"
 
     def wrench(

@@ -174,7 +174,8 @@ def told(effect: Effect) -> dict[str, Any]:
         case actuation.InflowThrustLoss():
             values = {"loss": effect.coefficient}
         case body.NetBuoyancy() | body.Payload():
-            place = "all"
+            at_Cb = isinstance(effect, body.NetBuoyancy) and effect.height != 0
+            place = "centre_of_buoyancy" if at_Cb else "all"
             if isinstance(effect, body.Payload):
                 values = {
                     "mass": effect.mass + own["added_mass"],

@@ -30,10 +30,14 @@ def _units(axis: int, power: int) -> str:
 
 @dataclass(frozen=True)
 class NetBuoyancy(Effect):
-    """Buoyancy less weight is wrong by Δ: a force Δ upwards at Bo (Fossen 2011, ch. 4.1)."""
+    """Buoyancy less weight is wrong by Δ: a force Δ upwards (Fossen 2011, ch. 4.1).
+
+    At `height` above Bo: none, or that of the centre of buoyancy.
+    """
 
     cause = "net_buoyancy"
     force: float = 0.0
+    height: float = 0.0
 
     @property
     def where(self) -> str:
@@ -46,11 +50,15 @@ class NetBuoyancy(Effect):
         return self.force == 0
 
     def wrench(self, now: Moment, latent: Latent, state: np.ndarray) -> np.ndarray:
-        return np.concatenate([self.force * now.up, np.zeros_like(now.up)])
+        arm = np.zeros_like(now.up)
+        arm[2] = self.height
+        push = self.force * now.up
+        return np.concatenate([push, cross(arm, push)])
 
     @classmethod
     def drawn(cls, rng: Any, size: float) -> "NetBuoyancy":
-        return cls(sign(rng) * around(rng, 1.5 * size))
+        force = sign(rng) * around(rng, 1.5 * size)
+        return cls(force, float(rng.choice([0.0, Vehicle().r_b[2]])))
 
 
 @dataclass(frozen=True)

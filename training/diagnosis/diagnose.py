@@ -8,6 +8,7 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from threadpoolctl import threadpool_limits
 
 from ...models.checks import check_numbers, require
 from ...models.dynamics import Dynamics
@@ -24,7 +25,8 @@ from .checks import SPARSE, limits, problems, unexcited
 from .data import Data
 from .disturbance import OF_OTHERS, all_laws, best_law, passing
 from .disturbance import told as told_laws
-from .gain import Contender, judge, told, white_part
+from .experiments import experiments
+from .gain import Contender, Simulated, judge, told, white_part
 from .hypotheses import Fit
 from .identify import identify, with_coefficients
 from .laws import Law
@@ -98,6 +100,7 @@ class Finding:
     final: Look
     fits: dict[Hypothesis, Fit]
     laws: list[Law]
+    simulated: dict[str, Simulated]
 
 
 class Diagnoser:
@@ -164,8 +167,12 @@ class Diagnoser:
         tested = len(found.fits) + len(laws)
         causes, stirring = [], []
         if joint is not None:
+            self.progress(0.8, "what to do next")
+            following = experiments(bench, final, found.accepted, nuisance)
             causes = [
-                telling.cause(a, bench, final, joint, structures.get(a.hypothesis))
+                telling.cause(
+                    a, bench, final, joint, following[a.hypothesis], structures.get(a.hypothesis)
+                )
                 for a in found.accepted
             ]
         for group in groups:
@@ -173,9 +180,11 @@ class Diagnoser:
             law_cause, effect = telling.law_cause(group, rivals, bench, final)
             causes.append(law_cause)
             stirring.append(effect)
-        gain = self._gain(bench, found, fitted, rows, shaped, tuple(stirring), bool(causes))
+        gain, simulated = self._gain(
+            bench, found, fitted, rows, shaped, tuple(stirring), bool(causes)
+        )
         residual = telling.residual(bench, final)
-        left = telling.left_over(residual, causes)
+        left = telling.left_over(residual, causes, bench, final, least)
         d = bench.data
         diagnosis = result.Diagnosis(
             version=result.VERSION,
@@ -211,8 +220,9 @@ class Diagnoser:
             bench.vehicle.thrusters(),
         ).for_steps_of(_FINEST)
         return Finding(
-            diagnosis, extended, bench.library, final.theta, d, base, final, found.fits, laws
-        )
+            diagnosis, extended, bench.library, final.theta, d, base, final, found.fits, laws,
+            simulated,
+        )  # fmt: skip
 
     def _believed(self, bench: Bench) -> Look:
         try:
@@ -295,7 +305,7 @@ class Diagnoser:
         laws: list[Law],
         stirring: tuple[Effect, ...],
         extended: bool,
-    ) -> dict[str, result.ModelGain]:
+    ) -> tuple[dict[str, result.ModelGain], dict[str, Simulated]]:
         """Base, base refitted, extended model and black box on data left out of their fits.
 
         `fitted` is the look of the final fit, with responses to the parameters of `rows`.
@@ -330,10 +340,11 @@ class Diagnoser:
             self.progress(0.84 + 0.04 * number, f"gain: {name.replace('_', ' ')}")
             in_use = [] if contender.box is not None else [*belief, *rows]
             judged[name] = judge(bench, contender, horizon, seed, in_use, estimated)
-        return {
+        gain = {
             name: told(j, judged["base"], bench, horizon, np.random.default_rng(seed))
             for name, j in judged.items()
         }
+        return gain, {name: j.simulated for name, j in judged.items()}
 
 
 def diagnose(
@@ -348,7 +359,18 @@ def diagnose(
     Raises:
         UserError: the recording lacks pose or twist, or is too short.
     """
-    config = DiagnoseConfig() if config is None else config
+    # threads of BLAS wait for each other in a loop: beside other work that is five times slower
+    with threadpool_limits(1, user_api="blas"):
+        return _diagnose(recording, vehicle, base, config or DiagnoseConfig(), progress)
+
+
+def _diagnose(
+    recording: Recording,
+    vehicle: Vehicle,
+    base: Dynamics | None,
+    config: DiagnoseConfig,
+    progress: Progress,
+) -> Finding:
     found = Diagnoser(recording, vehicle, base, config, progress).run()
     first = found.diagnosis
     if config.refit != "auto" or not coefficients_are_off(first):

@@ -11,14 +11,18 @@ from .gain import white_part
 from .laws import Law, estimated, find_laws, growth_alone, run_constants
 from .levels import LEVEL, beside_slow, find_levels, process_share
 from .looking import Bench, Look
+from .naming import margin
 from .noise import estimate
+from .repeats import repeating
 from .transition import Transition
-from .waves import are_waves, find_waves
+from .waves import are_waves, find_current, find_waves
 
 _BLOW = 4.0
 """Standard deviations beyond which an error is a blow's."""
 _SHORTEST, _SMALLEST = 3.0, 0.1
 """Steps that a colour must last, share by which a level must differ."""
+_MOST_AXES = 3
+"""Axes on which errors repeat from which it is no water that moves at random."""
 SLOW = ("waves", "disturbance_colour", "current_varying")
 _AS_WELL = 1.0
 """Nats by which growth with the speed may explain less than a level to explain it as well."""
@@ -61,11 +65,20 @@ def best_law(bench: Bench, look: Look) -> float:
 def all_laws(bench: Bench, look: Look, least: float) -> list[Law]:
     """Laws of what is left, waves and level included, largest gain first."""
     found = laws_of(bench, look)
+    alike = repeating(look.z, bench.data)
     slow = [law for law in found if law.name == "disturbance_colour"]
     if max((law.heldout_gain for law in slow), default=0.0) > least:
-        waves = find_waves(bench, look)
+        waves, current = find_waves(bench, look), find_current(bench, look)
         if are_waves(waves, slow):
             found.append(waves)
+        # one motion of the water against pushes on every axis, or against one that stays
+        stays = won_by("current_varying", found)
+        if current.heldout_gain > max(won_by("disturbance_colour", slow), stays + margin(stays)):
+            found = [law for law in found if law.name != "current_varying"]
+            found.append(current)
+    # what repeats with the commands is no chance
+    water = {"W"} if len(alike) >= _MOST_AXES else set()
+    found = [law for law in found if law.name not in SLOW or law.where not in {*alike, *water}]
     found += find_levels(bench, look, least)
     return sorted(found, key=lambda law: -law.heldout_gain)
 

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ...models import se3
 from ...models.effects.base import AXES, Effect
@@ -51,6 +51,21 @@ class Contender:
     """Share of the estimated diffusion that is none of theirs (`white_part`)."""
 
 
+class Simulated(NamedTuple):
+    """Recorded less simulated, window after window.
+
+    Attributes:
+        errors: pose seen from the simulated body, and twist; lane 0 is simulated without noise, the
+            others with that of the disturbance and of the records (N, 12, S, K).
+        pieces: which of the data (K,).
+        every: steps of a window, each simulated from the record at its start.
+    """
+
+    errors: Float[np.ndarray, "N 12 S K"]
+    pieces: Int[np.ndarray, " K"]
+    every: int
+
+
 class Judged(NamedTuple):
     """Sums over pieces of one fold each; the bootstrap draws folds.
 
@@ -58,6 +73,7 @@ class Judged(NamedTuple):
         score: log density of the innovations by piece (nats) (R,).
         square: squared errors by horizon, group and fold, with their number.
         energy, inside: likewise energy scores, and shares in the bands.
+        simulated: the simulations that these were taken from.
     """
 
     score: Float[np.ndarray, " R"]
@@ -65,6 +81,7 @@ class Judged(NamedTuple):
     energy: Float[np.ndarray, "h F"]
     inside: Float[np.ndarray, "b h F"]
     count: Float[np.ndarray, "h F"]
+    simulated: Simulated
 
 
 class Scores(NamedTuple):
@@ -186,6 +203,7 @@ def _simulated(
         ),
         np.float64,
     )  # fmt: skip
+    simulated = Simulated(e.astype(np.float32), kept, every)
     at = horizons(horizon, every, data.dt)
     fold, labels = data.fold[kept], np.unique(data.fold)
     weight = data.weight[:, kept]
@@ -212,7 +230,7 @@ def _simulated(
                 low, high = order_statistics(SAMPLES, band)
                 hit = (ordered[:, :, low] <= 0) & (ordered[:, :, high] >= 0)
                 inside[b, h, f] = (hit.mean(axis=1) * w).sum()
-    return Judged(score, square, energy, inside, count)
+    return Judged(score, square, energy, inside, count, simulated)
 
 
 def horizons(longest: float, every: int, dt: float) -> list[int]:

@@ -121,14 +121,17 @@ class Evidence:
         fold: Int[np.ndarray, " R"],
     ):
         self.library, self.theta, self.design = library, theta, design
-        scale = np.concatenate([[1.0], 1 / design.size])
-        products = products * scale[:, None] * scale
-        self.runs = pooled(products, run)
+        self.runs = pooled(self.scaled(products), run)
         labels, first = np.unique(run, return_index=True)
         self.fold = fold[first]
         self.folds = pooled(self.runs, self.fold)
         self.fold_of = np.unique(self.fold, return_inverse=True)[1]
         del labels
+
+    def scaled(self, products: Float[np.ndarray, "*R m m"]) -> Float[np.ndarray, "*R m m"]:
+        """Products of responses to parameters of one, from those to the probes as they are."""
+        scale = np.concatenate([[1.0], 1 / self.design.size])
+        return products * scale[:, None] * scale
 
     @cached_property
     def total(self) -> Float[np.ndarray, "m m"]:
@@ -260,6 +263,11 @@ class Evidence:
             values, gradient = np.maximum(values, 1e-12), shift @ T[:, columns] / s
             changes[own] = least_within(values, vectors, gradient, low[own] * s, high[own] * s) / s
         return changes
+
+    def least(self, T: Float[np.ndarray, "m m"], parameters: Sequence[int]) -> float:
+        """What is left of the loss ½ T_00 of some products at the best of these parameters."""
+        weights, _, _ = self._combine(T, *self._split([i for i in parameters if self.shows(i)]))
+        return float(weights @ T @ weights) / 2
 
     def _tangent(self, curved: int | None, t: float, parameters: list[int]) -> np.ndarray:
         """Weights (k, m) of the derivative of the innovations by each parameter."""

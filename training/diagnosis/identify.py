@@ -21,7 +21,6 @@ from .hypotheses import known_within
 from .looking import Bench, Look
 from .noise import Filter
 
-COMMON = ("added_mass", "linear_drag", "quadratic_drag", "net_buoyancy")
 WRENCH = ("axis_thrust", "thrust_lever", "centre_of_buoyancy")
 CURVE = ("thrust_table", "voltage_exponent")
 PULSES = ("thrust_offset",)
@@ -78,7 +77,7 @@ def coefficients(bench: Bench) -> list[Coefficient]:
             spread, low = _DRAG * max(*both, 1e-3), -old
         elif cause == "added_mass":
             spread, low = max(old, 0.1 * float(rigid[AXES.index(where)])), -old
-        elif cause == "net_buoyancy":
+        elif (cause, where) == ("net_buoyancy", "all"):
             spread = _BUOYANCY
         elif (cause, where) == ("actuation_delay", "all") and level:
             spread = _DELAY

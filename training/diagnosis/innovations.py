@@ -107,19 +107,23 @@ def _predict(model: Extended, effects: Any, arrays: Arrays, count: int) -> Predi
             model, inertia, memory, x, v, command, h[None], count, volts[None]
         )
         latest = Recent.over(v, Vp, a, h[None])
+        jacobian, slope = _jacobian(plain, rest, x, (v + Vp) / 2, command, h)
+        latest = latest.keeping(Vp, slope)
         recent = recent.after(latest)
         error = difference(*model.observe(Xp, Vp, recent), X1, V1)
-        jacobian = _jacobian(plain, rest, x, (v + Vp) / 2, command, h)
         return (memory, recent), Predictions(error, Xp, Vp, jacobian, latest, (x, v))
 
     memory = settle(model, past, past_step[:, None])
     first = at_first(model, inertia, memory, X[0], V[0], past[-1], voltage[:1], step[:1])
+    first = first.keeping(V[0], jnp.zeros((6, *V[0].shape), V.dtype))
     xs = (X[:-1], V[:-1], X[1:], V[1:], u, voltage, step)
     return jax.lax.scan(body, (memory, first), xs)[1]._replace(first=first)
 
 
-def _jacobian(model: Extended, inertia: Any, X: Array, V: Array, u: Array, dt: Array) -> Array:
-    """exp(J dt) of δ' = δV - ad_V δ, δV' = ∂a/∂x δ, to third order."""
+def _jacobian(
+    model: Extended, inertia: Any, X: Array, V: Array, u: Array, dt: Array
+) -> tuple[Array, Array]:
+    """exp(J dt) of δ' = δV - ad_V δ, δV' = ∂a/∂x δ, to third order; ∂a/∂V."""
     F = model.allocate(u)
     eye = jnp.eye(12, dtype=V.dtype)[3:]
 
@@ -143,7 +147,7 @@ def _jacobian(model: Extended, inertia: Any, X: Array, V: Array, u: Array, dt: A
     J = dt[None, None] * jnp.concatenate([top, bottom])
     JJ = jnp.einsum("ijr,jkr->ikr", J, J)
     whole = jnp.eye(12, dtype=V.dtype)[:, :, None] + J + JJ / 2
-    return whole + jnp.einsum("ijr,jkr->ikr", JJ, J) / 6
+    return whole + jnp.einsum("ijr,jkr->ikr", JJ, J) / 6, lower[:, 3:]
 
 
 def _late(library: Library, theta: np.ndarray) -> Float[np.ndarray, "6"]:

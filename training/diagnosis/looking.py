@@ -23,7 +23,7 @@ from .gram import gram
 from .hypotheses import Design, Evidence, Fit
 from .innovations import Predictions, predict
 from .naming import parameters_of
-from .noise import Filter, Noise, estimate, make_filter
+from .noise import Filter, Noise, estimate, judging_filter
 from .responses import respond
 from .transition import Transition
 
@@ -34,7 +34,7 @@ _RANDOM = ("waves", "current_varying")
 _DRAG = ("linear_drag", "quadratic_drag")
 _HALVINGS = 4
 """Steps that may fail before a fit ends."""
-_WILD = 1e3
+WILD = 1e3
 """m, rad, m/s, rad/s, and slopes, beyond which a prediction over one step has diverged."""
 _WORSE = 20.0
 """Nats by which one-step errors may become less likely: the filter weighs them otherwise."""
@@ -183,10 +183,7 @@ class Bench:
         if kalman is not None:
             return p, noise, kalman
         data, inverse = self.data, np.linalg.inv(mass)
-        kalman = make_filter(noise, steps, inverse, data.dt, data.step, jacobian)
-        # correlated innovations tell less than as many independent ones
-        less = kalman.whiten / np.sqrt(noise.memory)[:, None, None]
-        return p, noise, replace(kalman, whiten=less, memory=noise.memory)
+        return p, noise, judging_filter(noise, steps, inverse, data.dt, data.step, jacobian)
 
     def errors(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "N 12 R"]:
         """Errors of one-step predictions, zero where a piece has no sample."""
@@ -345,7 +342,7 @@ class Bench:
             np.abs(np.asarray(a)).max(axis=(1, *range(2, a.ndim - 1)))
             for a in (p.error, p.jacobian)
         )
-        return np.any([np.any(~(size < _WILD) & here, axis=0) for size in sizes], axis=0)
+        return np.any([np.any(~(size < WILD) & here, axis=0) for size in sizes], axis=0)
 
 
 def mass(

@@ -18,6 +18,8 @@ CLEAR, CLEAR_OF_FEW = 5.0, 1.5
 """Multiples of the threshold from which the robust p value is not asked: few clusters (runs, or
 pieces of a handful of runs) bound it, so few that only some of them show an effect bound it to
 nothing."""
+_CLEARLY = 3.0
+"""Standard errors from which a parameter differs from zero."""
 _FEW = 12
 """Clusters that are few."""
 
@@ -45,6 +47,17 @@ def admissible(library: Library, theta: Float[np.ndarray, " p"], fit: Fit) -> bo
     return True
 
 
+def is_itself(library: Library, theta: Float[np.ndarray, " p"], fit: Fit) -> bool:
+    """Whether an essential parameter of the name clearly differs from zero, if it has any."""
+    values = theta[list(fit.parameters)] + fit.values
+    made_of = [
+        abs(value) > _CLEARLY * error
+        for i, value, error in zip(fit.parameters, values, fit.errors, strict=True)
+        if library.entries[i].parameter.name in kind(library.entries[i].cause).essential
+    ]
+    return not made_of or any(made_of)
+
+
 def margin(gain: float) -> float:
     """How much a name with more freedom must win by."""
     return max(MARGIN_NATS, MARGIN_SHARE * gain)
@@ -62,8 +75,8 @@ def choose(
     """The name that explains most, or None where nothing passes.
 
     To pass, a name needs a held-out gain above `threshold` (calibrated for the number of names), a
-    robust p value that survives Bonferroni unless the gain is clear (`strict`: even then), and
-    admissible estimates.
+    robust p value that survives Bonferroni unless the gain is clear (`strict`: even then),
+    admissible estimates, and what makes it that name.
     Echoes of names accepted before (with their gains) must win one per cent of those. Among the
     rest the largest held-out gain leads; a simpler name replaces it unless clearly beaten. Ties are
     names within two standard errors of the difference, clustered by run.
@@ -83,6 +96,7 @@ def choose(
                 or (fit.heldout_gain > _clear(fit) * threshold and not strict)
             )
             and admissible(library, theta, fit)
+            and is_itself(library, theta, fit)
         ):
             passing[hypothesis] = fit
     if not passing:

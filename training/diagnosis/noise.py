@@ -227,6 +227,20 @@ def make_filter(
     return _filter(noise, process, step, dt, transition, jacobian)[0]
 
 
+def judging_filter(
+    noise: Noise,
+    transition: Transition,
+    mass_inverse: Float[np.ndarray, "6 6"],
+    dt: float,
+    step: Float[np.ndarray, "N R"],
+    jacobian: Float[np.ndarray, "N 12 12 R"],
+) -> Filter:
+    """That filter, by which correlated innovations tell less than as many independent ones."""
+    kalman = make_filter(noise, transition, mass_inverse, dt, step, jacobian)
+    less = kalman.whiten / np.sqrt(noise.memory)[:, None, None]
+    return replace(kalman, whiten=less, memory=noise.memory)
+
+
 Process = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Ā and Q (R, 12, 12) of steps (R,) in s."""
 

@@ -11,7 +11,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from ...models.files import atomic_path
 
 Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,13 @@ class Structure:
 
 @dataclass(frozen=True)
 class Cause:
-    """One named cause."""
+    """One named cause.
+
+    Attributes:
+        next_experiment: what would tell it from what it is confused with, in words.
+        experiments: nats a minute that each maneuver of a set is expected to tell by; empty where
+            maneuvers make no difference.
+    """
 
     name: str
     where: str
@@ -80,6 +86,7 @@ class Cause:
     rivals: list[Rival]
     indistinguishable_from: list[str]
     next_experiment: str
+    experiments: dict[str, float] = field(default_factory=dict)
     structure: Structure | None = None
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from ...models.effects.library import Library, kind
+from ...models.effects.library import kind
 from .beside import Beside
 from .disturbance import SLOW, laws_of, won_by
 from .gain import Contender, scores
@@ -19,6 +19,7 @@ from .naming import (
     Hypothesis,
     admissible,
     choose,
+    is_itself,
     margin,
     p_value,
     parameters_of,
@@ -89,7 +90,8 @@ def refitted(bench: Bench, refit: str) -> list[int]:
     """Parameters that are free beside every cause."""
     if refit == "all":
         return [c.row for c in coefficients(bench)]
-    return [i for i, e in enumerate(bench.library.entries) if e.cause in REFITS[refit]]
+    entries = enumerate(bench.library.entries)
+    return [i for i, e in entries if e.cause in REFITS[refit] and e.where != "centre_of_buoyancy"]
 
 
 class Search:
@@ -191,11 +193,12 @@ class Search:
         """
         names = [choice.hypothesis, *(h for h, _ in choice.rivals)]
         for h in names:
-            theta, seen = self._fitted(h, fits, found, None)
+            theta, seen, _ = self._fitted(h, fits, found, None)
             left = laws_of(self.bench, seen)
             if left and max(won_by(w.name, left) for w in left) < _LEFT * law:
                 exact = self._exact(fits[h], theta, seen, found)
-                if not admissible(self.bench.library, found.current.theta, exact):
+                named = self.bench.library, found.current.theta, exact
+                if not (admissible(*named) and is_itself(*named)):
                     continue
                 gains = [(other, fits[other].heldout_gain) for other in names if other != h]
                 return Choice(h, exact, (), tuple(gains))
@@ -301,12 +304,15 @@ class Search:
 
     def _fitted(
         self, h: Hypothesis, fits: dict[Hypothesis, Fit], found: Found, kalman: Filter | None
-    ) -> tuple[Float[np.ndarray, " p"], Look]:
-        """A name fitted with exact predictions, beside all that was found."""
+    ) -> tuple[Float[np.ndarray, " p"], Look, Fit]:
+        """A name fitted with exact predictions, beside all that was found; the fit has its own
+        numbers alone, as they are.
+        """
         beside = self.nuisance + parameters_of(self.bench.library, found.hypotheses)
         chosen = [*self.bench.library.at(*h), *beside]
         start = self._start(fits[h], found.current.theta)
-        return self.bench.polish(start, chosen, kalman, origin=found.current)[:2]
+        theta, seen, joint = self.bench.polish(start, chosen, kalman, origin=found.current)
+        return theta, seen, _of_one(self.bench.library.at(*h), theta, joint)
 
     def _refine(
         self, choice: Choice, fits: dict[Hypothesis, Fit], found: Found
@@ -315,7 +321,7 @@ class Search:
         library, bench = self.bench.library, self.bench
         beside = self.nuisance + parameters_of(library, found.hypotheses)
         top = choice.hypothesis
-        theta, seen = self._fitted(top, fits, found, None)
+        theta, seen, _ = self._fitted(top, fits, found, None)
         close = [h for h, g in choice.rivals[:2] if g > _CLOSE * choice.fit.heldout_gain]
         if not close:
             return choice, theta
@@ -324,8 +330,9 @@ class Search:
         for h in close:
             if h[0] in kind(top[0]).simpler:
                 continue
-            other, rival = self._fitted(h, fits, found, seen.kalman)
-            within = admissible(library, np.zeros_like(other), _as_fit(library, h, other))
+            other, rival, alone = self._fitted(h, fits, found, seen.kalman)
+            named = library, np.zeros_like(other), alone
+            within = admissible(*named) and is_itself(*named)
             # what is nested in a name keeps it unless clearly beaten; more numbers must pay
             least = 2.0 if best.loss == start_loss else 0.0
             least += max(len(library.at(*h)) - len(library.at(*top)), 0)
@@ -336,7 +343,9 @@ class Search:
         if top == choice.hypothesis:
             return choice, theta
         rivals = ((choice.hypothesis, choice.fit.heldout_gain), *choice.rivals)
-        return Choice(top, fits[top], choice.ties, rivals), theta
+        others = tuple(rival for rival in rivals if rival[0] != top)
+        ties = tuple(h for h in choice.ties if h != top)
+        return Choice(top, fits[top], ties, others), theta
 
     def _backward(self, found: Found) -> None:
         """Drop causes that those found later have made needless, and refit the rest."""
@@ -362,6 +371,7 @@ class Search:
             found.current = self.bench.look(theta)
 
 
-def _as_fit(library: Library, h: Hypothesis, theta: np.ndarray) -> Fit:
-    rows = library.at(*h)
-    return Fit(tuple(rows), theta[rows], {}, np.zeros(len(rows)), 0.0, np.zeros(1), 1.0)
+def _of_one(rows: Sequence[int], theta: Float[np.ndarray, " p"], joint: Fit) -> Fit:
+    """Numbers of one name as they are (no changes), with their errors in a joint fit."""
+    errors = np.array([joint.errors[joint.parameters.index(i)] for i in rows])
+    return Fit(tuple(rows), theta[list(rows)], {}, errors, 0.0, np.zeros(1), 1.0)

@@ -11,15 +11,18 @@ from jaxtyping import Float
 from ...models.effects.base import AXES, Effect
 from ...models.effects.library import kind
 from . import result
-from .experiments import next_experiment
+from .experiments import Experiment, of_law
 from .hypotheses import Fit
-from .laws import Law, estimated
+from .laws import Law, estimated, run_constants
 from .looking import Bench, Look
 from .naming import Choice, parameters_of
+from .repeats import repeating
 from .search import Found
 
 CHANNELS = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
 _NAN = float("nan")
+_SCALE = 0.01
+"""Spread of thrust between runs that is tried first."""
 _FOLLOWING, _SEVERAL = 0.5, 3
 """Correlation of neighbouring errors that is no chance, and velocities that have it."""
 
@@ -30,9 +33,20 @@ def quantile(fit: Fit) -> float:
 
 
 def unit(of: str, where: str) -> str:
-    """The unit on one axis, of a parameter whose unit differs between moving and turning."""
+    """The unit at one place, of a parameter whose unit differs between moving and turning.
+
+    A coefficient of one axis by the motion on another (`sway_from_yaw`) has the units of both.
+    """
     both = of.split(" or ")
-    return both[where in AXES[3:]] if len(both) == 2 else of
+    axis, _, source = where.partition("_from_")
+    if len(both) == 2:
+        return both[axis in AXES[3:] or where == "munk"]
+    if source:
+        force, _, speed = of.partition("/")
+        force = force.replace("N", "N·m") if axis in AXES[3:] else force
+        speed = speed.replace("m", "rad") if source in AXES[3:] else speed
+        return f"{force}/{speed}"
+    return of
 
 
 def values_of(
@@ -54,12 +68,12 @@ def cause(
     bench: Bench,
     look: Look,
     joint: Fit,
+    experiment: Experiment,
     structure: result.Structure | None = None,
 ) -> result.Cause:
     """A named cause; `joint` is the fit of all accepted parameters together."""
     name, where = choice.hypothesis
     rivals = [result.Rival(h[0], h[1], float(g)) for h, g in choice.rivals]
-    others = [*(h[0] for h in choice.ties), *(r.name for r in rivals)]
     return result.Cause(
         name=name,
         where=where,
@@ -67,7 +81,8 @@ def cause(
         evidence=result.Support(choice.p_value, choice.fit.heldout_gain),
         rivals=rivals,
         indistinguishable_from=list(dict.fromkeys(h[0] for h in choice.ties if h[0] != name)),
-        next_experiment=next_experiment(name, kind(name).family, others),
+        next_experiment=experiment.text,
+        experiments=experiment.nats,
         structure=structure,
     )
 
@@ -99,6 +114,47 @@ def residual(bench: Bench, look: Look) -> dict[str, result.AxisResidual]:
 
 
 def left_over(
+    residual: Mapping[str, result.AxisResidual],
+    causes: Sequence[result.Cause],
+    bench: Bench,
+    look: Look,
+    least: float,
+) -> list[str]:
+    """What the causes leave that is no noise, in words."""
+    if look.noise.estimated:
+        return following(residual, causes)
+    left = following(residual, causes)
+    alike = repeating(look.z, bench.data)
+    if alike:
+        left.append(
+            f"errors of {', '.join(alike)} repeat from run to run under the same commands (up to "
+            f"{max(alike.values()):.1f} times what chance makes): the simulation lacks something "
+            "there that follows the commands"
+        )
+    gain, std = thrust_by_run(bench, look)
+    if gain > max(least, *(c.evidence.heldout_gain for c in causes if _is_random(c.name)), 0.0):
+        left.append(
+            f"thrust differs from run to run (by {100 * std:.1f} %, standard deviation), as with a "
+            "supply voltage that was not recorded"
+        )
+    return left
+
+
+def _is_random(name: str) -> bool:
+    return name in ("waves", "current_varying") or kind(name).family == "disturbance"
+
+
+def thrust_by_run(bench: Bench, look: Look) -> tuple[float, float]:
+    """Nats that a thrust scale of each run's own wins on data left out, and how they spread."""
+    evidence, at = look.plain, bench.library.at("thrust_scale", "all")
+    if not set(at) <= set(evidence.design.owner.tolist()) or len(evidence.runs) < 3:
+        return 0.0, 0.0
+    columns, size = [evidence.column(i) for i in at], np.array([_SCALE])
+    gain, values, _ = run_constants(evidence.runs, columns, size, evidence.fold)
+    return float(gain.sum()), values["std"]
+
+
+def following(
     residual: Mapping[str, result.AxisResidual], causes: Sequence[result.Cause]
 ) -> list[str]:
     """What errors that follow each other say: velocities' alone, and of no law that was named.
@@ -128,6 +184,7 @@ def law_cause(
     """Laws of one name as a cause, axis by axis, and the effect that has them."""
     same = sorted(laws, key=lambda law: law.where in AXES[3:])  # newtons before newton metres
     top = max(laws, key=lambda law: law.heldout_gain)
+    experiment = of_law(top, rivals, bench, look)
     parameters: dict[str, result.Value] = {}
     cls = kind(top.name)
     values = np.zeros(cls.size())
@@ -142,7 +199,8 @@ def law_cause(
         evidence=result.Support(float(np.exp(-top.heldout_gain)), top.heldout_gain),
         rivals=[result.Rival(r.name, r.where, r.heldout_gain) for r in rivals[:4]],
         indistinguishable_from=[],
-        next_experiment=next_experiment(top.name, "disturbance", [r.name for r in rivals]),
+        next_experiment=experiment.text,
+        experiments=experiment.nats,
     )
     return named, cls(jnp.asarray(values))
 

@@ -1,7 +1,7 @@
-"""Swell, currents that differ from run to run, and judging causes beside either or slow pushes."""
+"""Swell, currents that wander, and judging causes beside either or slow pushes."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -31,17 +31,25 @@ _TIMES = 2.0
 """How many times what slow forces win waves must win."""
 _BENDS = 4
 """Cosines that bend a current over a piece, besides a constant."""
+_WANDER = np.array([0.3, 0.6, 1.0, 2.0, 4.0, 10.0, 100.0])
+"""Time constants of a current that are tried, in lengths of a piece."""
+_LONG = 10.0
+"""Of those, from which a current stays as it is."""
 
 
 def beside_laws(bench: Bench, look: Look, laws: Sequence[Law]) -> Beside:
     """The random structure that wins most: slow pushes by axis, a current, or swell."""
     slow = [law for law in laws if law.name == "disturbance_colour" and law.heldout_gain > _LEAST]
     pushes = sum(law.heldout_gain for law in slow)
-    current = max((law.heldout_gain for law in laws if law.name == "current_varying"), default=0.0)
-    if current > pushes:
+    stays = max((law.heldout_gain for law in laws if law.name == "current_varying"), default=0.0)
+    wanders = find_current(bench, look)
+    if max(stays, wanders.heldout_gain) > pushes:
         whole = Screen(bench, look, None, whole=True)
         v = _flow(bench, whole.kept)
-        return _drawn(whole, v, np.zeros_like(v), _bends())
+        length = float(np.median(bench.data.times[-1, whole.kept]))
+        return _drawn(
+            whole, v, np.zeros_like(v), _bends(wanders.parameters["time_constant"] / length)
+        )
     if slow:
         swell, waves = _found(bench, look)
         if are_waves(waves, slow):
@@ -102,10 +110,45 @@ def _flow(bench: Bench, kept: np.ndarray) -> Float[np.ndarray, "N 3 k R"]:
     return found
 
 
-def _bends() -> np.ndarray:
-    """Standard deviations of the flow's terms: mean-reverting within the length of a piece."""
+def find_current(bench: Bench, look: Look) -> Law:
+    """A horizontal current that wanders within runs: Gauss–Markov in W, anew for each piece.
+
+    Its Karhunen–Loève series is cut after `_BENDS` cosines. Of the time constants the one that wins
+    most; of one of ten pieces and more is only known that it is longer than a piece.
+    """
+    screen = Screen(bench, look, None)
+    v = _flow(bench, screen.kept)
+    J = _responses(screen, v, np.zeros_like(v))
+    G, columns = _products(screen, J), list(range(1, len(J) + 1))
+    length = float(np.median(bench.data.times[-1, screen.kept]))
+
+    def lost(logs: np.ndarray) -> np.ndarray:
+        """Nats by piece at the logarithms of standard deviation and time constant."""
+        spread = _bends(float(np.exp(logs[1])) / length)
+        return run_constants(G, columns, spread, screen.fold)[2](logs[:1] + np.log(spread[0]))
+
+    tried = [run_constants(G, columns, _bends(tau), screen.fold) for tau in _WANDER]
+    best = int(np.argmax([told[0].sum() for told in tried]))
+    share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
+    heldout, values, _ = tried[best]
+    std, tau = values["std"] / _bends(_WANDER[best])[0], length * _WANDER[best]
+    numbers = {"std": float(std), "time_constant": float(tau)}
+    law = Law("current_varying", "W", numbers, heldout * share, loss=lost)
+    logs, covariance = estimated(law, np.arange(len(screen.kept)))
+    numbers = dict(zip(numbers, np.exp(logs).tolist(), strict=True))
+    unsure = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    errors = {
+        name: value * float(e) for (name, value), e in zip(numbers.items(), unsure, strict=True)
+    }
+    if numbers["time_constant"] > _LONG * length:
+        numbers["time_constant"], errors["time_constant"] = length, float("nan")
+    return replace(law, parameters=numbers, loss=None, errors=errors)
+
+
+def _bends(tau: float = 1.0) -> np.ndarray:
+    """Standard deviations of the flow's terms, mean-reverting within `tau` lengths of a piece."""
     t = (np.arange(64) + 0.5) / 64
-    C = np.exp(-np.abs(t[:, None] - t))
+    C = np.exp(-np.abs(t[:, None] - t) / tau)
     phi = np.stack([np.cos(np.pi * k * t) * (np.sqrt(2) if k else 1) for k in range(_BENDS + 1)])
     return np.repeat(np.sqrt(np.diag(phi @ C @ phi.T)) / 64, 2)
 

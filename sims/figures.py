@@ -94,3 +94,18 @@ def legend(axes: Axes, **options: Any) -> None:
     }
     if handles:
         axes.legend(**(settings | options))
+
+
+def common_legend(figure: Figure, axes: Axes) -> None:
+    """One row above all panels, at the right, of what one of them shows."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside upper right", ncols=len(handles), frameon=False,
+        handlelength=1.4, columnspacing=1.2, borderaxespad=0.0,
+    )  # fmt: skip
+
+
+def plain_logs(axes: Axes) -> None:
+    """Numbers of a logarithmic axis as they are: 0.5, 2, 30."""
+    axes.yaxis.set_major_formatter(lambda x, _: f"{x:g}")
+    axes.yaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")

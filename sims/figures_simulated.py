@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ..models import se3
 from ..training.diagnosis.diagnose import Finding
 from ..training.diagnosis.gain import Simulated
-from .figures import FLOWN, GRID, INK, PLANNED, legend, panels, styled
+from .figures import FLOWN, GRID, INK, PLANNED, common_legend, legend, panels, plain_logs, styled
 from .figures_diagnosis import draw_map, error_map, variables
 
 NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
@@ -80,11 +80,11 @@ def bands_figure(finding: Finding) -> Figure:
     for ax in axes[-1]:
         ax.set_xlabel("t / s")
     figure.suptitle(
-        f"A run of '{data.names[int(data.scenario[piece])]}' in the 90 % bands of simulations that "
-        "start from the record at each grey line",
+        f"A run of '{data.names[int(data.scenario[piece])]}', simulated anew from each grey line: "
+        "90 % bands",
         fontsize=9.5, x=0.01, ha="left",
     )  # fmt: skip
-    legend(axes[0, 2])
+    common_legend(figure, axes[0, 2])
     return figure
 
 
@@ -111,7 +111,7 @@ def axes_figure(finding: Finding) -> Figure:
         ax.set_ylim(bottom=0)
     for ax in axes[-1]:
         ax.set_xlabel("horizon / s")
-    legend(axes[0, 5])
+    common_legend(figure, axes[0, 5])
     return figure
 
 
@@ -169,6 +169,7 @@ def runs_figure(finding: Finding) -> Figure:
     for ax, title in zip(axes[:, 0], ("One-step errors", "Errors of simulations"), strict=True):
         ax.axhline(1, color=INK, lw=1, ls="--")
         ax.set_yscale("log")
+        plain_logs(ax)
         ax.set_title(f"{title} by run; dashed: what noise does")
         for edge in edges:
             ax.axvline(edge, color=GRID, lw=1.0, zorder=0)

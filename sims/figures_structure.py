@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from ..training.diagnosis.data import Data
 from ..training.diagnosis.diagnose import Finding
 from ..training.diagnosis.repeats import shares
-from .figures import INK, QUIET, legend, panels, styled
+from .figures import INK, QUIET, common_legend, panels, plain_logs, styled
 from .figures_diagnosis import error_map, innovations_of, where_they_are
 from .figures_simulated import MODELS
 
@@ -42,7 +42,7 @@ def memory_figure(finding: Finding) -> Figure:
         axes[1, i].set_xlabel("frequency / Hz")
     axes[0, 0].set_ylabel("autocorrelation")
     axes[1, 0].set_ylabel("power, 1 is noise")
-    legend(axes[0, 5])
+    common_legend(figure, axes[0, 5])
     return figure
 
 
@@ -70,12 +70,13 @@ def repeats_figure(finding: Finding) -> Figure:
             ax.bar(x + 0.38 * (k - 0.5), found[number], 0.36, color=color, label=name)
         ax.axhline(1, color=INK, lw=1, ls="--")
         ax.set_yscale("log")
+        plain_logs(ax)
         ax.set_title(title)
         ax.set_xticks(x, _TWIST, rotation=30)
         if np.isnan(by_model[0][number]).all():
             ax.text(0.5, 0.5, "no runs repeat", ha="center", color=QUIET, transform=ax.transAxes)
     axes[0, 0].set_ylabel("variance, 1 is noise")
-    legend(axes[0, 2])
+    common_legend(figure, axes[0, 2])
     return figure
 
 

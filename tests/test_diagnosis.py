@@ -16,6 +16,8 @@ from spinndrift.models.errors import UserError
 from spinndrift.models.recording import Recording
 from spinndrift.models.recording_csv import read_csv
 from spinndrift.models.vehicle import load_vehicle
+from spinndrift.sims.diagnosis_report import diagnosis_page
+from spinndrift.sims.figures_simulated import at_ends
 from spinndrift.training.diagnosis import looking
 from spinndrift.training.diagnosis.checks import limits
 from spinndrift.training.diagnosis.data import Data
@@ -57,6 +59,7 @@ from spinndrift.training.diagnosis.telling import (
     with_coefficients_off,
 )
 from spinndrift.training.diagnosis.transition import Transition
+from spinndrift.training.generate import GenerateConfig, generate
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(runs=2, seconds=6.0)
@@ -237,6 +240,15 @@ def test_a_lag_is_named_measured_and_extended(tmp_path):
     assert seen == sorted(seen)
     assert seen[-1] == 1
     check(json.loads(d.as_json()), schema())
+    assert d.causes[0].experiments[max(d.causes[0].experiments)] >= 0
+    html = diagnosis_page(finding, "A lag").html()
+    for title in ("Simulations beside the records", "Where the error lives", "Error or noise"):
+        assert f"<h2>{title}</h2>" in html or title in html
+    assert html.count("data:image") == 14
+    # simulated windows end as far from the records as the simulated noise is wide
+    z, _, _ = at_ends(finding, finding.simulated["extended"])
+    assert np.sqrt((z**2).mean()) == pytest.approx(1, abs=0.15)
+    assert (at_ends(finding, finding.simulated["base"])[0] ** 2).mean() > (z**2).mean()
     assert not coefficients_are_off(d)
     assert best_gain(d) == d.gain["extended"].log_score_gain.value
     # what a belief that is wrong in most coefficients shows: no name, and a refit that tells
@@ -601,6 +613,17 @@ def test_a_name_nested_in_another_keeps_the_data(tmp_path):
     assert not is_itself(bench.library, look.theta, tether), "a tether pulls sideways or tautens"
     held = replace(tether, values=np.array([0.5, *tether.values[1:]]))
     assert is_itself(bench.library, look.theta, held)
+
+
+def test_simulated_states_without_noise_are_no_clock_that_is_off():
+    """Of ten substeps a sample: the pose feels a push half a substep late."""
+    config = GenerateConfig(
+        maneuvers=("surge-forward", "yaw-left", "heave-roll-pitch"), trajectories=4, duration=6.0
+    )
+    diagnoser = Diagnoser(generate(config, VEHICLE), VEHICLE)
+    look = diagnoser.bench.look(diagnoser.bench.believed)
+    search = diagnoser._names(diagnoser.bench, [], 0.0, 1.0)
+    assert search.next(Found(look, look, look))[0] is None
 
 
 def test_bands_hold_what_a_law_of_the_disturbance_adds(tmp_path):

@@ -15,7 +15,8 @@ from .figures_diagnosis import draw_map, error_map, variables
 
 NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
 _UNITS = ("m", "m", "m", "°", "°", "°", "m/s", "m/s", "m/s", "°/s", "°/s", "°/s")
-_BAND = 0.9
+_BAND, _LOST = 0.9, 1e6
+"""Share of simulations in a band; size of an error beyond which one has diverged."""
 _SCALE = np.array([1, 1, 1, *3 * (180 / np.pi,)] * 2)
 """From SI to the units shown."""
 MODELS = {"base": ("belief", PLANNED), "extended": ("with the causes", FLOWN)}
@@ -30,16 +31,27 @@ def contenders(finding: Finding) -> list[tuple[Simulated, str, str]]:
 def shown(
     X: Float[np.ndarray, "N 7 *s"], V: Float[np.ndarray, "N 6 *s"]
 ) -> Float[np.ndarray, "N 12 *s"]:
-    """Position (m), roll, pitch and yaw (°), velocity (m/s) and turning rate (°/s)."""
+    """Position (m), roll, pitch and yaw (°), velocity (m/s) and turning rate (°/s).
+
+    Of a simulation that has diverged attitudes are not a number.
+    """
     q = np.moveaxis(X[:, [1, 2, 3, 0]], 1, -1)
+    lost = np.asarray(~np.isfinite(q).all(axis=-1))
+    q = np.where(lost[..., None], [0.0, 0.0, 0.0, 1.0], q)
     angles = Rotation.from_quat(q.reshape(-1, 4)).as_euler("ZYX").reshape(*q.shape[:-1], 3)
+    angles[lost] = np.nan
     turned = np.moveaxis(angles[..., ::-1], -1, 1)
     return np.concatenate([X[:, 4:], turned, V], axis=1) * _SCALE.reshape(12, *(1,) * (X.ndim - 2))
 
 
+def _bounded(values: np.ndarray) -> np.ndarray:
+    """The same with what diverged at ±`_LOST`."""
+    return np.clip(np.nan_to_num(values, nan=_LOST, posinf=_LOST, neginf=-_LOST), -_LOST, _LOST)
+
+
 def _typical(finding: Finding, simulated: Simulated) -> int:
     """The run with the median error in the scenario that the belief forecasts worst."""
-    error = np.nan_to_num((simulated.errors[:, :, 0] ** 2).sum(axis=(0, 1)), nan=np.inf)
+    error = _bounded((simulated.errors[:, :, 0].astype(float) ** 2).sum(axis=(0, 1)))
     scenario = finding.data.scenario[simulated.pieces]
     there = np.unique(scenario)
     worst = there[np.argmax([np.median(error[scenario == s]) for s in there])]
@@ -60,6 +72,7 @@ def bands_figure(finding: Finding) -> Figure:
     figure, axes = panels(4, 3, 6.6, sharex=True)
     for simulated, name, color in contenders(finding):
         e = simulated.errors[:n, :, 1:, k].astype(float)
+        e[~(np.abs(e) < _LOST)] = np.nan
         away = jnp.asarray(np.moveaxis(-e[:, :6], 1, 0))
         X_s = se3.retract(jnp.asarray(X.T)[:, :, None], away)
         found = shown(np.moveaxis(np.asarray(X_s), 0, 1), V[:, :, None] - e[:, 6:])
@@ -125,14 +138,14 @@ def at_ends(
     e = simulated.errors.astype(float)
     ends = np.arange(every - 1, len(e), every)
     exists = data.weight[ends][:, simulated.pieces] > 0
-    own = e[ends].transpose(0, 3, 1, 2)[exists]
+    own = _bounded(e[ends].transpose(0, 3, 1, 2)[exists])
     spread = own[:, :, 1:].std(axis=2)
     means = {}
     for name, values in variables(finding).items():
         windows = np.stack([values[n + 1 - every : n + 1, simulated.pieces].mean(0) for n in ends])
         means[name] = windows[exists]
     piece = np.broadcast_to(simulated.pieces, exists.shape)[exists]
-    return own[:, :, 0] / np.maximum(spread, 1e-12), means, piece
+    return _bounded(own[:, :, 0] / np.maximum(spread, 1e-12)), means, piece
 
 
 @styled

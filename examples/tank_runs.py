@@ -73,7 +73,7 @@ LADDER: tuple[tuple[str, tuple[tuple[str, tuple[str, ...] | None], ...]], ...] =
     ("preset", ()),
     ("gain of the command, by axis", (("axis_thrust", None),)),
     ("and drag, net buoyancy", (("linear_drag", None), ("quadratic_drag", None),
-                                ("net_buoyancy", None))),
+                                ("net_buoyancy", ("all",)))),
     ("and centre of gravity", (("centre_of_gravity", None),)),
     ("and thruster lag", (("thruster_lag", ("all",)),)),
     ("and drag coupling", (("drag_coupling", LEVERS),)),

@@ -240,11 +240,11 @@ def test_a_lag_is_named_measured_and_extended(tmp_path):
     assert seen == sorted(seen)
     assert seen[-1] == 1
     check(json.loads(d.as_json()), schema())
-    assert d.causes[0].experiments[max(d.causes[0].experiments)] >= 0
+    assert min(d.causes[0].experiments.values()) >= 0
     html = diagnosis_page(finding, "A lag").html()
     for title in ("Simulations beside the records", "Where the error lives", "Error or noise"):
-        assert f"<h2>{title}</h2>" in html or title in html
-    assert html.count("data:image") == 14
+        assert title in html
+    assert html.count("data:image") == 13
     # simulated windows end as far from the records as the simulated noise is wide
     z, _, _ = at_ends(finding, finding.simulated["extended"])
     assert np.sqrt((z**2).mean()) == pytest.approx(1, abs=0.15)

@@ -121,9 +121,9 @@ def left_over(
     least: float,
 ) -> list[str]:
     """What the causes leave that is no noise, in words."""
-    if look.noise.estimated:
-        return following(residual, causes)
     left = following(residual, causes)
+    if look.noise.estimated:
+        return left
     alike = repeating(look.z, bench.data)
     if alike:
         left.append(

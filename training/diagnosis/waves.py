@@ -145,7 +145,7 @@ def find_current(bench: Bench, look: Look) -> Law:
     return replace(law, parameters=numbers, loss=None, errors=errors)
 
 
-def _bends(tau: float = 1.0) -> np.ndarray:
+def _bends(tau: float) -> np.ndarray:
     """Standard deviations of the flow's terms, mean-reverting within `tau` lengths of a piece."""
     t = (np.arange(64) + 0.5) / 64
     C = np.exp(-np.abs(t[:, None] - t) / tau)

@@ -8,7 +8,6 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from threadpoolctl import threadpool_limits
 
 from ...models.checks import check_numbers, require
 from ...models.dynamics import Dynamics
@@ -361,6 +360,8 @@ def diagnose(
         UserError: the recording lacks pose or twist, or is too short.
     """
     # threads of BLAS wait for each other in a loop: beside other work that is five times slower
+    from threadpoolctl import threadpool_limits  # it sets a variable as it is imported
+
     with threadpool_limits(1, user_api="blas"):
         return _diagnose(recording, vehicle, base, config or DiagnoseConfig(), progress)
 

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jaxtyping import Array
 
 from .errors import UserError
 from .files import atomic_path
@@ -107,6 +108,11 @@ class Recording:
         return present(self.dataset, COMMANDS)
 
     @property
+    def thrust_from(self) -> str:
+        """Which of the commands says most of the thrusters' forces."""
+        return next(c for c in ("thruster_force", "pwm", "F_Bo_B") if c in self.commands)
+
+    @property
     def missing(self) -> dict[str, tuple[str, ...]]:
         """State channels that some trajectory lacks, by variable: {"X_WB": ("x", "y"), …}."""
         exists = (self.lengths > 0)[..., None]
@@ -181,21 +187,9 @@ class Recording:
         """
         if "F_Bo_B" in self.dataset:
             return self.dataset["F_Bo_B"]
-        vehicle = self._resolve(vehicle)
-        thrusters = vehicle.thrusters(jnp.result_type(float))
+        thrusters = self._resolve(vehicle).thrusters(jnp.result_type(float))
         name = self.commands[0]
-        values = self.dataset[name].to_numpy()
-        count = thrusters.allocation.shape[1]
-        if values.shape[-1] != count:
-            raise UserError(
-                f"{name}: the recording has {values.shape[-1]} thrusters, the vehicle {count}; "
-                "choose the vehicle it was recorded with"
-            )
-        rest = 1500.0 if name == "pwm" else 0.0
-        command = jnp.asarray(np.moveaxis(np.where(self.mask[..., None], values, rest), -1, 0))
-        if name == "pwm":
-            command = thrusters.force(command, jnp.asarray(self._voltage(thrusters)))
-        F = np.moveaxis(np.asarray(thrusters.wrench(command)), 0, -1)
+        F = np.moveaxis(np.asarray(thrusters.wrench(self._forces(name, thrusters))), 0, -1)
         return xr.DataArray(
             np.where(self.mask[..., None], F, np.nan),
             dims=(*LEADING, "wrench_component"),
@@ -206,6 +200,44 @@ class Recording:
             },
             attrs={"units": COMMANDS["F_Bo_B"][1], "made from": name},
         )
+
+    def thrust(self, vehicle: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the thrusters' commanded forces (N) and the voltage relative to the nominal one.
+
+        Arrays (scenario, trajectory, time, n) and (scenario, trajectory, time), finite throughout.
+        Forces are taken as they are, else PWM through the vehicle's curve at the recorded voltage
+        (steady state: no lag), else the wrench split over the thrusters with the least effort.
+
+        Args:
+            vehicle: a `Vehicle`, the name of a preset, or None for the one named in the recording.
+
+        Raises:
+            UserError: if no vehicle is known, or its thruster count differs.
+        """
+        thrusters = self._resolve(vehicle).thrusters(jnp.result_type(float))
+        name = self.thrust_from
+        if name == "F_Bo_B":
+            F = np.moveaxis(self.dataset[name].to_numpy(), -1, 0)
+            level = jnp.tensordot(thrusters.inverse, jnp.asarray(F), 1)
+        else:
+            level = self._forces(name, thrusters)
+        volts = self._voltage(thrusters) / float(thrusters.nominal_voltage)
+        return np.nan_to_num(np.moveaxis(np.asarray(level), 0, -1)), volts
+
+    def _forces(self, name: str, thrusters: Any) -> Array:
+        """Forces (n, scenario, trajectory, time) of a command to thrusters."""
+        values = self.dataset[name].to_numpy()
+        count = thrusters.allocation.shape[1]
+        if values.shape[-1] != count:
+            raise UserError(
+                f"{name}: the recording has {values.shape[-1]} thrusters, the vehicle {count}; "
+                "choose the vehicle it was recorded with"
+            )
+        rest = 1500.0 if name == "pwm" else 0.0
+        command = jnp.asarray(np.moveaxis(np.where(self.mask[..., None], values, rest), -1, 0))
+        if name == "thruster_force":
+            return command
+        return thrusters.force(command, jnp.asarray(self._voltage(thrusters)))
 
     def _resolve(self, vehicle: Any) -> Any:
         if vehicle is None and not self.vehicle:

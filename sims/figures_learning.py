@@ -2,7 +2,6 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from matplotlib.figure import Figure
@@ -11,9 +10,10 @@ from ..models.dynamics import Dynamics
 from ..models.recording import Recording
 from ..training.evaluate import Evaluation
 from ..training.metrics import displacement
+from ..training.objective import Batch
 from ..training.predict import predict
 from ..training.windows import Windows
-from .figures import FLOWN, INK, PLANNED, QUIET, legend, panels, styled
+from .figures import ESTIMATE, FLOWN, INK, PLANNED, QUIET, legend, panels, styled
 
 _NORMS = (
     ("position", "position / m"),
@@ -21,7 +21,7 @@ _NORMS = (
     ("linear_velocity", "velocity / (m/s)"),
     ("angular_velocity", "rate / (rad/s)"),
 )
-_COLORS = {"preset": PLANNED, "learned": FLOWN}
+_COLORS = {"preset": PLANNED, "learned": FLOWN, "start": ESTIMATE}
 
 
 @styled
@@ -137,25 +137,23 @@ def bands_figure(
     Displacements are seen from the learned model's noise-free motion, so that the width of a band
     and the distance of the measurement from it can be compared by eye.
     """
-    one = windows.take(np.array([index]))
-    observed_X, observed_V, F = (jnp.asarray(a) for a in (one.X, one.V, one.F))
-    X_0, V_0 = observed_X[0], observed_V[0]
-    drawn = eqx.filter_jit(predict)
-    X, V = drawn(
-        learned, X_0, V_0, F, windows.dt, jax.random.key(0), samples,
-        substeps=substeps[0], with_path_of_drift=True,
-    )  # fmt: skip
-    Xp, Vp = drawn(
-        preset, X_0, V_0, F, windows.dt, jax.random.key(0), 0,
-        substeps=substeps[1], with_path_of_drift=True,
-    )  # fmt: skip
+    one = Batch.of(windows.take(np.array([index])))
+
+    def drawn(model: Dynamics, count: int, substeps: int) -> tuple[Array, Array]:
+        return eqx.filter_jit(predict)(
+            model, one.X[0], one.V[0], one.F, windows.dt, jax.random.key(0), count,
+            substeps=substeps, with_path_of_drift=True, commands=one.commands,
+        )  # fmt: skip
+
+    X, V = drawn(learned, samples, substeps[0])
+    Xp, Vp = drawn(preset, 0, substeps[1])
     reference = X[:, :, -1:], V[:, :, -1:]
 
     def seen(X_other: Array, V_other: Array) -> np.ndarray:
         return np.asarray(displacement(X_other, V_other, *reference))[..., 0]
 
     sampled = seen(X[:, :, :-1], V[:, :, :-1])
-    measured = seen(observed_X[1:, :, None], observed_V[1:, :, None])[:, :, 0]
+    measured = seen(one.X[1:, :, None], one.V[1:, :, None])[:, :, 0]
     believed = seen(Xp, Vp)[:, :, 0]
     t = windows.dt * np.arange(1, windows.steps + 1)
     figure, axes = panels(4, 3, 8.2, sharex=True)

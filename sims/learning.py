@@ -1,6 +1,6 @@
 """From a recording to a learned vehicle, judged on data it has not seen."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,19 +10,22 @@ import xarray as xr
 
 from ..models.checkpoint import load_model, save_model
 from ..models.dynamics import Dynamics
+from ..models.effects.extended import Extended, core
 from ..models.errors import UserError
+from ..models.integrate import cast
 from ..models.recording import Recording
 from ..models.rigid_body import FossenDynamics
 from ..models.vehicle import Vehicle
 from ..training.config import TrainingConfig, WindowConfig
 from ..training.evaluate import Evaluation, evaluate
 from ..training.fit import TrainingResult, fit
-from ..training.start import estimate_diffusion, starting_model
-from ..training.windows import Windows, make_windows
+from ..training.start import begun_with, estimate_diffusion, starting_model, with_diffusion
+from ..training.windows import Normalisation, Windows, make_windows
 
 FINE_SUBSTEPS = 5
 """Steps a sample for models that were not trained at a step of their own, such as presets."""
 _VALIDATION = 0.15
+_REMEMBERED = 10.0  # s of commands and motion before a window, at most
 _DRIFT = 0.2  # of the time, about, for the start that fits the drift alone
 
 
@@ -40,7 +43,7 @@ class Learned:
     """What training a recording's vehicle ends with."""
 
     model: Dynamics
-    preset: FossenDynamics
+    preset: Dynamics
     parts: Parts
     result: TrainingResult
     evaluation: Evaluation
@@ -48,8 +51,42 @@ class Learned:
     """Integration steps a sample that the model was trained with."""
 
 
-def split_parts(recording: Recording, vehicle: Vehicle, config: WindowConfig) -> Parts:
+@dataclass(frozen=True)
+class Start:
+    """A model that training starts from in place of the preset.
+
+    Attributes:
+        model: a Fossen model, a SPINN, or either with effects about it.
+        substeps: integration steps a sample that suit it.
+    """
+
+    model: Dynamics
+    substeps: int = FINE_SUBSTEPS
+
+    @classmethod
+    def read(cls, path: Path) -> tuple["Start", dict[str, Any]]:
+        """From a model file, with its metadata.
+
+        Raises:
+            UserError: the file is no model.
+        """
+        model, metadata = load_model(path, dtype=jnp.float32)
+        return cls(model, int(metadata.get("substeps", FINE_SUBSTEPS))), metadata
+
+
+def windowing(model: Dynamics | None, normalise: Normalisation) -> dict[str, Any]:
+    """What `make_windows` takes besides for a model; effects see the world and the thrusters."""
+    if not isinstance(model, Extended):
+        return {"normalise": normalise}
+    return {"normalise": "none", "remembered": min(model.lasts, _REMEMBERED)}
+
+
+def split_parts(
+    recording: Recording, vehicle: Vehicle, config: WindowConfig, model: Dynamics | None = None
+) -> Parts:
     """Cut a recording into parts that share no moment of any run (`Recording.split`).
+
+    `model` is one to be trained or judged on them.
 
     Raises:
         UserError: it is too short for windows to learn from and others to hold out.
@@ -62,7 +99,7 @@ def split_parts(recording: Recording, vehicle: Vehicle, config: WindowConfig) ->
                 vehicle,
                 length_s=config.length_s,
                 stride_s=stride,
-                normalise=config.normalise,
+                **windowing(model, config.normalise),
             )
         except UserError as error:
             raise UserError(f"{name} part of the data: {error}") from error
@@ -77,21 +114,30 @@ def split_parts(recording: Recording, vehicle: Vehicle, config: WindowConfig) ->
     return Parts(cut(first, config.stride_s, "training"), validation, held_out)
 
 
-def compare(
-    learned: Dynamics,
-    preset: FossenDynamics,
-    windows: Windows,
-    substeps: int = 1,
-    label: str = "learned",
-) -> Evaluation:
-    """Held-out errors of a preset and of a learned model, each at the step size that suits it."""
+def compare(models: Mapping[str, tuple[Dynamics, int]], windows: Windows) -> Evaluation:
+    """Errors of models on the same windows, each with the substeps a sample that suit it."""
     parts = [
-        evaluate({"preset": preset}, windows, substeps=FINE_SUBSTEPS),
-        evaluate({label: learned}, windows, substeps=substeps),
+        evaluate({name: model}, windows, substeps=substeps)
+        for name, (model, substeps) in models.items()
     ]
     return Evaluation(
         xr.concat([part.dataset for part in parts], dim="model", combine_attrs="drop_conflicts")
     )
+
+
+def judged(model: Dynamics, windows: Windows) -> Dynamics:
+    """The model as it can be judged on windows: in their precision, at their steps, with a b.
+
+    A Fossen model that states no diffusion gets the one that its own errors on them show.
+    """
+    dtype = windows.X.dtype
+    model = cast(model, dtype)
+    if isinstance(model, Extended):
+        model = model.for_steps_of(windows.dt)
+    own = core(model)
+    if not isinstance(own, FossenDynamics) or bool(jnp.any(own.diffusion > 0)):
+        return model
+    return with_diffusion(model, estimate_diffusion(model, windows))
 
 
 def learn(
@@ -100,10 +146,11 @@ def learn(
     config: TrainingConfig,
     out: Path,
     *,
+    start: Start | None = None,
     resume: bool = False,
     progress: Callable[[float, str], None] = lambda fraction, remark: None,
 ) -> Learned:
-    """Train a SPINN from a preset and judge both on the held-out part.
+    """Train a SPINN from a preset, or another `start`, and judge them on the held-out part.
 
     Writes into `out` what `training.fit` writes, `evaluation.csv`, `evaluation.json`, the model
     that training starts from as `start.spinn`, and the preset with its estimated diffusion as
@@ -112,7 +159,9 @@ def learn(
     Raises:
         UserError: the data don't suffice; the sentence says what is missing.
     """
-    parts = split_parts(recording, vehicle, config.windows)
+    given = None if start is None else start.model
+    config = begun_with(config, given)
+    parts = split_parts(recording, vehicle, config.windows, given)
     kept = out / "start.spinn"
     if resume and kept.exists() and (out / "checkpoint.npz").exists():
         model, _ = load_model(kept)
@@ -122,10 +171,11 @@ def learn(
             vehicle,
             parts.learn,
             lambda step, total, loss: progress(_DRIFT * step / total, "drift first"),
+            given,
+            parts.validation,
         )
         save_model(kept, model)
-    dtype = jnp.dtype(parts.learn.X.dtype)
-    preset = vehicle.dynamics(estimate_diffusion(vehicle.dynamics(dtype=dtype), parts.learn), dtype)
+    preset = judged(vehicle.dynamics(), parts.learn)
     substeps = config.objective.substeps
     metadata: dict[str, Any] = {
         "vehicle": vehicle.name,
@@ -146,7 +196,10 @@ def learn(
         resume=resume,
         metadata=metadata,
     )
-    evaluation = compare(result.model, preset, parts.held_out, substeps)
+    models = {"preset": (preset, FINE_SUBSTEPS), "learned": (result.model, substeps)}
+    if start is not None:
+        models["start"] = judged(start.model, parts.learn), start.substeps
+    evaluation = compare(models, parts.held_out)
     evaluation.save(out / "evaluation.csv")
     evaluation.save(out / "evaluation.json")
     save_model(out / "preset.spinn", preset, metadata | {"substeps": FINE_SUBSTEPS})

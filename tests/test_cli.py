@@ -8,9 +8,12 @@ import pytest
 
 from helpers import run_python
 from spinndrift.models import config as yaml
-from spinndrift.models.checkpoint import load_model
+from spinndrift.models.checkpoint import load_model, save_model
+from spinndrift.models.effects.extended import Extended, core
+from spinndrift.models.effects.library import kind
 from spinndrift.models.recording import Recording
 from spinndrift.models.spinn import Spinn, SpinnConfig
+from spinndrift.models.vehicle import load_vehicle
 from spinndrift.sims.cli import main
 from spinndrift.sims.demo import EMBEDDED
 from spinndrift.training.config import (
@@ -160,3 +163,30 @@ def test_train_resume_and_evaluate(generated, tmp_path, capsys, monkeypatch):
     overall = json.loads(results.read_text())
     assert set(overall) == {"preset", "learned"}
     assert 0 < overall["learned"]["rmse_position"] < 1
+
+
+def test_training_starts_from_a_model_with_effects(generated, tmp_path, capsys):
+    """As a diagnosis writes it; what it found stays, a SPINN learns what is left."""
+    vehicle, lag = load_vehicle("bluerov2_heavy"), kind("thruster_lag").of(time_constant=0.1)
+    believed = tmp_path / "extended.spinn"
+    save_model(believed, Extended.create(vehicle.dynamics(), (lag,), vehicle.thrusters()))
+    settings, out = tmp_path / "tiny.yaml", tmp_path / "run"
+    settings.write_text(yaml.dump(TINY))
+    given = ("train", generated, "--config", settings, "--steps", "2")
+    assert called(*given, "--model", believed, "--out", out) is None
+    model, _ = load_model(out / "model.spinn")
+    assert isinstance(model, Extended)
+    assert isinstance(model.base, Spinn)
+    np.testing.assert_allclose(model.effects[0].values, lag.values, rtol=1e-7)
+    overall = json.loads((out / "evaluation.json").read_text())
+    assert set(overall) == {"preset", "learned", "start"}
+    # what was learned is a start too, as it is and with its own architecture alone
+    again = tmp_path / "again"
+    assert called(*given, "--model", out / "model.spinn", "--out", again) is None
+    trained_on = core(load_model(again / "model.spinn")[0])
+    assert isinstance(trained_on, Spinn)
+    assert trained_on.config == model.base.config
+    other = ("train", generated, "--method", "euclidean-fdm", "--out", tmp_path / "no")
+    assert called(*other, "--model", out / "model.spinn") == 2
+    assert "coordinates" in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()

@@ -168,6 +168,7 @@ class FakeThrusters:
     """Force 0.1 N/µs per volt; thruster i pushes with weight i along x."""
 
     allocation = np.outer(np.eye(6)[0], np.arange(8.0))
+    inverse = np.linalg.pinv(allocation)
     nominal_voltage = 2.0
 
     def force(self, pwm_us, voltage):
@@ -205,6 +206,31 @@ def test_wrench_comes_from_whatever_command_there_is():
     four = Recording.from_trajectories([trajectory(n=30, commands={"pwm": pwm[:, :4]})], DT)
     with pytest.raises(UserError, match="4 thrusters, the vehicle 8"):
         four.wrench(FakeVehicle())
+
+
+def test_thrust_comes_from_the_nearest_command():
+    f = np.random.default_rng(0).normal(size=(30, 8))
+    F = f @ FakeThrusters.allocation.T
+    wanted = {
+        "thruster_force": (f, f),
+        "pwm": (1500 + 100 * f, 50 * f),
+        "F_Bo_B": (F, F @ FakeThrusters.inverse.T),
+    }
+    for name, (command, expected) in wanted.items():
+        runs = [
+            trajectory(n=n, commands={name: command[:n]}, sensors={"voltage": np.full(n, 5.0)})
+            for n in (30, 20)
+        ]
+        level, voltage = Recording.from_trajectories(runs, DT).thrust(FakeVehicle())
+        np.testing.assert_allclose(level[0, 0], expected, atol=1e-9)
+        np.testing.assert_allclose(level[0, 1, :20], expected[:20], atol=1e-9)
+        assert np.isfinite(level).all()
+        np.testing.assert_array_equal(voltage[0, 0], 2.5)
+    every = {"pwm": 1500 + f, "thruster_force": f, "F_Bo_B": F}
+    both = trajectory(n=30, commands=every, sensors={})
+    level, voltage = Recording.from_trajectories([both], DT).thrust(FakeVehicle())
+    np.testing.assert_array_equal(level[0, 0], f)
+    np.testing.assert_array_equal(voltage, 1.0)
 
 
 def test_broken_files_are_told_in_one_sentence(tmp_path):

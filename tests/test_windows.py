@@ -1,5 +1,9 @@
 """Windows: normalisation, masks, honest splits, messages."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -142,3 +146,41 @@ def test_what_is_missing_is_named():
     blind = Trajectory("a", blind.X_WB, blind.V_WB_B * np.nan, blind.commands)
     with pytest.raises(UserError, match=r"V_WB_B u/v/w.*DVL"):
         make_windows(recording(blind))
+
+
+class Pair:
+    """A vehicle with two thrusters along x."""
+
+    def thrusters(self, dtype=None):
+        return SimpleNamespace(
+            allocation=np.eye(6)[:, :2],
+            inverse=jnp.eye(6)[:2],
+            nominal_voltage=jnp.array(16.0),
+            wrench=lambda f: jnp.tensordot(jnp.eye(6)[:, :2], f, 1),
+        )
+
+
+def test_windows_know_what_was_commanded_before():
+    """Commands at index n are n; before the beginning of a run the first is held."""
+    F = run("a", 101, 5).commands["F_Bo_B"]
+    one = replace(run("a", 101, 5), commands={"thruster_force": F[:, :2]})
+    given = {"length_s": 1.0, "stride_s": 0.5, "normalise": "none", "dtype": np.float64}
+    w = make_windows(recording(one), Pair(), remembered=0.2, **given)
+    assert make_windows(recording(one), Pair(), **given).commands is None
+    c = w.commands
+    assert c is not None
+    assert c.before.shape == (4, 2, len(w))
+    for i, start in enumerate(w.start):
+        n = round(start / DT)
+        np.testing.assert_array_equal(c.level[:, 0, i], np.arange(n, n + 20))
+        before = np.maximum(np.arange(n - 4, n), 0)
+        np.testing.assert_array_equal(c.before[:, 1, i], before)
+        np.testing.assert_array_equal(c.V_before[..., i], one.V_WB_B[before])
+    np.testing.assert_array_equal(c.voltage, 1.0)
+    # shorter windows cut from these know as much as if they had been cut so at once
+    parts = w.subdivide(10)
+    again = make_windows(recording(one), Pair(), remembered=0.2, **(given | {"length_s": 0.5}))
+    order = [int(np.flatnonzero(np.isclose(again.start, s))[0]) for s in parts.start]
+    leaves = (jax.tree.leaves(x.commands) for x in (parts, again.take(order)))
+    for mine, theirs in zip(*leaves, strict=True):
+        np.testing.assert_array_equal(mine, theirs)

@@ -5,16 +5,23 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax.numpy as jnp
 
+from ..models.dynamics import Dynamics
+from ..models.effects.extended import Extended, core
 from ..models.euclidean import EulerPotential
 from ..models.networks import Heads, MlpStack
 from ..models.potential import BoundedScalar, GravityPotential, PosePotential, Potential
 from ..models.spinn import Spinn
 
-Model = TypeVar("Model", bound=Spinn)
+Model = TypeVar("Model", bound=Dynamics)
 
 
-def constants(model: Spinn) -> list[Any]:
-    """The numbers that make M, D, D^f and V where networks give zero."""
+def constants(model: Dynamics) -> list[Any]:
+    """The numbers that make M, D, D^f and V of a SPINN, or of one with effects about it.
+
+    Raises:
+        TypeError: it is another model.
+    """
+    model = _spinn(model)
     potential = model.learned_potential
     network = _network(potential)
     found = [model.matrix_heads.bias, network.skip, network.bound]
@@ -22,6 +29,13 @@ def constants(model: Spinn) -> list[Any]:
         found.append(model.constant_mass)
     if isinstance(potential, (GravityPotential, EulerPotential)):
         found.append(potential.net_buoyancy)
+    return found
+
+
+def _spinn(model: Dynamics) -> Spinn:
+    found = core(model)
+    if not isinstance(found, Spinn):
+        raise TypeError(f"{type(found).__name__} is no SPINN: it has no networks")
     return found
 
 
@@ -36,6 +50,12 @@ def _network(potential: Potential) -> BoundedScalar | EulerPotential:
 
 def without_networks(model: Model) -> Model:
     """The same function by the smallest networks, where the heads' weights are zero."""
+    if isinstance(model, Extended):
+        return model.with_base(_small(_spinn(model)))
+    return _small(_spinn(model))
+
+
+def _small(model: Spinn) -> Spinn:
 
     def small(hidden: MlpStack) -> MlpStack:
         count, _, inputs = hidden.weights[0].shape

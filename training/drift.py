@@ -19,7 +19,7 @@ import scipy.optimize
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..models.spinn import Spinn
+from ..models.dynamics import Dynamics
 from .config import DriftConfig
 from .constants import constants, without_networks
 from .fit import Progress
@@ -28,7 +28,7 @@ from .objective import Batch
 from .predict import predict_drift
 from .windows import Windows
 
-Model = TypeVar("Model", bound=Spinn)
+Model = TypeVar("Model", bound=Dynamics)
 
 _PASSES = 2
 
@@ -96,7 +96,7 @@ def _solved(
     ).x
 
 
-def _telling(pieces: Windows, model: Spinn, count: int, substeps: int) -> Windows:
+def _telling(pieces: Windows, model: Dynamics, count: int, substeps: int) -> Windows:
     """Half of `count` evenly spread over all, half where the model expects the largest changes.
 
     A change of velocity tells masses apart from drags, and a recording may hold few of them. Chosen
@@ -105,8 +105,11 @@ def _telling(pieces: Windows, model: Spinn, count: int, substeps: int) -> Window
     """
     if len(pieces) <= count:
         return pieces
-    start, F = (jnp.asarray(pieces.X[0]), jnp.asarray(pieces.V[0])), jnp.asarray(pieces.F)
-    _, V = eqx.filter_jit(predict_drift)(model, *start, F, pieces.dt, substeps=substeps)
+    batch = Batch.of(pieces)
+    _, V = eqx.filter_jit(predict_drift)(
+        model, batch.X[0], batch.V[0], batch.F, pieces.dt, substeps=substeps,
+        commands=batch.commands,
+    )  # fmt: skip
     change = np.nan_to_num(np.abs(np.asarray(V[-1]) - pieces.V[0]), nan=0.0, posinf=0.0)
     largest = np.argsort(-change, axis=1, kind="stable")[:, : max(1, count // 12)]
     even = np.linspace(0, len(pieces) - 1, max(1, count - largest.size)).round().astype(int)
@@ -125,7 +128,9 @@ def _residuals(
     def residuals(values: Array, given: Any) -> Array:
         model, batch, unit = given
         model = eqx.tree_at(constants, model, unravel(values))
-        X, V = predict_drift(model, batch.X[0], batch.V[0], batch.F, dt, substeps=substeps)
+        X, V = predict_drift(
+            model, batch.X[0], batch.V[0], batch.F, dt, substeps=substeps, commands=batch.commands
+        )
         errors = jnp.stack(unit.by_axis(X[:, :, None], V[:, :, None], batch))
         errors = errors[:, :, 1::4]  # neighbouring times say nearly the same
         # a far step of the solver may run away: a large finite error tells it to go back

@@ -222,6 +222,7 @@ def _compare(
         samples,
         substeps=substeps,
         with_path_of_drift=True,
+        commands=batch.commands,
     )
     y = batch.X[1:, :, None], batch.V[1:, :, None]
     e = displacement(X, V, *y)  # (12, T, P + 1, W), last one noise-free

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from ..models import se3
 from ..models.checks import check_numbers, require
 from ..models.dynamics import Dynamics
+from ..models.effects.extended import core
 from ..models.errors import UserError
 from ..models.spinn import Spinn
 from .kernels import (
@@ -181,6 +182,7 @@ class FdmObjective(Objective):
             substeps=c.substeps,
             with_path_of_drift=drift,
             place=batch.place,
+            commands=batch.commands,
         )
         first, second = time_pairs(time_key, batch.F.shape[0], self.lags, c.time_pairs)
         pose = kernel_score(
@@ -228,8 +230,9 @@ class MseObjective(Objective):
         self, model: Dynamics, batch: Batch, key: Array
     ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
         X, V = predict_drift(
-            model, batch.X[0], batch.V[0], batch.F, self.error.dt, substeps=self.error.substeps
-        )
+            model, batch.X[0], batch.V[0], batch.F, self.error.dt, substeps=self.error.substeps,
+            commands=batch.commands,
+        )  # fmt: skip
         total = self.error(X[:, :, None], V[:, :, None], batch)
         parts = {"mse": total}
         if self.config.mass_weight > 0:
@@ -240,12 +243,13 @@ class MseObjective(Objective):
 
 def _mass_variation(model: Dynamics, batch: Batch, key: Array) -> Array:
     """The model's own measure of how M depends on velocity, at velocities of the batch."""
-    if not isinstance(model, Spinn):
+    own = core(model)
+    if not isinstance(own, Spinn):
         return jnp.zeros((), batch.V.dtype)
     time_key, direction_key = jax.random.split(key)
     V = batch.V[jax.random.randint(time_key, (), 0, batch.V.shape[0])]
     direction = normal_by_window(direction_key, batch.place, (6,), 1, V.dtype)[..., 0]
-    return model.mass_variation(V, direction)
+    return own.mass_variation(V, direction)
 
 
 def typical_motion(
@@ -260,7 +264,10 @@ def typical_motion(
     finite &= np.isfinite(windows.F).all((0, 1))
     batch = Batch.of(windows.take(np.flatnonzero(finite)).thin(_CHUNK))
     predict_all = eqx.filter_jit(predict_drift)
-    X, V = predict_all(model, batch.X[0], batch.V[0], batch.F, windows.dt, substeps=substeps)
+    X, V = predict_all(
+        model, batch.X[0], batch.V[0], batch.F, windows.dt, substeps=substeps,
+        commands=batch.commands,
+    )  # fmt: skip
     kept = np.flatnonzero(np.isfinite(X).all((0, 1)) & np.isfinite(V).all((0, 1)))
     if 2 * kept.size <= batch.X.shape[2]:
         raise UserError(

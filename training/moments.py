@@ -175,6 +175,7 @@ class MomentsObjective(Objective):
             substeps=self.config.substeps,
             with_path_of_drift=with_path_of_drift,
             place=batch.place,
+            commands=batch.commands,
         )
 
     def pose_parts(self, X: Float[Array, "T C P W"], batch: Batch) -> dict[str, Array]:

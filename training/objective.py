@@ -8,10 +8,12 @@ import abc
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ..models.dynamics import Dynamics
+from ..models.effects.played import Commands
 from .windows import Windows
 
 
@@ -20,23 +22,27 @@ class Batch(NamedTuple):
 
     `place` numbers the windows: what is drawn for a window depends on its place, not on which
     others are at hand, so a batch shared among devices sees the noise that one device would.
+    `commands` are there for models with effects, which act on single thrusters and remember.
     """
 
     X: Float[Array, "N 7 W"]
     V: Float[Array, "N 6 W"]
     F: Float[Array, "T 6 W"]
     place: Int[Array, " W"]
+    commands: Commands | None = None
 
     @classmethod
     def of(cls, windows: Windows) -> "Batch":
         """All windows as one batch."""
-        X, V, F = (jnp.asarray(a) for a in (windows.X, windows.V, windows.F))
-        return cls(X, V, F, jnp.arange(len(windows)))
+        arrays = (windows.X, windows.V, windows.F)
+        X, V, F, commands = jax.tree.map(jnp.asarray, (*arrays, windows.commands))
+        return cls(X, V, F, jnp.arange(len(windows)), commands)
 
     def take(self, indices: Int[Array, " B"]) -> "Batch":
         """The windows of some indices, in places of their own."""
-        X, V, F = (a[:, :, indices] for a in (self.X, self.V, self.F))
-        return Batch(X, V, F, jnp.arange(indices.size))
+        arrays = (self.X, self.V, self.F, self.commands)
+        X, V, F, commands = jax.tree.map(lambda a: a[:, :, indices], arrays)
+        return Batch(X, V, F, jnp.arange(indices.size), commands)
 
 
 class Objective(eqx.Module):

@@ -5,6 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, Float, Int
 
 from ..models.dynamics import Dynamics
+from ..models.effects.extended import Extended
+from ..models.effects.played import Commands, gaussians, play
 from ..models.integrate import rollout
 
 
@@ -20,31 +22,37 @@ def predict(
     substeps: int = 1,
     with_path_of_drift: bool = False,
     place: Int[Array, " W"] | None = None,
+    commands: Commands | None = None,
 ) -> tuple[Float[Array, "T 7 P W"], Float[Array, "T 6 P W"]]:
     """Draw `samples` motions from each window's first state and commands, at t_1 … t_T.
 
     `with_path_of_drift` appends the noise-free motion as one more sample. Increments come from
-    `key` and the windows' places (0, 1 … W - 1 unless given).
+    `key` and the windows' places (0, 1 … W - 1 unless given). A model with effects acts on the
+    thrusters' `commands`, where they are given, and shows what instruments would (`play`).
     """
     T, _, W = F.shape
     count = samples + with_path_of_drift
-    # substeps as steps of their own: the compiled step is one, however many there are
-    dt = dt / substeps
-    scale = jnp.asarray(dt**0.5, F.dtype)
-    n = model.brownian_size
     place = jnp.arange(W) if place is None else place
-    dW = scale * normal_by_window(key, place, (T * substeps, 1, n), samples, F.dtype)
-    if with_path_of_drift:
-        dW = jnp.concatenate([dW, jnp.zeros((T * substeps, 1, n, W, 1), F.dtype)], axis=4)
 
     # one axis of all windows' samples: loops over it are long, whatever W and P are
     def flat(a: Array) -> Array:
         a = jnp.broadcast_to(a[..., None], (*a.shape, count))
         return a.reshape(*a.shape[:-2], W * count)
 
-    F = jnp.repeat(flat(F), substeps, axis=0)
-    dW = dW.reshape(T * substeps, 1, n, W * count)
-    Xs, Vs = rollout(model, flat(X_0), flat(V_0), F, dt, dW)
+    def drawn(steps: int, parts: int, components: int) -> Array:
+        w = normal_by_window(key, place, (steps, parts, components), samples, F.dtype)
+        if with_path_of_drift:
+            w = jnp.concatenate([w, jnp.zeros((*w.shape[:4], 1), F.dtype)], axis=4)
+        return w.reshape(steps, parts, components, W * count)
+
+    if isinstance(model, Extended) and commands is not None:
+        w = drawn(T, substeps, gaussians(model))
+        Xs, Vs = play(model, flat(X_0), flat(V_0), jax.tree.map(flat, commands), dt, w, substeps)
+        return _by_sample(Xs, W), _by_sample(Vs, W)
+    # substeps as steps of their own: the compiled step is one, however many there are
+    dt = dt / substeps
+    dW = jnp.asarray(dt**0.5, F.dtype) * drawn(T * substeps, 1, model.brownian_size)
+    Xs, Vs = rollout(model, flat(X_0), flat(V_0), jnp.repeat(flat(F), substeps, axis=0), dt, dW)
     return _by_sample(Xs[substeps - 1 :: substeps], W), _by_sample(Vs[substeps - 1 :: substeps], W)
 
 
@@ -71,7 +79,10 @@ def predict_drift(
     dt: float,
     *,
     substeps: int = 1,
+    commands: Commands | None = None,
 ) -> tuple[Float[Array, "T 7 W"], Float[Array, "T 6 W"]]:
-    """The noise-free motion of each window at t_1 … t_T."""
+    """The noise-free motion of each window at t_1 … t_T; `commands` as of `predict`."""
+    if isinstance(model, Extended) and commands is not None:
+        return play(model, X_0, V_0, commands, dt, substeps=substeps)
     Xs, Vs = rollout(model, X_0, V_0, jnp.repeat(F, substeps, axis=0), dt / substeps)
     return Xs[substeps - 1 :: substeps], Vs[substeps - 1 :: substeps]

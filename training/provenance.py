@@ -17,7 +17,8 @@ PACKAGES = ("spinndrift", "jax", "jaxlib", "equinox", "optax", "diffrax", "numpy
 def fingerprint(windows: Windows) -> str:
     """A digest of the windows' numbers: equal data, equal text."""
     digest = hashlib.sha256()
-    for array in (windows.X, windows.V, windows.F, windows.start):
+    arrays = (windows.X, windows.V, windows.F, windows.start, *(windows.commands or ()))
+    for array in arrays:
         digest.update(repr((array.shape, str(array.dtype))).encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(repr((windows.dt, windows.names, windows.normalise)).encode())

@@ -8,9 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..models.effects.played import Commands
 from ..models.errors import UserError
 from ..models.recording import Recording
 
@@ -31,6 +33,7 @@ class Windows:
         start: time of t_0 since the beginning of the run's own clock (s).
         names: scenario names.
         normalise: what was made of the windows' first pose.
+        commands: what the thrusters were commanded, and what came before, for models with effects.
     """
 
     X: Float[np.ndarray, "N 7 W"]
@@ -42,6 +45,7 @@ class Windows:
     start: Float[np.ndarray, " W"]
     names: tuple[str, ...]
     normalise: Normalisation = "heading"
+    commands: Commands | None = None
 
     def __len__(self) -> int:
         return self.X.shape[2]
@@ -72,6 +76,7 @@ class Windows:
             scenario=self.scenario[i],
             run=self.run[i],
             start=self.start[i],
+            commands=jax.tree.map(lambda a: a[..., i], self.commands),
         )
 
     def thin(self, count: int) -> "Windows":
@@ -91,6 +96,7 @@ class Windows:
                 V=self.V[k : k + steps + 1],
                 F=self.F[k : k + steps],
                 start=self.start + k * self.dt,
+                commands=self._commands_from(k, steps),
             )
             for k in range(0, self.steps - steps + 1, steps)
         ]
@@ -103,6 +109,22 @@ class Windows:
             scenario=np.concatenate([part.scenario for part in parts]),
             run=np.concatenate([part.run for part in parts]),
             start=np.concatenate([part.start for part in parts]),
+            commands=jax.tree.map(
+                lambda *a: np.concatenate(a, axis=-1), *(part.commands for part in parts)
+            ),
+        )
+
+    def _commands_from(self, k: int, steps: int) -> Commands | None:
+        """The commands of windows that begin k steps later."""
+        c = self.commands
+        if c is None:
+            return None
+        earlier = len(c.before)
+        return Commands(
+            c.level[k : k + steps],
+            c.voltage[k : k + steps],
+            np.concatenate([c.before, c.level[:k]])[-earlier:],
+            np.concatenate([c.V_before, self.V[:k]])[-earlier:],
         )
 
     def overlaps(self, other: "Windows") -> bool:
@@ -129,6 +151,7 @@ def make_windows(
     length_s: float = 4.0,
     stride_s: float | None = None,
     normalise: Normalisation = "heading",
+    remembered: float | None = None,
     dtype: Any = np.float32,
 ) -> Windows:
     """Cut every trajectory of a recording into windows of `length_s`, one each `stride_s`.
@@ -136,7 +159,9 @@ def make_windows(
     `normalise` moves each window's start: "heading" to the origin with zero yaw, so that gravity
     keeps its direction; "identity" to the group's identity, as the paper does; "none" leaves it.
     `stride_s` defaults to a quarter of the length. Trajectories shorter than a window are left
-    out; `vehicle` is what `Recording.wrench` takes.
+    out; `vehicle` is what `Recording.wrench` takes. With `remembered` the windows have what the
+    thrusters were commanded too, and in so many seconds before them; the beginning of a run is
+    taken as it was for ever.
 
     Raises:
         UserError: no trajectory is long enough, or a channel of pose or twist is missing.
@@ -171,6 +196,9 @@ def make_windows(
     runs = data["trajectory"].to_numpy() if "trajectory" in data.coords else None
     clock = data["start_time"].to_numpy() if "start_time" in data else np.zeros(lengths.shape)
     X, V, F, scenario, run, start = [], [], [], [], [], []
+    commands: list[Commands] = []
+    thrust = None if remembered is None else recording.thrust(vehicle)
+    earlier = np.arange(-max(1, round((remembered or 0.0) / recording.dt)), 0)
     for j, k in np.argwhere(lengths > steps):
         for n in range(0, int(lengths[j, k]) - steps, stride):
             X.append(X_all[j, k, n : n + steps + 1])
@@ -179,6 +207,12 @@ def make_windows(
             scenario.append(j)
             run.append(k if runs is None else runs[k])
             start.append(clock[j, k] + n * recording.dt)
+            if thrust is not None:
+                level, voltage = (a[j, k] for a in thrust)
+                now, before = slice(n, n + steps), np.maximum(n + earlier, 0)
+                commands.append(
+                    Commands(level[now], voltage[now, None], level[before], V_all[j, k, before])
+                )
     return Windows(
         X=_normalised(np.stack(X, axis=-1), normalise).astype(dtype),
         V=np.stack(V, axis=-1).astype(dtype),
@@ -189,6 +223,9 @@ def make_windows(
         start=np.array(start, float),
         names=recording.scenarios,
         normalise=normalise,
+        commands=jax.tree.map(lambda *a: np.stack(a, axis=-1).astype(dtype), *commands)
+        if commands
+        else None,
     )
 
 

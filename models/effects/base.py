@@ -168,6 +168,11 @@ class Effect(eqx.Module):
         own = expand(self.values[k :: len(self.parameters)], like.ndim)
         return own[:1] + own[1:]
 
+    def longest(self, k: int) -> float:
+        """The largest parameter k of any thruster, for places `ALL_OR_ONE`."""
+        own = np.asarray(self.values, float)[k :: len(self.parameters)]
+        return float(np.max(own[0] + np.maximum(own[1:], 0.0)))
+
     def column(self, like: Array) -> Array:
         """All values as components, of the rank of `like`."""
         return expand(self.values, like.ndim)
@@ -178,6 +183,11 @@ class Effect(eqx.Module):
     def memory_size(self) -> int:
         """Numbers that the effect carries from step to step, for each thruster or in all."""
         return 0
+
+    @property
+    def lasts(self) -> float:
+        """For how long (s) what came before a motion still shows in it, to a percent or so."""
+        return 0.0
 
     def initial(self, command: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
         """The memory of an effect that has seen `command` for ever."""

@@ -7,7 +7,6 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from .base import ALL_OR_ONE, Effect, Parameter
@@ -36,14 +35,16 @@ class ActuationDelay(Effect):
         """The last commands, newest first, then the times that they were held."""
         return (self.thrusters + 1) * self.steps
 
+    @property
+    def lasts(self) -> float:
+        return self.longest(0)
+
     def initial(self, command: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
         held = jnp.ones((self.steps, *command.shape[1:]), command.dtype)
         return jnp.concatenate([command] * self.steps + [held])
 
     def for_steps_of(self, dt: float) -> "ActuationDelay":
-        values = np.asarray(self.values, float)
-        longest = float(values[0] + max(values[1:].max(), 0.0))
-        return dataclasses.replace(self, steps=max(math.ceil(longest / dt - 1e-9), 0) + 1)
+        return dataclasses.replace(self, steps=max(math.ceil(self.lasts / dt - 1e-9), 0) + 1)
 
     def actuate(
         self,

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -18,6 +19,11 @@ Random = tuple[Array, ...]
 """One array (s, *batch) for each effect with a random state, in the model's order."""
 FOR_EVER = 1e9
 """A step (s) after which a random state is drawn from its stationary law (`Extended.stir`)."""
+
+
+def core(dynamics: Dynamics) -> Dynamics:
+    """A model without the effects about it."""
+    return dynamics.base if isinstance(dynamics, Extended) else dynamics
 
 
 class Inertia(NamedTuple):
@@ -62,6 +68,27 @@ class Extended(Dynamics):
         """The same base and thrusters with other effects."""
         ordered = tuple(sorted(effects, key=lambda effect: effect.order))
         return dataclasses.replace(self, effects=ordered)
+
+    def with_base(self, base: Dynamics) -> "Extended":
+        """The same effects and thrusters about another base."""
+        return dataclasses.replace(self, base=base)
+
+    def trainable(self) -> "Extended":
+        """The same tree with True at what is trained of the base; effects stay as measured."""
+        own = getattr(self.base, "trainable", None)
+        spec = jax.tree.map(eqx.is_inexact_array, self.base) if own is None else own()
+        fixed = jax.tree.map(lambda _: False, self)
+        return eqx.tree_at(lambda m: m.base, fixed, spec)
+
+    @property
+    def lasts(self) -> float:
+        """For how long (s) what came before a motion still shows in it."""
+        return max((effect.lasts for effect in self.effects), default=0.0)
+
+    @property
+    def reads(self) -> bool:
+        """Whether instruments show anything else than the state."""
+        return self._any("measure")
 
     # ------------------------------------------------------------- what every `Dynamics` has
 

@@ -30,6 +30,10 @@ class ThrusterLag(Effect):
         """The present force of each thruster."""
         return self.thrusters
 
+    @property
+    def lasts(self) -> float:
+        return 5 * self.longest(0)
+
     def initial(self, command: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:
         return command
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import accumulate
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +10,51 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .. import integrate, se3
-from ..dynamics import Flow
-from .extended import FOR_EVER, Extended
+from ..dynamics import Flow, Memory
+from .extended import FOR_EVER, Extended, Random
 from .recent import Recent
+
+
+def advanced(
+    model: Extended,
+    carried: tuple[Memory, Random],
+    X_WB: Float[Array, "7 *#batch"],
+    V_WB_B: Float[Array, "6 *#batch"],
+    level: Float[Array, "n *#batch"],
+    voltage: Float[Array, "1 *#batch"] | None,
+    F_Bo_B: Sequence[Float[Array, "6 *#batch"]],
+    noise: Sequence[Float[Array, "k *#batch"]] | None,
+    period: float,
+    started: Any = True,
+    water: Sequence[Flow | None] | None = None,
+) -> tuple[tuple[Memory, Random], Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
+    """What is carried, pose and twist after a `period` (s) under held thruster forces.
+
+    It takes a substep for each wrench of `F_Bo_B`, which act besides the thrusters; `noise` has
+    unit Gaussians of each (`Extended.noise_size`), `water` its flow. Before anything has `started`
+    random states are drawn from their stationary law; without noise they are left out.
+    """
+    memory, random = carried
+    body, count = model.body, len(F_Bo_B)
+    h = period / count
+    memory, levels = model.actuate(memory, level, period, count)
+    memory, felt = model.feel(memory, V_WB_B, period)
+    X, V = X_WB, V_WB_B
+    for s, F_other in enumerate(F_Bo_B):
+        flow = None if water is None else water[s]
+        V_r = V
+        if flow is not None:
+            v_c = se3.rotate_inverse(X, flow.v_WC_W)
+            V_r = V - jnp.concatenate([v_c, jnp.zeros_like(v_c)])
+        F = model.push(levels[..., s], X, V_r, voltage) + F_other
+        F = F if felt is None else F + felt
+        dW = None
+        if noise is not None:
+            dt = jnp.where(started, h, FOR_EVER) if random and s == 0 else h
+            random, push = model.stir(random, X, V, noise[s], dt)
+            F, dW = F + push, h**0.5 * noise[s][:6]
+        X, V = integrate.step(body, X, V, F, h, dW, flow)
+    return (memory, random), X, V
 
 
 class Stepper:
@@ -41,7 +84,7 @@ class Stepper:
     @property
     def reads(self) -> bool:
         """Whether instruments show anything else than the state."""
-        return any(effect.acts("measure") for effect in self.model.effects)
+        return self.model.reads
 
     @property
     def lags(self) -> bool:
@@ -70,21 +113,13 @@ class Stepper:
         `level` are the thrusters' forces (N) before effects, `voltage` is relative to the nominal
         one, `F_Bo_B` acts besides; `noise` has S substeps of unit Gaussians, `water` their flow.
         """
-        model, h = self.model, self.period / self.substeps
         *parts, started = jnp.split(carried, self._ends) if self._ends else [carried]
-        memory, random = jax.tree.unflatten(self._structure, parts)
-        memory, levels = model.actuate(memory, level, self.period, self.substeps)
-        memory, felt = model.feel(memory, V_WB_B, self.period)
-        F_other = F_Bo_B if felt is None else F_Bo_B + felt
-        X, V, body = X_WB, V_WB_B, model.body
-        for s, flow in enumerate(water):
-            V_r = V
-            if flow is not None:
-                V_r = V - jnp.concatenate([se3.rotate_inverse(X, flow.v_WC_W), jnp.zeros(3)])
-            fresh = self._ends and s == 0
-            dt = jnp.where(started[0] > 0, h, FOR_EVER) if fresh else h
-            random, push = model.stir(random, X, V, noise[s], dt)
-            F = model.push(levels[..., s], X, V_r, voltage) + push + F_other
-            X, V = integrate.step(body, X, V, F, h, h**0.5 * noise[s, :6], flow)
-        left = jax.tree.leaves((memory, random))
+        before = jax.tree.unflatten(self._structure, parts)
+        began = started[0] > 0 if self._ends else True
+        pushes = [F_Bo_B] * self.substeps
+        after, X, V = advanced(
+            self.model, before, X_WB, V_WB_B, level, voltage, pushes, list(noise), self.period,
+            began, water,
+        )  # fmt: skip
+        left = jax.tree.leaves(after)
         return X, V, jnp.concatenate([*left, jnp.ones(1)]) if left else carried

@@ -171,6 +171,10 @@ class Unknown(Effect):
     def memory_size(self) -> int:
         return 2 if self.kind == "memory" else 0
 
+    @property
+    def lasts(self) -> float:
+        return 5 * self.numbers[0] if self.kind == "memory" else 0.0
+
     def feel(
         self, memory: Float[Array, "2 *#batch"], V_WB_B: Float[Array, "6 *#batch"], dt: Any
     ) -> tuple[Float[Array, "2 *#batch"], Float[Array, "6 *#batch"]]:

@@ -30,29 +30,31 @@ class Evaluate:
 
     def run(self) -> None:
         """Load, predict, compare."""
-        import jax.numpy as jnp
-
-        from ...models.checkpoint import load_model
         from ...models.vehicle import load_vehicle
         from ...systems.mavlink.logs import load_data
-        from ...training.start import estimate_diffusion
         from ...training.windows import make_windows
-        from ..learning import compare
+        from ..learning import FINE_SUBSTEPS, Start, compare, judged, windowing
 
         if self.out is not None and self.out.suffix not in (".csv", ".json", ".nc"):
             raise UserError(f"--out {self.out}: end the name in .csv, .json or .nc")
-        model, metadata = load_model(self.model, dtype=jnp.float32)
+        start, metadata = Start.read(self.model)
         name = self.vehicle or metadata.get("vehicle") or "bluerov2_heavy"
         vehicle = load_vehicle(name)
         with progress_bar(f"reading {self.data.name}") as update:
             recording = load_data(self.data, vehicle=self.vehicle, progress=update)
         windows = make_windows(
-            recording, vehicle, length_s=self.length, stride_s=self.length, normalise="heading"
+            recording,
+            vehicle,
+            length_s=self.length,
+            stride_s=self.length,
+            **windowing(start.model, "heading"),
         )
-        preset = vehicle.dynamics(dtype=jnp.float32)
-        preset = vehicle.dynamics(estimate_diffusion(preset, windows), jnp.float32)
+        models = {
+            "preset": (judged(vehicle.dynamics(), windows), FINE_SUBSTEPS),
+            "learned": (judged(start.model, windows), start.substeps),
+        }
         with progress_bar("evaluating"):
-            found = compare(model, preset, windows, int(metadata.get("substeps", 1)))
+            found = compare(models, windows)
         if self.out is not None:
             found.save(self.out)
         shown = console()

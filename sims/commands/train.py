@@ -11,7 +11,7 @@ from ..progress import console, progress_bar
 
 @dataclass(frozen=True)
 class Train:
-    """Learn a stochastic model of a vehicle from data, starting at a preset.
+    """Learn a stochastic model of a vehicle from data, starting at a preset or another model.
 
     The last part of the data (or whole runs, where a scenario has several) is held out; the
     summary and report.html compare preset and learned model on it. Ctrl-C leaves a checkpoint;
@@ -32,6 +32,10 @@ class Train:
     With `--method` they are laid over the method's, and may not contradict what makes it."""
     vehicle: str | None = None
     """Preset name or YAML file to start from; by default what the data name."""
+    model: Path | None = None
+    """Model file (.spinn) to start from in place of the preset: what `spinndrift diagnose` wrote as
+    extended/model.spinn, whose effects stay as they are while a SPINN learns the rest, or a trained
+    model, which is trained on. Of a trained one the architecture stays."""
     steps: int | None = None
     """Number of training steps, instead of the settings' own."""
     seed: int | None = None
@@ -47,7 +51,7 @@ class Train:
         from ...training.config import TrainingConfig
         from ...training.methods import method_config
         from ..cores import share_cores
-        from ..learning import learn
+        from ..learning import Start, learn
         from ..learning_report import add_data, add_evaluation, add_training
         from ..pages import Page
 
@@ -63,14 +67,22 @@ class Train:
                 f"--out {self.out}: holds a training run; continue it with --resume or name "
                 "another folder"
             )
+        start, metadata = (None, {}) if self.model is None else Start.read(self.model)
         with progress_bar(f"reading {self.data.name}") as update:
             recording = load_data(self.data, vehicle=self.vehicle, progress=update)
-        vehicle = load_vehicle(recording.vehicle or "bluerov2_heavy")
+        vehicle = load_vehicle(recording.vehicle or metadata.get("vehicle") or "bluerov2_heavy")
         with progress_bar("training") as update:
             learned = learn(
-                recording, vehicle, config, self.out, resume=self.resume, progress=update
+                recording,
+                vehicle,
+                config,
+                self.out,
+                start=start,
+                resume=self.resume,
+                progress=update,
             )
-        page = Page("Training", f"{self.data.name}, from the preset `{vehicle.name}`")
+        began = f"the preset `{vehicle.name}`" if self.model is None else f"`{self.model}`"
+        page = Page("Training", f"{self.data.name}, from {began}")
         add_evaluation(add_training(add_data(page, recording), learned), learned)
         page.write(self.out / "report.html")
         shown = console()

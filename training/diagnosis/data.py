@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -161,10 +160,8 @@ def make_data(
             f"recording: {channels} is missing; a diagnosis needs attitude and all of the twist. "
             "Without a DVL give u, v, w from measured positions (differences, turned into B)"
         )
-    thrusters = vehicle.thrusters()
     data = recording.dataset
-    name = next(c for c in ("thruster_force", "pwm", "F_Bo_B") if c in recording.commands)
-    nominal = float(thrusters.nominal_voltage)
+    thrust, volts = recording.thrust(vehicle)
     lengths = recording.lengths
     names = ("X", "V", "u", "past", "past_step", "voltage", "step")
     pieces: dict[str, list[Any]] = {name: [] for name in names}
@@ -184,13 +181,8 @@ def make_data(
         values = {
             "X": dead_reckoned(times, data["X_WB"].to_numpy()[j, k, :length], V),
             "V": V,
-            "command": data[name].to_numpy()[j, k, :length],
         }
-        volts = np.full(length, nominal)
-        if has_voltage:
-            measured = data["voltage"].to_numpy()[j, k, :length]
-            volts = np.where(np.isfinite(measured), measured, nominal)
-        u = _forces(values["command"], name, thrusters, volts)
+        u = thrust[j, k, :length]
         held = np.diff(times)
         first = min(behind, int(_OF_A_RUN * (length - 1))) if remembered else 0
         count = -(-(length - 1 - first) // segment)
@@ -202,7 +194,7 @@ def make_data(
             pieces["X"].append(values["X"][a : b + 1])
             pieces["V"].append(values["V"][a : b + 1])
             pieces["u"].append(u[a:b])
-            pieces["voltage"].append(volts[a:b] / nominal)
+            pieces["voltage"].append(volts[j, k, a:b])
             pieces["step"].append(held[a:b])
             sizes.append(b - a)
             scenario.append(j)
@@ -226,19 +218,10 @@ def make_data(
         run=np.array(run, int),
         names=recording.scenarios,
         dt=mean,
-        command=name,
+        command=recording.thrust_from,
         has_voltage=has_voltage,
         unmeasured=unmeasured,
     )
-
-
-def _forces(command: np.ndarray, name: str, thrusters: Any, volts: np.ndarray) -> np.ndarray:
-    values = jnp.asarray(np.nan_to_num(command.T))
-    if name == "pwm":
-        return np.asarray(thrusters.force(values, jnp.asarray(volts))).T
-    if name == "F_Bo_B":
-        return np.asarray(jnp.tensordot(thrusters.inverse, values, 1)).T
-    return np.nan_to_num(command)
 
 
 def _stack(parts: list[np.ndarray], length: int) -> np.ndarray:

@@ -1,0 +1,108 @@
+"""Recorded motion of a model with effects under recorded commands to its thrusters.
+
+What a window of a recording is compared with: the motion starts from what instruments showed, acts
+on what was commanded before the window too, and ends as instruments would show it.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .extended import Extended
+from .recent import Recent
+from .stepping import advanced
+
+
+class Commands(NamedTuple):
+    """What thrusters were commanded in a window and before it.
+
+    Attributes:
+        level: force along each thruster's axis (N), held for a step.
+        voltage: of the battery, relative to the nominal one.
+        before: commands (N) of the steps before the window.
+        V_before: recorded twists at which these steps began.
+    """
+
+    level: Float[Array | np.ndarray, "T n *batch"]
+    voltage: Float[Array | np.ndarray, "T 1 *batch"]
+    before: Float[Array | np.ndarray, "K n *batch"]
+    V_before: Float[Array | np.ndarray, "K 6 *batch"]
+
+
+def gaussians(model: Extended) -> int:
+    """Unit Gaussians that a substep of `play` takes: of b dW, of effects, of pushes that last."""
+    return model.noise_size + model.base.brownian_size - 6
+
+
+def play(
+    model: Extended,
+    X_0: Float[Array, "7 *batch"],
+    V_0: Float[Array, "6 *batch"],
+    commands: Commands,
+    dt: float,
+    noise: Float[Array, "T S k *batch"] | None = None,
+    substeps: int = 1,
+) -> tuple[Float[Array, "T 7 *batch"], Float[Array, "T 6 *batch"]]:
+    """What instruments show at dt, 2 dt, …, from what they showed at 0, each step in substeps.
+
+    `noise` holds `gaussians` unit Gaussians for each of S substeps; without it the motion is that
+    of the drift, in `substeps`. `model.for_steps_of(dt)` must have been taken. Late instruments
+    show the motion as linear between steps.
+    """
+    count = substeps if noise is None else noise.shape[1]
+    commands = jax.tree.map(jnp.asarray, commands)
+    memory, random = model.carried(commands.before[0])
+    memory = _after(model, memory, commands, dt)
+    X, V, recent = X_0, V_0, None
+    if model.reads:
+        recent = _beginning(model, memory, X_0, V_0, commands, dt)
+        X, V = model.infer(X_0, V_0, recent)
+    lasting = None
+    if noise is not None and model.base.brownian_size > 6:
+        w = noise[:, :, model.noise_size :]
+        path = model.lasting_push(w.reshape(-1, *w.shape[2:]), dt / count)
+        lasting = path.reshape(*w.shape[:2], *path.shape[1:])
+
+    def advance(carry: Any, given: Any) -> Any:
+        carried, X, V, recent = carry
+        level, voltage, w, extra, number = given
+        pushes = [jnp.zeros_like(V)] * count if extra is None else list(extra)
+        w = None if w is None else list(w)
+        carried, X1, V1 = advanced(
+            model, carried, X, V, level, voltage, pushes, w, dt, number > 0
+        )  # fmt: skip
+        seen = X1, V1
+        if recent is not None:
+            rates = jnp.concatenate([(V1 - V) / dt, jnp.zeros_like(V)])
+            recent = recent.after(Recent.over(V, V1, rates, dt))
+            seen = model.observe(X1, V1, recent)
+        return (carried, X1, V1, recent), seen
+
+    xs = (commands.level, commands.voltage, noise, lasting, jnp.arange(len(commands.level)))
+    start = ((memory, random), X, V, recent)
+    return jax.lax.scan(jax.checkpoint(advance), start, xs)[1]
+
+
+def _after(model: Extended, memory: Any, commands: Commands, dt: float) -> Any:
+    """Memories when the steps before the window are over."""
+    if not memory:
+        return memory
+
+    def step(memory: Any, given: tuple[Array, Array]) -> tuple[Any, None]:
+        command, V = given
+        return model.feel(model.actuate(memory, command, dt, 1)[0], V, dt)[0], None
+
+    before: Any = (commands.before, commands.V_before)
+    return jax.lax.scan(step, memory, before)[0]
+
+
+def _beginning(
+    model: Extended, memory: Any, X: Array, V: Array, commands: Commands, dt: float
+) -> Recent:
+    """How the motion came to be what it is at the window's start, under the command before it."""
+    level = model.actuate(memory, commands.before[-1], dt, 1)[1][..., 0]
+    F = model.push(level, X, V, commands.voltage[0])
+    return Recent.steady(model.body.acceleration(X, V, F), dt)

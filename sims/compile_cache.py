@@ -1,5 +1,6 @@
 """Compiled programs kept on disk, so that the second run of a command starts at once."""
 
+import gc
 import hashlib
 import platform
 from pathlib import Path
@@ -9,6 +10,8 @@ from filelock import FileLock, Timeout
 from platformdirs import user_cache_path
 
 _LARGEST = 2**30  # bytes; what was used longest ago goes first
+_MAPS = Path("/proc/self/maps")
+_MOST_MAPS = 20_000  # Linux gives a process 65530, and a compiler that gets no more crashes
 
 
 def keep_compiled(folder: Path | None = None) -> None:
@@ -62,6 +65,13 @@ def compiled_environment() -> dict[str, str]:
         "JAX_COMPILATION_CACHE_DIR": folder,
         "JAX_COMPILATION_CACHE_MAX_SIZE": str(_LARGEST),
     }
+
+
+def give_back_programs() -> None:
+    """Forget compiled programs before their pages, several maps each, use up the process's."""
+    if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 def _processor() -> str:

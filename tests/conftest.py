@@ -1,6 +1,5 @@
 """Settings that every test runs under; nothing in the library sets them."""
 
-import gc
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,7 +7,12 @@ import hypothesis
 import jax
 import pytest
 
-from spinndrift.sims.compile_cache import compiled_folder, keep_compiled, mend
+from spinndrift.sims.compile_cache import (
+    compiled_folder,
+    give_back_programs,
+    keep_compiled,
+    mend,
+)
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -27,18 +31,10 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile("spinndrift")
 
-_MAPS = Path("/proc/self/maps")
-_MOST_MAPS = 20_000  # Linux gives a process 65530, and a compiler that gets no more crashes
-
 
 @pytest.fixture(autouse=True, scope="module")
 def _few_compiled_programs() -> Iterator[None]:
-    """Forget compiled programs before their pages, several maps a kernel, use up the process's.
-
-    And remove what processes that tests kill may have left half stored.
-    """
+    """Forget compiled programs in time, and remove what killed processes have left half stored."""
     mend(Path(str(compiled_folder())))
     yield
-    if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MOST_MAPS:
-        jax.clear_caches()
-        gc.collect()
+    give_back_programs()

@@ -183,7 +183,7 @@ def test_cases_are_judged_once_and_the_page_keeps_its_own_words(tmp_path, monkey
     seen = []
     with pytest.raises(KeyboardInterrupt):
         running.run_cases(cases, tmp_path / "out", 0.01, lambda f, r="": seen.append(f))
-    rows = running.run_cases(cases, tmp_path / "out", 0.01, lambda f, r="": seen.append(f))
+    rows, _ = running.run_cases(cases, tmp_path / "out", 0.01, lambda f, r="": seen.append(f))
     assert calls == ["null-0", "null-1", "null-1", "lag"]
     assert seen[-1] == 1
     with pytest.raises(UserError, match="name another --out"):
@@ -198,6 +198,16 @@ def test_cases_are_judged_once_and_the_page_keeps_its_own_words(tmp_path, monkey
     assert "| false alarms | 0 of 2 (0.00 to 0.84) |" in text
     assert "| thruster_lag | 0 of 1 | adequate |" in text
     assert len(tables(rows)) == 2
+
+    def broken(case, alpha, progress):
+        if case.name == "null-0":
+            raise ZeroDivisionError("once")
+        return judge(case, alpha, progress)
+
+    monkeypatch.setattr(running, "judge", broken)
+    rows, failed = running.run_cases(cases, tmp_path / "other", 0.01, lambda f, r="": None)
+    assert [row["case"] for row in rows] == ["null-1", "lag"]
+    assert [(str(f.task), f.reason) for f in failed] == [("null-0", "ZeroDivisionError: once")]
     (tmp_path / "out" / "lag" / "judged.json").write_text(json.dumps([1]))
     with pytest.raises(UserError, match="no judgement"):
         running.run_cases(cases, tmp_path / "out", 0.01, lambda f, r="": None)

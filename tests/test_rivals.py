@@ -119,10 +119,10 @@ def test_rivals_stand_beside_judgements(tmp_path, monkeypatch):
     monkeypatch.setattr(running, "judge", judge)
     monkeypatch.setattr(running, "compete", compete)
     go = {"out": tmp_path / "out", "alpha": 0.01, "progress": lambda f, r="": None}
-    alone = running.run_cases(cases[:1], **go)
+    alone, _ = running.run_cases(cases[:1], **go)
     assert alone[0]["rivals"] == {}
-    rows = running.run_cases(cases, **go, rivals=True)
-    assert running.run_cases(cases, **go) == rows
+    rows, _ = running.run_cases(cases, **go, rivals=True)
+    assert running.run_cases(cases, **go)[0] == rows
     assert asked == ["lift", "tether"]
     table = next(t for t in tables(rows) if "Rivals" in t.caption)
     assert table.header[3:] == ("stlsq", "features")

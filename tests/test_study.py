@@ -16,6 +16,7 @@ from diagonal import Diagonal
 from spinndrift.models import config as yaml
 from spinndrift.models.errors import UserError
 from spinndrift.sims.cli import main
+from spinndrift.sims.fanout import run_here
 from spinndrift.sims.study import train
 from spinndrift.sims.study.config import (
     SizeConfig,
@@ -25,7 +26,6 @@ from spinndrift.sims.study.config import (
     from_belief,
     scaled,
 )
-from spinndrift.sims.study.fanout import run_here
 from spinndrift.sims.study.judge import diffusions
 from spinndrift.sims.study.pages import render
 from spinndrift.sims.study.run import run_study

@@ -109,6 +109,9 @@ class Case:
         """Of the folder."""
         return self.folder.name
 
+    def __str__(self) -> str:
+        return self.name
+
     @property
     def has_oracle(self) -> bool:
         """Whether there are data that no diagnosis sees, with the true model's forecasts."""
@@ -121,7 +124,7 @@ def find_cases(folder: str | os.PathLike[str], only: Sequence[str] = ()) -> list
     Raises:
         UserError: there is none, or a truth can't be read.
     """
-    paths = sorted(Path(folder).glob("*/truth.yaml"))
+    paths = sorted(Path(folder).absolute().glob("*/truth.yaml"))
     if not paths:
         raise UserError(
             f"--cases {folder}: holds no case (a folder with truth.yaml); docs/blind-cases.md says "

@@ -1,8 +1,9 @@
-"""All cases of a folder, one after the other; what is done stays done."""
+"""All cases of a folder, one after the other or spread over processes; what is done stays done."""
 
 import json
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,54 @@ import jax
 
 from ...models.errors import UserError
 from ...models.files import atomic_path
+from ..compile_cache import give_back_programs, keep_compiled
+from ..fanout import Failed, run_here, run_on_cluster
 from ..progress import Update
 from .cases import Case
 from .judging import judge
 from .rivals import compete, pysindy
 
 _DONE, _RIVALS = "judged.json", "rivals.json"
-_KEPT = 25
-"""Cases after which compiled programs are given back: a process can map only so many of them."""
+
+
+@dataclass(frozen=True)
+class JudgeCase:
+    """What is left to do of a case, on disk in the end.
+
+    A case has a folder in `out` with `diagnosis.json` and `judged.json`; the second is written
+    last, so an interrupted case is done again. With `rivals` other methods are judged on the same
+    files (`rivals.json`); what is there already is kept.
+    """
+
+    out: str
+    alpha: float
+    rivals: bool
+
+    def left(self, case: Case) -> tuple[bool, bool]:
+        """Whether the diagnosis and whether the rivals are still to be judged."""
+        folder = Path(self.out) / case.name
+        own = not (folder / _DONE).exists()
+        return own, self.rivals and not (folder / _RIVALS).exists()
+
+    def __call__(self, case: Case, progress: Update = lambda fraction, remark="", /: None) -> None:
+        """Diagnose and judge.
+
+        Raises:
+            UserError: the case can't be read.
+        """
+        jax.config.update("jax_enable_x64", True)  # a cluster's worker has no start of its own
+        keep_compiled()
+        give_back_programs()
+        folder = Path(self.out) / case.name
+        own, beside = self.left(case)
+        if own:
+            judged, finding = judge(
+                case, self.alpha, lambda f, remark="": progress(f, f"{case.name}: {remark}")
+            )
+            finding.diagnosis.save(folder / "diagnosis.json")
+            _write(folder / _DONE, {"alpha": self.alpha, **judged.plain()})
+        if beside:
+            _write(folder / _RIVALS, {name: one.plain() for name, one in compete(case).items()})
 
 
 def run_cases(
@@ -26,45 +67,43 @@ def run_cases(
     alpha: float,
     progress: Update,
     rivals: bool = False,
-) -> list[dict[str, Any]]:
-    """Diagnose and judge the cases that are not judged yet; return all judgements.
+    workers: int = 0,
+) -> tuple[list[dict[str, Any]], list[Failed]]:
+    """Diagnose and judge the cases that are not judged yet; all judgements, and who raised.
 
-    Each case has a folder in `out` with `diagnosis.json` and `judged.json`; the second is written
-    last, so an interrupted case is done again. With `rivals` other methods are judged on the same
-    files (`rivals.json`, and `rivals` in a judgement); what is there already is kept.
+    In this process one by one, or with `workers` in as many processes of this machine. `rivals` in
+    a judgement has theirs, if there are any.
 
     Raises:
         UserError: a case can't be read, or was judged with another alpha; pysindy is not there.
     """
-    found, fresh = [], 0
     if rivals:
         pysindy()  # now, not after the first case
-    for number, case in enumerate(cases):
-        folder = Path(out) / case.name
-        at = folder / _DONE
-        if not at.exists():
+    work = JudgeCase(str(Path(out).absolute()), alpha, rivals)
+    for case in cases:
+        _judgement(work, case)  # of another alpha: now, not after the last case
+    left = [case for case in cases if any(work.left(case))]
+    if workers == 0:
+        failed = run_here(work, left, progress) if left else []
+    else:
+        failed = run_on_cluster(work, left, progress, workers=workers) if left else []
+    progress(1.0, "")
+    return [row for case in cases if (row := _judgement(work, case)) is not None], failed
 
-            def tell(fraction: float, remark: str = "", n: int = number, case: Case = case) -> None:
-                progress((n + fraction) / len(cases), f"{case.name}: {remark}")
 
-            fresh += 1
-            if fresh % _KEPT == 0:
-                jax.clear_caches()
-            judged, finding = judge(case, alpha, tell)
-            finding.diagnosis.save(folder / "diagnosis.json")
-            _write(at, {"alpha": alpha, **judged.plain()})
-        row = read_judgement(at)
-        if row["alpha"] != alpha:
-            raise UserError(
-                f"{at}: was judged with alpha {row['alpha']:g}, not {alpha:g}; name another --out"
-            )
-        beside = folder / _RIVALS
-        if rivals and not beside.exists():
-            _write(beside, {name: rival.plain() for name, rival in compete(case).items()})
-        row["rivals"] = json.loads(beside.read_text(encoding="utf-8")) if beside.exists() else {}
-        found.append(row)
-        progress((number + 1) / len(cases), case.name)
-    return found
+def _judgement(work: JudgeCase, case: Case) -> dict[str, Any] | None:
+    """What is on disk of a case."""
+    at = Path(work.out) / case.name / _DONE
+    if not at.exists():
+        return None
+    row = read_judgement(at)
+    if row["alpha"] != work.alpha:
+        raise UserError(
+            f"{at}: was judged with alpha {row['alpha']:g}, not {work.alpha:g}; name another --out"
+        )
+    beside = at.with_name(_RIVALS)
+    row["rivals"] = json.loads(beside.read_text(encoding="utf-8")) if beside.exists() else {}
+    return row
 
 
 def _write(at: Path, value: dict[str, Any]) -> None:

@@ -26,6 +26,8 @@ class Check:
     """Patterns of the names of cases or of causes to take (`'lag-*' net_buoyancy`)."""
     alpha: float = 0.01
     """Rate of false alarms that is promised."""
+    workers: int = 0
+    """Worker processes on this machine; 0 judges all cases in this one."""
     rivals: bool = False
     """Judge sparse regression (pysindy: STLSQ and weak form) and random features on the same files
     too."""
@@ -47,7 +49,7 @@ class Check:
             raise UserError(f"--docs {self.docs}: end the name in .md")
         cases = find_cases(self.cases, self.only)
         with progress_bar(f"{len(cases)} cases") as update:
-            rows = run_cases(cases, self.out, self.alpha, update, self.rivals)
+            rows, failed = run_cases(cases, self.out, self.alpha, update, self.rivals, self.workers)
         shown = console()
         for table in tables(rows):
             grid = Shown(*table.header, title=table.caption, title_justify="left")
@@ -58,3 +60,9 @@ class Check:
         if self.docs is not None:
             write_page(self.docs, rows, cases)
         shown.print(f"wrote {self.docs or self.out / 'diagnosis.md'}")
+        for one in failed:
+            shown.print(f"{one.task} was given up: {one.reason}")
+        if failed:
+            raise UserError(
+                f"{len(failed)} cases were given up (see above); the same command tries them again"
+            )

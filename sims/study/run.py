@@ -8,9 +8,9 @@ from pathlib import Path
 from ...models import config as yaml
 from ...models.errors import UserError
 from ...models.files import atomic_path
+from ..fanout import Failed, run_here, run_on_cluster
 from ..progress import Update
 from .config import StudyConfig
-from .fanout import Failed, run_here, run_on_cluster
 from .judge import check_vehicles
 from .task import Task
 from .work import run_task

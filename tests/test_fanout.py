@@ -9,8 +9,8 @@ import time
 import pytest
 
 from spinndrift.models.errors import UserError
+from spinndrift.sims.fanout import run_on_cluster
 from spinndrift.sims.study.config import scaled
-from spinndrift.sims.study.fanout import run_on_cluster
 from spinndrift.sims.study.run import StudyWork
 
 LIMIT = 35.0

@@ -5,8 +5,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from ...models.errors import UserError
-from ..progress import Update
+from ..models.errors import UserError
+from .progress import Update
 
 T = TypeVar("T")
 _ATTEMPTS = 3

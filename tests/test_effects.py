@@ -223,7 +223,7 @@ def test_wrenches_of_body_and_environment():
     np.testing.assert_allclose(aft, [*F_B, *cross(arm, F_B)], atol=1e-12)
     near = wrench("proximity", "surface", force=5.0, gain=0.0)
     np.testing.assert_allclose(near[:3], 5 * np.exp(p[2] / 0.5) * UP, atol=1e-12)
-    wall = wrench("proximity", "wall_east", gain=2.0, longer=0.1)
+    wall = wrench("proximity", "wall_east", gain=2.0, length=0.6)
     drag = np.asarray(BASE.drag_wrench(V))
     np.testing.assert_allclose(wall, 2 * np.exp((p[0] - 10) / 0.6) * drag, atol=1e-12)
 

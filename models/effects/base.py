@@ -49,6 +49,7 @@ class Parameter:
         low: least admissible value; an estimate below it vetoes the name.
         high: largest admissible value.
         spread: standard deviation of what is known of it beforehand; 0 stands for very little.
+        usual: what reports say where the value is zero: it counts from there.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Parameter:
     low: float = -math.inf
     high: float = math.inf
     spread: float = 0.0
+    usual: float = 0.0
 
 
 class Plant(NamedTuple):
@@ -147,11 +149,12 @@ class Effect(eqx.Module):
         for name, value in parameters.items():
             i = cls.index(where or places[0], name)
             p = cls.parameters[i % len(cls.parameters)]
-            if not p.low <= value <= p.high:
+            low, high = p.low + p.usual, p.high + p.usual
+            if not low <= value <= high:
                 raise UserError(
-                    f"{cls.name}.{name} is {value:g}: give {p.low:g} to {p.high:g} {p.unit}"
+                    f"{cls.name}.{name} is {value:g}: give {low:g} to {high:g} {p.unit}"
                 )
-            values[i] = value
+            values[i] = value - p.usual
         return cls(jnp.asarray(values, dtype), **(options or {}))
 
     @classmethod

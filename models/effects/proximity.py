@@ -10,15 +10,15 @@ from .base import Effect, Parameter, Plant, force_only
 from .load import up_in_body
 
 REACH = 0.5
-"""Length (m) over which a boundary is felt, about that of the hull, unless `longer` says else."""
+"""Length (m) over which a boundary is felt, about that of the hull, unless told otherwise."""
 
 
 class Proximity(Effect):
     """More drag and a vertical force near a boundary: e^(-d / ℓ) times g D(ξ) and times F.
 
     d is the clearance to the height `floor` (`bottom`), to z = 0 (`surface`), or to a vertical wall
-    at the edge of the box `walls` (west, east, south, north; m in W), ℓ = 0.5 m + `longer`. Where
-    the boundary itself lies can't be told from the drag: g refers to the places stated.
+    at the edge of the box `walls` (west, east, south, north; m in W), ℓ its `length`. Where the
+    boundary itself lies can't be told from the drag: g refers to the places stated.
     """
 
     name: ClassVar[str] = "proximity"
@@ -26,7 +26,7 @@ class Proximity(Effect):
     parameters: ClassVar = (
         Parameter("gain", "1", (0.3,), -1.0, 50.0),
         Parameter("force", "N", (0.5,), -60.0, 60.0),
-        Parameter("longer", "m", (0.1,), -0.4, 3.0),
+        Parameter("length", "m", (0.1,), -0.4, 3.0, usual=REACH),
     )
     places: ClassVar = ("bottom", "surface", "wall_west", "wall_east", "wall_south", "wall_north")
     source: ClassVar[str] = "drag up by half within one hull height of a wall"
@@ -41,8 +41,8 @@ class Proximity(Effect):
         clearances = (z - self.floor, -z, x - west, east - x, y - south, north - y)
         more = push = jnp.zeros_like(z)
         for k, clearance in enumerate(clearances):
-            gain, force, longer = (self.part(3 * k + i, V_CB_B) for i in range(3))
-            near = jnp.exp(-jnp.maximum(clearance, 0) / jnp.maximum(REACH + longer, 0.05))
+            gain, force, more_length = (self.part(3 * k + i, V_CB_B) for i in range(3))
+            near = jnp.exp(-jnp.maximum(clearance, 0) / jnp.maximum(REACH + more_length, 0.05))
             more, push = more + gain * near, push + force * near
         drag = more[None] * plant.drag(V_CB_B)
         return drag + force_only(push[None] * up_in_body(X_WB))

@@ -85,6 +85,8 @@ class Diagnose:
         shown = console()
         shown.print(finding.diagnosis.sentence)
         for cause in finding.diagnosis.causes:
-            values = ", ".join(f"{k} {v.value:.4g} {v.unit}" for k, v in cause.parameters.items())
-            shown.print(f"  {cause.name} ({cause.where}): {values}")
+            told = ", ".join(f"{k} {v.value:.4g} {v.unit}" for k, v in cause.parameters.items())
+            if cause.structure is not None:  # its coefficients stand in diagnosis.json
+                told = cause.structure.description
+            shown.print(f"  {cause.name} ({cause.where}): {told}")
         shown.print(f"wrote {self.out}")

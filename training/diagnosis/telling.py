@@ -56,7 +56,8 @@ def values_of(
     t = quantile(joint)
     found = {}
     for i in rows:
-        p, v = bench.library.entries[i].parameter, float(theta[i])
+        p = bench.library.entries[i].parameter
+        v = p.usual + float(theta[i])
         error = t * float(joint.errors[joint.parameters.index(i)])
         told = unit(p.unit, bench.library.entries[i].where)
         found[p.name] = result.Value(v, told, (v - error, v + error))

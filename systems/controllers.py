@@ -21,6 +21,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from ..models.checkpoint import load_model
 from ..models.checks import Vector6, check_numbers, require
 from ..models.dynamics import Dynamics
+from ..models.effects.extended import Extended, core
 from ..models.errors import UserError
 from ..models.spinn import Spinn
 from ..models.vehicle import load_vehicle
@@ -199,7 +200,9 @@ class MppiImpedance(Controller):
         """The model to plan with and what its checkpoint says of it."""
         if self.model is not None:
             model, metadata = load_model(self.model, float)
-            return (model.whitened() if isinstance(model, Spinn) else model), metadata
+            own = core(model)
+            white = own.whitened() if isinstance(own, Spinn) else own
+            return (model.with_base(white) if isinstance(model, Extended) else white), metadata
         vehicle = load_vehicle(self.vehicle or station.vehicle)
         return vehicle.dynamics(np.array(self.diffusion)), {}
 

@@ -10,6 +10,8 @@ from ..models.checkpoint import load_model
 from ..models.checks import Vector6, check_numbers, require
 from ..models.disturbances import Combined, Kind, OrnsteinUhlenbeckWrench, preset
 from ..models.dynamics import Dynamics
+from ..models.effects.by_hand import EffectConfig
+from ..models.effects.extended import Extended, core
 from ..models.sensors import Compass, DepthSensor, Dvl, Imu
 from ..models.spinn import Spinn
 from ..models.vehicle import Vehicle, load_vehicle
@@ -36,6 +38,7 @@ class StationConfig:
     Attributes:
         vehicle: a preset's name or the path of a vehicle's YAML file: hull, thrusters, physics.
         model: a checkpoint of the dynamics to simulate; the vehicle's physics if left out.
+        effects: what the plant has besides these dynamics, by name; planners don't know of it.
         diffusion: b of the physics' process noise (N√s and N·m√s); disturbances are usually better.
         disturbance_set: a named set (`models.disturbances.preset`).
         disturbances: more of them, by kind.
@@ -51,6 +54,7 @@ class StationConfig:
 
     vehicle: str = "bluerov2_heavy"
     model: Path | None = None
+    effects: tuple[EffectConfig, ...] = ()
     diffusion: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     disturbance_set: str = "still"
     disturbances: tuple[Kind, ...] = ()
@@ -87,9 +91,16 @@ class StationConfig:
         Raises:
             UserError: the vehicle or the checkpoint can't be read.
         """
+        vehicle = self.load_vehicle()
         if self.model is not None:
-            return load_model(self.model, float)[0]
-        return self.load_vehicle().dynamics(np.array(self.diffusion))
+            model = load_model(self.model, float)[0]
+        else:
+            model = vehicle.dynamics(np.array(self.diffusion))
+        if not self.effects:
+            return model
+        own = model.effects if isinstance(model, Extended) else ()
+        more = tuple(effect.build() for effect in self.effects)
+        return Extended.create(core(model), (*own, *more), vehicle.thrusters())
 
     def disturbance(self) -> Combined:
         """All disturbances as one, and with them the pushes that last of a learned model.
@@ -99,7 +110,7 @@ class StationConfig:
         """
         members = (*preset(self.disturbance_set).members, *self.disturbances)
         if self.model is not None:
-            model = load_model(self.model, float)[0]
+            model = core(load_model(self.model, float)[0])
             if isinstance(model, Spinn) and model.lasting is not None:
                 std = np.asarray(model.lasting.std(model.scales.diffusion)).tolist()
                 time = np.asarray(model.lasting.time_constant).tolist()

@@ -12,6 +12,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 from thruster_examples import prompt_thrusters
 
+from spinndrift.models import config as yaml
 from spinndrift.models import integrate, se3
 from spinndrift.models.effects.extended import Extended
 from spinndrift.models.effects.library import kind
@@ -22,6 +23,7 @@ from spinndrift.systems.learned_plant import LearnedPlant
 from spinndrift.systems.mppi_config import MppiConfig
 from spinndrift.systems.mppi_core import MppiPlanner
 from spinndrift.systems.obstacles import Cylinders, SphereHull
+from spinndrift.systems.station_config import StationConfig
 from spinndrift.systems.wrench_limits import BoxLimits
 
 MASS, PUSH, TAU, DELAY = 20.0, 10.0, 0.2, 0.13
@@ -115,6 +117,33 @@ def test_thrust_effects_act_on_thrusters_alone():
     force[2] = 0
     wrench = np.asarray(thrusters.wrench(jnp.asarray(force)))
     np.testing.assert_allclose(V, wrench / np.diag(BODY.rigid_inertia) * 0.1, atol=2e-3)
+
+
+def test_a_scenario_has_effects_by_name():
+    """As settings they are the effects themselves, beside those that a model brings along."""
+    settings = yaml.loads(
+        StationConfig,
+        """
+effects:
+- {name: thruster_lag, parameters: {time_constant: 0.3}}
+- {name: thruster_gain, where: "3", parameters: {gain: -0.5}}
+- {name: proximity, where: bottom, parameters: {gain: 1.5}, options: {floor: -6.0}}
+""",
+        "station",
+    )
+    again = yaml.loads(StationConfig, yaml.dump(settings), "station")
+    assert again == settings
+    model = settings.dynamics()
+    assert isinstance(model, Extended)
+    by_hand = (
+        kind("thruster_lag").of(time_constant=0.3),
+        kind("thruster_gain").of("3", gain=-0.5),
+        kind("proximity").of("bottom", gain=1.5, options={"floor": -6.0}),
+    )
+    expected = extended(*by_hand).effects
+    assert [e.name for e in model.effects] == [e.name for e in expected]
+    for mine, theirs in zip(*map(jax.tree.leaves, (model.effects, expected)), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
 
 
 def test_random_states_live_in_the_plant():

@@ -107,6 +107,20 @@ def test_changes():
         ("success: !ReachGoal {}", "needs `goal`"),
         ("{station: {seed: -1}}", "seed"),
         ("{station: {vehicle: 3}}", "text"),
+        ("{station: {effects: [{name: lag}]}}", "effects.*'lag'.*thruster_lag"),
+        (
+            "{station: {effects: [{name: thruster_lag, parameters: {tau: 1}}]}}",
+            "effects.*no 'tau': it has time_constant",
+        ),
+        ("{station: {effects: [{name: linear_drag}]}}", "say where: one of surge"),
+        (
+            "{station: {effects: [{name: thruster_lag, parameters: {time_constant: -1}}]}}",
+            "is -1: give 0 to 1.5 s",
+        ),
+        (
+            "{station: {effects: [{name: proximity, where: bottom, options: {height: 1}}]}}",
+            "proximity.options.*height",
+        ),
         ("{", "--scenario-text"),
     ],
 )

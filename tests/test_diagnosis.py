@@ -466,6 +466,25 @@ def test_structure_without_a_name_is_found_where_it_is(tmp_path):
     assert effect.numbers[1] == pytest.approx(parameters["frequency"]["value"], rel=0.15)
 
 
+def test_backlash_is_told_with_its_thruster_and_width(tmp_path):
+    """One thruster of eight follows its command with play: that one and no other, how much."""
+    from spinndrift.training.diagnosis.structures import described, refined
+    from spinndrift.training.diagnosis.unknowns import screened
+
+    case, recording = recorded(tmp_path, 70013, "unknown", names=("backlash",))
+    hidden = case.answer()["causes"][0]
+    bench = Diagnoser(recording, VEHICLE).bench
+    rng = np.random.default_rng(0)
+    seen = screened(bench, bench.look(bench.believed), [], 0.01, rng)
+    assert seen is not None
+    effect = refined(seen[0], seen[1], rng)
+    assert (effect.kind, effect.acts_on) == ("play", hidden["where"])
+    assert effect.numbers[0] == pytest.approx(hidden["parameters"]["width"]["value"], rel=0.1)
+    told = described(effect, np.ones(1), bench)
+    assert told["variables"] == [f"f{hidden['where']}"]
+    assert "backlash" in told["description"]
+
+
 def test_single_precision_is_refused_with_a_remedy(tmp_path):
     recording = recorded(tmp_path, 3, "null")[1]
     with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):

@@ -15,7 +15,7 @@ from spinndrift.models.effects.drag import COUPLINGS
 from spinndrift.models.effects.predict import advance
 from spinndrift.models.effects.recent import Recent
 from spinndrift.models.effects.thrust import REFERENCE
-from spinndrift.models.effects.unknown import Unknown
+from spinndrift.models.effects.unknown import Unknown, taken_up
 from spinndrift.models.errors import UserError
 from spinndrift.models.integrate import rollout
 from spinndrift.models.vehicle import load_vehicle
@@ -472,6 +472,41 @@ def test_what_has_no_name_is_stored_and_moves_the_vehicle(tmp_path, kind, acts_o
     plain = drift(PLAIN)
     np.testing.assert_allclose(drift(PLAIN.with_effects((effect,))), plain, atol=1e-12)
     assert np.abs(drift(model) - plain).max() > 1e-4
+
+
+def test_play_encloses_its_area_at_any_speed_and_refinement():
+    """Of amplitude A and play δ the loop is a parallelogram of area 4 δ (A - δ)."""
+    A, play, steps = 5.0, 1.5, 4001
+    command = A * jnp.sin(jnp.linspace(0.0, 6 * np.pi, 3 * steps - 2))
+
+    def followed(u):
+        return jax.lax.scan(lambda f, x: 2 * (taken_up(f, x, play),), jnp.zeros(1), u[:, None])[1]
+
+    out = np.asarray(followed(command))[:, 0]
+    assert np.abs(out - command).max() <= play + 1e-12
+    area = abs(np.trapezoid(out[-steps:], np.asarray(command[-steps:])))
+    np.testing.assert_allclose(area, 4 * play * (A - play), rtol=1e-5)
+    # what is left out between two samples of a monotone piece changes nothing
+    turns = np.flatnonzero(np.diff(np.diff(np.asarray(command)) > 0)) + 1
+    kept = np.unique([0, *turns, *range(0, len(command), 37)])
+    np.testing.assert_array_equal(np.asarray(followed(command[kept]))[:, 0], out[kept])
+
+
+@pytest.mark.parametrize("where", ["thrusters", "3"])
+def test_play_acts_on_the_thrusters_that_have_it(tmp_path, where):
+    effect = Unknown.neutral(kind="play", acts_on=where, numbers=(1.5,))
+    model = PLAIN.with_effects((dataclasses.replace(effect, values=1 + effect.values),))
+    save_model(tmp_path / "m.spinn", model)
+    model = load_model(tmp_path / "m.spinn")[0]
+    assert isinstance(model, Extended)
+    wanted = np.array([[2.0], [-4.0]])
+    memory, forces = model.carried(jnp.zeros((8, 1)))[0], []
+    for u in (*wanted, np.zeros(1)):
+        memory, level = model.actuate(memory, jnp.broadcast_to(jnp.asarray(u), (8, 1)), 0.05, 2)
+        forces.append(np.asarray(level)[:, 0, -1])
+    concerned = np.isin(np.arange(1, 9), range(1, 9) if where == "thrusters" else [int(where)])
+    for force, plays, prompt in zip(forces, (0.5, -2.5, -1.5), (2.0, -4.0, 0.0), strict=True):
+        np.testing.assert_allclose(force, np.where(concerned, plays, prompt), atol=1e-12)
 
 
 def test_a_late_twist_that_differs_from_the_prediction_keeps_what_drag_leaves():

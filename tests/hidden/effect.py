@@ -87,6 +87,10 @@ class Effect:
         """(8,) s."""
         return np.zeros(8)
 
+    def follow(self, before: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """What the drive takes the command (8, B) for, `before` being what it took the last for."""
+        return u
+
     def distort(self, u: np.ndarray, volts: np.ndarray) -> np.ndarray:
         """Steady thrust (8, B) for commanded thrust u (8, B) and battery `volts` (B,)."""
         return u

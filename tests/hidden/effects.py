@@ -67,6 +67,7 @@ UNKNOWN: dict[str, type] = {
     "swirl": unknown.Swirl,
     "appendage": unknown.Appendage,
     "memory": unknown.Memory,
+    "backlash": unknown.Backlash,
 }
 
 

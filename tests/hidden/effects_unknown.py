@@ -141,3 +141,41 @@ class Memory(_Unknown):
     def drawn(cls, rng: Any, size: float) -> "Memory":
         axis = int(rng.choice([0, 1, 2, 5]))
         return cls(axis, around(rng, (40.0 if axis < 3 else 1.5) * size), rng.uniform(1.0, 2.0))
+
+
+@dataclass(frozen=True)
+class Backlash(_Unknown):
+    """Drives follow their command with play: f stays until u leaves f ± δ, then f = u ∓ δ.
+
+    The play operator (Krasnosel'skii and Pokrovskii 1989; Tao and Kokotović 1996, eq. 2.2); in one
+    thruster, 1 … 8, or in all (None).
+    """
+
+    kind = "backlash"
+    width: float = 0.0
+    thruster: int | None = None
+
+    @property
+    def variables(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return tuple(f"f{k}" for k in range(1, 9) if self.thruster in (None, k))
+
+    @property
+    def where(self) -> str:
+        return "thrusters" if self.thruster is None else str(self.thruster)
+
+    def parameters(self) -> Parameters:
+        return {"width": value(self.width, "N")}
+
+    def neutral(self) -> bool:
+        return self.width == 0
+
+    def follow(self, before: np.ndarray, u: np.ndarray) -> np.ndarray:
+        taken = np.minimum(np.maximum(before, u - self.width), u + self.width)
+        concerned = np.isin(np.arange(1, 9), self.thruster or np.arange(1, 9))[:, None]
+        return np.where(concerned, taken, u)
+
+    @classmethod
+    def drawn(cls, rng: Any, size: float) -> "Backlash":
+        if rng.uniform() < 0.5:
+            return cls(around(rng, 1.0 * size))
+        return cls(around(rng, 2.0 * size), int(rng.integers(1, 9)))

@@ -71,6 +71,7 @@ def predict(
     B = truth.states.shape[2]
     run = np.arange(B)
     samples = np.rint(truth.t / h).astype(int) + lead
+    taken = plant.followed(truth.held)
     X, V = [], []
     for n in starts:
         span = samples[n : n + steps + 1] - samples[n]
@@ -79,7 +80,7 @@ def predict(
         y = _start(truth, plant, full, samples[n], n, exact_start, h)
         past = np.stack([truth.states[samples[n] - k, :, run].T for k in range(lead, 0, -1)])
         rows = samples[n] - lead + np.arange(lead + int(span.max()))[:, None]
-        held = truth.held[np.minimum(rows, truth.held.shape[0] - 1), :, run].transpose(0, 2, 1)
+        held = taken[np.minimum(rows, taken.shape[0] - 1), :, run].transpose(0, 2, 1)
         latents = _latents(truth, plant, full, samples[n])
         future = [y]
         for i in range(int(span.max())):

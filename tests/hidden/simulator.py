@@ -117,6 +117,7 @@ def simulate(
     states = np.empty((steps + 1, plant.size, B))
     states[0], past = y, [latents]
     held = np.zeros((steps + 1, 8, B))  # commands, by inner step
+    taken = np.zeros_like(held)  # and what drives take them for
     forces = np.zeros((N, 8, B))
     current, index, run = np.zeros((8, B)), np.zeros(B, int), np.arange(B)
     b = np.array(noise.diffusion)[:, None]
@@ -137,7 +138,8 @@ def simulate(
             forces[n, :, due] = wanted.T
             index[due] += 1
         held[i] = current
-        u = delayed(held, i, plant.delay, h)
+        taken[i] = plant.follow(taken[i - 1], current)
+        u = delayed(taken, i, plant.delay, h)
         steady = plant.steady_thrust(u, setup.voltage)
         latents = {k: e.advance(latents[k], h, own[k]) for k, e in enumerate(plant.effects)}
         y = plant.knock(y, h, own)

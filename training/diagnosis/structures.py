@@ -11,7 +11,7 @@ folds. Groups are added one at a time, each beside those before (orthogonal matc
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -42,6 +42,8 @@ NODES = {
 }
 """Times (s) that a memory fades in, and frequencies (Hz) for each, closest where vehicles and what
 hangs on them ring."""
+PLAYS = (0.3, 0.6, 1.2, 2.4, 4.8)
+"""Backlash (N) of thrusters that is tried, ±."""
 _CORRELATED, _MOST_CORRELATED = 0.1, 2
 """Correlation of neighbouring innovations from which an axis may remember other velocities, and so
 many axes at most."""
@@ -57,11 +59,12 @@ class Group:
 
     Attributes:
         effect: that has these columns as its terms (of a memory: with the first node's numbers).
-        action: `wrench`, `thruster`, `force` or `flow` (both in W).
+        action: `wrench`, `thruster`, `thrusters` (a wrench on all axes), `force` or `flow` (in W).
         variables: inputs, in the words of recordings.
         columns: of the wrench (N, component of the action, k, R) for a range of pieces.
         nodes: columns of each alternative.
-        labels: what each node means: time constant (s) and frequency (Hz) of a memory.
+        labels: the effect's first numbers at each node: time constant (s) and frequency (Hz) of a
+            memory, the play (N) of thrusters.
     """
 
     effect: Unknown
@@ -69,7 +72,7 @@ class Group:
     variables: tuple[str, ...]
     columns: Callable[[np.ndarray], Float[np.ndarray, "N c k R"]]
     nodes: tuple[tuple[int, ...], ...]
-    labels: tuple[tuple[float, float], ...] = ()
+    labels: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -177,6 +180,8 @@ class Screen:
             unit = np.eye(len(model.inverse))[:, int(group.effect.acts_on) - 1]
             wrench = self.inverse @ np.asarray(model.allocate(jnp.asarray(unit)))
             return wrench[:, None, None] * phi
+        if group.action == "thrusters":
+            return np.einsum("ij,njkr->nikr", self.inverse, phi)
         F = self._of_world(self.inverse[:, :3]) if group.action == "force" else self.water[0]
         return np.einsum("nijr,njkr->nikr", F, phi)
 
@@ -352,6 +357,9 @@ def groups(bench: Bench, look: Look, quiet: Sequence[str] = ()) -> Iterator[Grou
     level = d.command != "F_Bo_B"
     for k in range(d.u.shape[1] if level else 0):
         yield _of_thruster(bench, k)
+        yield _of_play(bench, str(k + 1), PLAYS)
+    if level:
+        yield _of_play(bench, "thrusters", PLAYS)
     z = d.X[:-1, 6][d.weight > 0]
     numbers = (float(z.mean()), float(z.std() + 1e-3))
     yield _of_state(bench, Unknown.neutral(kind="depth", acts_on="W", numbers=numbers))
@@ -399,6 +407,39 @@ def _of_thruster(bench: Bench, k: int) -> Group:
         ]
 
     return Group(effect, "thruster", (f"f{k + 1}",), columns, (tuple(range(effect.size())),))
+
+
+def _of_play(bench: Bench, where: str, plays: Sequence[float]) -> Group:
+    """Backlash of one thruster or of all, one width a node."""
+    model, d = bench.model, bench.data
+    count, single = d.u.shape[1], where != "thrusters"
+    effect = Unknown.neutral(kind="play", acts_on=where, numbers=(plays[0],), thrusters=count)
+    of = [int(where) - 1] if single else list(range(count))
+
+    def columns(kept: np.ndarray) -> np.ndarray:
+        past, u = d.past[..., kept][:, of], d.u[..., kept][:, of]
+        behind = np.array([taken_up_by(past, u, play) - u for play in plays])  # (k, N, n, R)
+        acting = np.moveaxis(behind, 2, 0)  # (n, k, N, R)
+        if not single:
+            acting = np.asarray(model.allocate(jnp.asarray(acting)))
+        return np.moveaxis(acting, (0, 1), (1, 2))
+
+    variables = tuple(f"f{k + 1}" for k in of)
+    nodes = tuple((k,) for k in range(len(plays)))
+    action = "thruster" if single else "thrusters"
+    return Group(effect, action, variables, columns, nodes, tuple((p,) for p in plays))
+
+
+def taken_up_by(
+    past: Float[np.ndarray, "P n R"], u: Float[np.ndarray, "N n R"], play: float
+) -> Float[np.ndarray, "N n R"]:
+    """What follows commands u with backlash, those before them taken up too."""
+    found, state = np.empty_like(u), past[0]
+    for command in past:
+        state = np.clip(state, command - play, command + play)
+    for n, command in enumerate(u):
+        found[n] = state = np.clip(state, command - play, command + play)
+    return found
 
 
 def _correlated(look: Look) -> list[int]:
@@ -449,13 +490,17 @@ def _bumps(x: np.ndarray, y: np.ndarray, most: int = 16) -> tuple[float, ...]:
 # --------------------------------------------------------------------------- what was found
 
 
+_FINER = (1.4, 1.18, 1.08)
+"""Factors by which numbers between nodes are sought."""
+
+
 def refined(screen: Screen, found: Matched, rng: np.random.Generator) -> Unknown:
     """The effect of a match: a memory's numbers between the nodes, the few terms of a motion."""
     effect = found.group.effect
     if effect.kind == "memory":
         axis, of = AXES.index(effect.acts_on), effect.remembered
         T, f = found.group.labels[found.node]
-        for spread in (1.4, 1.18, 1.08):
+        for spread in _FINER:
             # a ring that decays within the runs tells its frequency to a fraction of 1 / T
             step = (spread - 1) * max(f, 0.2)
             frequencies = [g for g in (f - step, f, f + step) if g >= 0.03] if f else [0.0]
@@ -464,6 +509,13 @@ def refined(screen: Screen, found: Matched, rng: np.random.Generator) -> Unknown
             again = screen.match(finer, 0.01, rng, draws=0)
             T, f = finer.labels[again.node]
         return Unknown.neutral(kind="memory", acts_on=effect.acts_on, numbers=(T, f, float(of)))
+    if effect.kind == "play":
+        (width,) = found.group.labels[found.node]
+        for spread in _FINER:
+            plays = (width / spread, width, width * spread)
+            finer = _of_play(screen.bench, effect.acts_on, plays)
+            width = plays[screen.match(finer, 0.01, rng, draws=0).node]
+        return replace(effect, numbers=(width,))
     if effect.kind == "motion":
         chosen = screen.sparse(found.group)
         return Unknown.neutral(kind="motion", acts_on=effect.acts_on, numbers=chosen)
@@ -496,6 +548,11 @@ def described(effect: Unknown, weights: np.ndarray, bench: Bench) -> dict[str, A
     elif effect.kind == "thruster":
         variables = (f"f{where}",)
         told = f"the force of thruster {where} against its command"
+    elif effect.kind == "play":
+        single = where != "thrusters"
+        variables = (f"f{where}",) if single else tuple(f"f{k + 1}" for k in range(d.u.shape[1]))
+        who = f"thruster {where} following its" if single else "thrusters that follow their"
+        told = f"{who} commands with backlash of {effect.numbers[0]:.2g} N"
     elif effect.kind == "pose":
         told = f"a wrench on {where} that depends on heading, roll or pitch"
     elif effect.kind == "damping":

@@ -24,7 +24,7 @@ from spinndrift.training.diagnosis.disturbance import (
     told,
     won_by,
 )
-from spinndrift.training.diagnosis.laws import Law
+from spinndrift.training.diagnosis.laws import Law, estimated, impacts
 from spinndrift.training.diagnosis.levels import LEVEL
 from spinndrift.training.diagnosis.noise import estimate, score_of
 from spinndrift.training.diagnosis.search import Found, Search
@@ -301,9 +301,10 @@ def test_a_belief_that_diverges_on_the_data_is_told(tmp_path):
         Diagnoser(read_csv(tmp_path / "data"), VEHICLE, belief).run()
 
 
-def test_a_current_that_wanders_is_one_motion_of_the_water(tmp_path):
+@pytest.mark.parametrize("size", [1.0, 3.0])
+def test_a_current_that_wanders_is_one_motion_of_the_water(tmp_path, size):
     """Not pushes on every axis: its size and time constant within three standard errors."""
-    case = draw(4, names=("current_varying",), plan=Plan(runs=3))
+    case = draw(4, names=("current_varying",), size=size, plan=Plan(runs=3))
     case.write(tmp_path / "data")
     bench = Diagnoser(read_csv(tmp_path / "data", resample=False), VEHICLE).bench
     look = bench.look(bench.believed)
@@ -315,3 +316,21 @@ def test_a_current_that_wanders_is_one_motion_of_the_water(tmp_path):
     for name, found in case.answer()["causes"][0]["parameters"].items():
         if np.isfinite(law.errors[name]):
             assert abs(law.parameters[name] - found["value"]) < 3 * law.errors[name]
+
+
+@pytest.mark.parametrize("sizes", ["alike", "gaussian"])
+def test_blows_come_out_as_many_and_as_large_whatever_their_sizes(sizes):
+    """Their rate and root mean square, by three standard errors."""
+    rng = np.random.default_rng(4)
+    share, size, N, R = 0.01, 7.0, 200, 30
+    hit = rng.uniform(size=(N, R)) < share
+    drawn = rng.choice([-1.0, 1.0], (N, R)) if sizes == "alike" else rng.standard_normal((N, R))
+    z = rng.standard_normal((N, R)) + size * drawn * hit
+    gain, values, loss = impacts(z, np.ones((N, R)), np.arange(R) % 5)
+    assert ("evenness" in values) == (sizes == "alike")
+    law = Law("disturbance_impacts", "surge", values, gain, loss)
+    found, covariance = estimated(law, np.arange(R))
+    truth = np.log([hit.mean(), np.sqrt(np.mean((size * drawn[hit]) ** 2) + 1), 1.0])
+    errors = np.sqrt(np.diag(covariance))[:3]
+    assert np.all(np.abs(found[:3] - truth) < 3 * errors)
+    assert np.all(errors < 0.2)

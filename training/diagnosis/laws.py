@@ -5,6 +5,7 @@ intensity. Each law below is one or two numbers that change their density; gains
 the numbers fitted on the other scenarios.
 """
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -37,6 +38,8 @@ class Law:
 Told = tuple[np.ndarray, dict[str, float], Callable[[np.ndarray], np.ndarray]]
 """Held-out gain by piece, the best numbers, and the loss as a function of their logarithms."""
 _GROWTHS = np.geomspace(0.05, 1000.0, 48)
+_EVENNESS, _ALIKE = (0.3, 0.1, 0.03), 4.0
+"""Shares of their spread in the squared sizes of blows that are alike; nats this must win."""
 _KAPPAS = (0.004, 0.01, 0.02, 0.04, 0.08, 0.15, 0.3)
 
 
@@ -59,7 +62,11 @@ def _held_out(losses: np.ndarray, fold: np.ndarray) -> tuple[np.ndarray, int]:
 def impacts(
     z: Float[np.ndarray, "N R"], weight: Float[np.ndarray, "N R"], fold: Int[np.ndarray, " R"]
 ) -> Told:
-    """Gain of a mixture (1 - p) N(0, s²) + p N(0, (k s)²) over N(0, σ²)."""
+    """Gain of a mixture of N(0, s²) with share 1 - p and blows with share p over N(0, σ²).
+
+    Blows have Gaussian sizes, w = `size`, or where that clearly wins more about one size, ±μ with a
+    spread w: μ² + w² = size², w² / size² the `evenness`.
+    """
     sigma = np.sqrt((z**2 * weight).sum() / weight.sum())
     # a histogram for each run: the density is smooth on its bins
     edges = sigma * np.concatenate([np.arange(0, 6, 0.05), np.geomspace(6, 1e3, 80)])
@@ -70,20 +77,31 @@ def impacts(
     plain = ((x / sigma) ** 2 / 2 + np.log(sigma)) @ counts
 
     def loss(logs: np.ndarray) -> np.ndarray:
-        p, size, s = np.exp(logs)
-        p = min(p, 0.9)
+        p, size, s, *of = np.exp(logs)
+        p, even = min(p, 0.9), min(of[0], 1.0) if of else 1.0
+        mu, w = size * np.sqrt(1 - even), size * np.sqrt(even)
         a = np.log1p(-p) - np.log(s) - (x / s) ** 2 / 2
-        b = np.log(p) - np.log(size) - (x / size) ** 2 / 2
-        return -np.logaddexp(a, b) @ counts
+        both = np.logaddexp(-(((x - mu) / w) ** 2) / 2, -(((x + mu) / w) ** 2) / 2) - np.log(2)
+        return -np.logaddexp(a, np.log(p) - np.log(w) + both) @ counts
 
-    choices, losses = [], []
-    for p in (0.002, 0.005, 0.01, 0.02, 0.05, 0.1):
-        for k in (2.0, 3.0, 5.0, 8.0, 15.0, 30.0):
-            for s in (0.6 * sigma, 0.8 * sigma, 0.9 * sigma, 0.96 * sigma):
-                choices.append({"share": p, "size": k * s, "rest": s})
-                losses.append(loss(np.log(list(choices[-1].values()))))
-    held, best = _held_out(np.array(losses), fold)
-    return plain - held, choices[best], loss
+    shares, sizes = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1), (2.0, 3.0, 5.0, 8.0, 15.0, 30.0)
+    rests = (0.6 * sigma, 0.8 * sigma, 0.9 * sigma, 0.96 * sigma)
+    gaussian = [
+        {"share": p, "size": k * s, "rest": s}
+        for p, k, s in itertools.product(shares, sizes, rests)
+    ]
+    alike = [{**choice, "evenness": e} for choice in gaussian for e in _EVENNESS]
+
+    def held_out(choices: list[dict[str, float]]) -> tuple[np.ndarray, dict[str, float]]:
+        losses = np.array([loss(np.log(list(choice.values()))) for choice in choices])
+        held, best = _held_out(losses, fold)
+        return plain - held, choices[best]
+
+    gain, values = held_out(gaussian)
+    of_one_size, also = held_out(alike)
+    if of_one_size.sum() > gain.sum() + _ALIKE:
+        gain, values = of_one_size, also
+    return gain, values, loss
 
 
 def speed_dependence(

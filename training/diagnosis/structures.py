@@ -194,10 +194,25 @@ class Screen:
     @cached_property
     def water(self) -> tuple[Float[np.ndarray, "N 6 3 R"], Float[np.ndarray, "N 6 3 R"]]:
         """dV/dt for velocity (m/s) and for acceleration (m/s²) of the water in W, one each."""
-        d = self.bench.data
-        X, V, u = (jnp.asarray(a[..., self.kept].swapaxes(0, 1)) for a in (d.X[:-1], d.V[:-1], d.u))
-        both = np.moveaxis(np.asarray(_of_water(self.bench.model, X, V, u)), 2, 0)
+        still = np.zeros((len(self.bench.data.u), 3, len(self.kept)))
+        both = self._of_water(still)[1]
         return both[:, :, :3], both[:, :, 3:]
+
+    def in_current(
+        self, v_WC_W: Float[np.ndarray, "N 3 R"]
+    ) -> tuple[Float[np.ndarray, "N 6 R"], Float[np.ndarray, "N 6 3 R"]]:
+        """dV/dt that a current (m/s) adds to that in still water, and its slope there."""
+        moving, slope = self._of_water(v_WC_W)
+        return moving - self._of_water(np.zeros_like(v_WC_W))[0], slope[:, :, :3]
+
+    def _of_water(
+        self, v_WC_W: Float[np.ndarray, "N 3 R"]
+    ) -> tuple[Float[np.ndarray, "N 6 R"], Float[np.ndarray, "N 6 6 R"]]:
+        d = self.bench.data
+        given = (d.X[:-1][..., self.kept], d.V[:-1][..., self.kept], d.u[..., self.kept], v_WC_W)
+        arrays = (jnp.asarray(a.swapaxes(0, 1)) for a in given)
+        drift, slope = _of_water(self.bench.model, *arrays)
+        return np.moveaxis(np.asarray(drift), 1, 0), np.moveaxis(np.asarray(slope), 2, 0)
 
     # ------------------------------------------------------------------------------ matching
 
@@ -324,17 +339,20 @@ class Screen:
 
 
 @eqx.filter_jit
-def _of_water(model: Extended, X: Array, V: Array, u: Array) -> Float[Array, "6 6 N R"]:
+def _of_water(
+    model: Extended, X: Array, V: Array, u: Array, v_WC_W: Array
+) -> tuple[Float[Array, "6 N R"], Float[Array, "6 6 N R"]]:
+    """dV/dt in a current, and its slope in velocity and acceleration of the water."""
     F = model.allocate(u)
     inverse = model.inertia().inverse
 
     def drift(both: Array) -> Array:
         return times(inverse, model.balance(X, V, F, Flow(both[:3], both[3:]))[1])
 
-    still = jnp.zeros((6, *X.shape[1:]), X.dtype)
-    unit = jnp.broadcast_to(jnp.eye(6, dtype=X.dtype)[:, :, None, None], (6, *still.shape))
-    columns = jax.vmap(lambda e: jax.jvp(drift, (still,), (e,))[1])(unit)
-    return jnp.moveaxis(columns, 0, 1)
+    current = jnp.concatenate([v_WC_W, jnp.zeros_like(v_WC_W)])
+    unit = jnp.broadcast_to(jnp.eye(6, dtype=X.dtype)[:, :, None, None], (6, *current.shape))
+    columns = jax.vmap(lambda e: jax.jvp(drift, (current,), (e,))[1])(unit)
+    return drift(current), jnp.moveaxis(columns, 0, 1)
 
 
 # ------------------------------------------------------------------------------- the groups

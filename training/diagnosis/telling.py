@@ -225,7 +225,7 @@ def _law_values(law: Law, bench: Bench, look: Look) -> dict[str, result.Value]:
     def physical(x: np.ndarray) -> np.ndarray:
         v = np.exp(x)
         if law.name == "disturbance_impacts":
-            share, size, rest = v
+            share, size, rest = v[:3]
             return np.array([np.sqrt(max(size**2 - rest**2, 1e-12)) / once, share / data.dt])
         if law.name == "disturbance_colour":
             tau, kappa = v[0], min(v[1], 0.99)

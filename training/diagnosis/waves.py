@@ -33,6 +33,8 @@ _BENDS = 4
 """Cosines that bend a current over a piece, besides a constant."""
 _WANDER = np.array([0.3, 0.6, 1.0, 2.0, 4.0, 10.0, 100.0])
 """Time constants of a current that are tried, in lengths of a piece."""
+_ROUNDS = 4
+"""Times that the most likely current of a piece is sought."""
 _LONG = 10.0
 """Of those, from which a current stays as it is."""
 
@@ -78,7 +80,7 @@ def are_waves(waves: Law, slow: Sequence[Law]) -> bool:
 def _drawn(screen: Screen, v: np.ndarray, a: np.ndarray, spread: np.ndarray) -> Beside:
     """Motion of the water drawn for each piece, its terms' standard deviations in proportion."""
     J = _responses(screen, v, a)
-    G = _products(screen, J)
+    G = _products(screen.z[0], J)
     std = run_constants(G, list(range(1, len(J) + 1)), spread, screen.fold)[1]["std"] / spread[0]
     return Beside(drawn=J, precision=1 / (max(std, 1e-9) * spread) ** 2)
 
@@ -91,8 +93,8 @@ def _responses(screen: Screen, v: np.ndarray, a: np.ndarray) -> Float[np.ndarray
     )
 
 
-def _products(screen: Screen, J: np.ndarray) -> Float[np.ndarray, "R m m"]:
-    return gram(np.concatenate([screen.z[:1], J]).astype(np.float64))
+def _products(z: np.ndarray, J: np.ndarray) -> Float[np.ndarray, "R m m"]:
+    return gram(np.concatenate([z[None], J]).astype(np.float64))
 
 
 def _times(bench: Bench, kept: np.ndarray) -> Float[np.ndarray, "N R"]:
@@ -113,27 +115,39 @@ def _flow(bench: Bench, kept: np.ndarray) -> Float[np.ndarray, "N 3 k R"]:
 def find_current(bench: Bench, look: Look) -> Law:
     """A horizontal current that wanders within runs: Gauss–Markov in W, anew for each piece.
 
-    Its Karhunen–Loève series is cut after `_BENDS` cosines. Of the time constants the one that wins
-    most; of one of ten pieces and more is only known that it is longer than a piece.
+    Its Karhunen–Loève series is cut after `_BENDS` cosines. Drag is not linear in it, so responses
+    are taken about the most likely current of each piece (Laplace's method), a few times. Of the
+    time constants the one that wins most; of one of ten pieces and more is only known that it is
+    longer than a piece.
     """
     screen = Screen(bench, look, None)
     v = _flow(bench, screen.kept)
-    J = _responses(screen, v, np.zeros_like(v))
-    G, columns = _products(screen, J), list(range(1, len(J) + 1))
     length = float(np.median(bench.data.times[-1, screen.kept]))
+    columns = list(range(1, v.shape[2] + 1))
+    likely, won = np.zeros((v.shape[3], v.shape[2])), np.zeros(v.shape[3])
+    G, best, tried = np.zeros(0), 0, []
+    for _ in range(_ROUNDS):
+        push, slope = screen.in_current(np.einsum("nikr,rk->nir", v, likely))
+        J = screen.passed(np.einsum("nijr,njkr->nikr", slope, v))
+        z = screen.z[0] + screen.passed(push[:, :, None])[0] - np.einsum("kar,rk->ar", J, likely)
+        won = ((screen.z[0].astype(float) ** 2).sum(axis=0) - (z**2).sum(axis=0)) / 2
+        G = _products(z, J)
+        tried = [run_constants(G, columns, _bends(tau), screen.fold) for tau in _WANDER]
+        best = int(np.argmax([told[0].sum() for told in tried]))
+        spread = tried[best][1]["std"] / _bends(_WANDER[best])[0] * _bends(_WANDER[best])
+        prior = np.diag(1 / np.maximum(spread, 1e-6) ** 2)
+        likely = -np.linalg.solve(G[:, 1:, 1:] + prior, G[:, 1:, :1])[..., 0]
 
     def lost(logs: np.ndarray) -> np.ndarray:
         """Nats by piece at the logarithms of standard deviation and time constant."""
         spread = _bends(float(np.exp(logs[1])) / length)
         return run_constants(G, columns, spread, screen.fold)[2](logs[:1] + np.log(spread[0]))
 
-    tried = [run_constants(G, columns, _bends(tau), screen.fold) for tau in _WANDER]
-    best = int(np.argmax([told[0].sum() for told in tried]))
     share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
     heldout, values, _ = tried[best]
     std, tau = values["std"] / _bends(_WANDER[best])[0], length * _WANDER[best]
     numbers = {"std": float(std), "time_constant": float(tau)}
-    law = Law("current_varying", "W", numbers, heldout * share, loss=lost)
+    law = Law("current_varying", "W", numbers, (heldout + won) * share, loss=lost)
     logs, covariance = estimated(law, np.arange(len(screen.kept)))
     numbers = dict(zip(numbers, np.exp(logs).tolist(), strict=True))
     unsure = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -226,7 +240,7 @@ def _found(bench: Bench, look: Look) -> tuple[Swell, Law]:
         J = _responses(screen, *(np.concatenate(w, axis=2) for w in zip(*water, strict=True)))
         found, spread = [], swells[0].spread
         for own in np.split(J, len(swells)):
-            G = _products(screen, own)
+            G = _products(screen.z[0], own)
             columns = list(range(1, len(own) + 1))
             found.append(run_constants(G, columns, spread, screen.fold))
         return found

@@ -474,6 +474,26 @@ def test_what_has_no_name_is_stored_and_moves_the_vehicle(tmp_path, kind, acts_o
     assert np.abs(drift(model) - plain).max() > 1e-4
 
 
+def test_waves_turn_the_water_as_those_that_run_towards_their_direction():
+    """Airy: u = aω cos(ωt) along it and w = -aω sin(ωt) up, fading with depth; std aω / √2."""
+    a, omega, way = 0.2, 1.7, 0.6
+    waves = KINDS["waves"].of("W", amplitude=a, frequency=omega, direction=way)
+    crest = jnp.array([a * omega, 0.0])
+    X = jnp.asarray(se3.identity(jnp.float64))
+    t = 0.02
+    moved = waves.advance(crest, jnp.zeros(2), jnp.asarray(t))
+    u, v, w = np.asarray(waves.drift_of_water(moved, X)) / np.exp(-omega * t / 24)
+    np.testing.assert_allclose(u * np.cos(way) + v * np.sin(way), a * omega * np.cos(omega * t))
+    np.testing.assert_allclose(u * np.sin(way), v * np.cos(way), atol=1e-15)
+    np.testing.assert_allclose(w, -a * omega * np.sin(omega * t))
+    deep = np.asarray(waves.drift_of_water(moved, X.at[6].set(-3.0)))
+    at_surface = np.asarray(waves.drift_of_water(moved, X))
+    np.testing.assert_allclose(deep / at_surface, np.exp(-3 * omega**2 / 9.80665), rtol=1e-12)
+    # long after they are one deviation for a draw of one
+    drawn = np.asarray(waves.advance(crest, jnp.ones(2), jnp.asarray(1e9)))
+    np.testing.assert_allclose(drawn, a * omega / np.sqrt(2), rtol=1e-12)
+
+
 def test_play_encloses_its_area_at_any_speed_and_refinement():
     """Of amplitude A and play δ the loop is a parallelogram of area 4 δ (A - δ)."""
     A, play, steps = 5.0, 1.5, 4001

@@ -65,14 +65,16 @@ class CurrentVarying(Effect):
 class Waves(Effect):
     """Orbital motion of long-crested swell: a narrow-band velocity with the depth's decay.
 
-    Two damped oscillators (quality 12) give the horizontal and the vertical velocity, a quarter
-    of a period apart, decaying with exp(ω² z / g) (Faltinsen 1990, table 2.1, deep water).
+    Waves of `amplitude` a and `frequency` ω run towards `direction`; water moves by aω cos along it
+    and by aω sin up, decaying with exp(ω² z / g) (Faltinsen 1990, table 2.1, deep water). Two
+    damped oscillators (quality 12) give both: a is the amplitude of a regular wave of the same
+    orbital speed, of which each has a standard deviation of aω / √2.
     """
 
     name: ClassVar[str] = "waves"
     family: ClassVar = "environment"
     parameters: ClassVar = (
-        Parameter("speed", "m/s", (0.03,), 0.0, 2.0),
+        Parameter("amplitude", "m", (0.02,), 0.0, 20.0),
         Parameter("frequency", "rad/s", (1.0,), 0.0, 10.0),
         Parameter("direction", "rad", (0.0,), -7.0, 7.0),
     )
@@ -93,7 +95,8 @@ class Waves(Effect):
     def advance(
         self, state: Float[Array, "s *#batch"], w: Float[Array, "w *#batch"], dt: Float[Array, ""]
     ) -> Float[Array, "s *#batch"]:
-        speed, omega = self.part(0, state), self.part(1, state)
+        omega = self.part(1, state)
+        speed = self.part(0, state) * omega / jnp.sqrt(jnp.asarray(2.0, omega.dtype))
         decay = jnp.exp(-omega * dt / 24)
         c, s = jnp.cos(omega * dt), jnp.sin(omega * dt)
         a, b = state[0], state[1]
@@ -106,4 +109,4 @@ class Waves(Effect):
         omega, angle = self.part(1, state), self.part(2, state)
         fade = jnp.exp(omega * omega * jnp.minimum(X_WB[6], 0) / 9.80665)
         level = state[0] * fade
-        return jnp.stack([level * jnp.cos(angle), level * jnp.sin(angle), state[1] * fade])
+        return jnp.stack([level * jnp.cos(angle), level * jnp.sin(angle), -state[1] * fade])

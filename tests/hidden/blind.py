@@ -204,7 +204,7 @@ def told(effect: Effect) -> dict[str, Any]:
             k, a = effect.stiffness, effect.anchor
             values = {"stiffness": k, "pull_east": k * a[0], "pull_north": k * a[1]}
         case environment.Waves():
-            values = {"frequency": own["frequency"]}
+            values = {name: own[name] for name in ("amplitude", "frequency", "direction")}
         case disturbance.DisturbanceLevel():
             place, values = "", {"change": effect.factor - 1}
         case disturbance.DisturbanceColour() | disturbance.DisturbanceImpacts():

@@ -93,6 +93,48 @@ def _responses(screen: Screen, v: np.ndarray, a: np.ndarray) -> Float[np.ndarray
     )
 
 
+def _about(
+    screen: Screen, v: np.ndarray, a: np.ndarray, likely: Float[np.ndarray, "R k"]
+) -> tuple[Float[np.ndarray, "N12 R"], Float[np.ndarray, "k N12 R"]]:
+    """Innovations of still water and responses, both of the tangent at a likely motion of it."""
+    push, slope = screen.in_current(np.einsum("nikr,rk->nir", v, likely))
+    by_a = np.einsum("nijr,njkr->nikr", screen.water[1], a)
+    J = screen.passed(np.einsum("nijr,njkr->nikr", slope, v) + by_a)
+    push = push + np.einsum("nikr,rk->nir", by_a, likely)
+    there = screen.z[0] + screen.passed(push[:, :, None])[0]
+    return there - np.einsum("kar,rk->ar", J, likely), J
+
+
+def _refined(
+    screen: Screen,
+    v: np.ndarray,
+    a: np.ndarray,
+    fit: Callable[[np.ndarray], tuple[Told, Float[np.ndarray, " k"]]],
+) -> tuple[Float[np.ndarray, "R m m"], Told]:
+    """Products and fit about the most likely motion of each piece, sought a few times (Laplace).
+
+    `fit` gives what is told by products, and the standard deviations that it finds.
+    """
+    likely, still = np.zeros((v.shape[3], v.shape[2])), _squares(screen.z[0])
+    for _ in range(_ROUNDS):
+        z, J = _about(screen, v, a, likely)
+        G = _products(z, J)
+        (gain, values, loss), spread = fit(G)
+        gain = gain + (still - _squares(z)) / 2
+        likely = _most_likely(G, spread)
+    return G, (gain, values, loss)
+
+
+def _squares(z: np.ndarray) -> Float[np.ndarray, " R"]:
+    return (z.astype(np.float64) ** 2).sum(axis=0)
+
+
+def _most_likely(G: Float[np.ndarray, "R m m"], spread: np.ndarray) -> Float[np.ndarray, "R k"]:
+    """Coefficients of each piece with standard deviations `spread` beforehand."""
+    prior = np.diag(1 / np.maximum(spread, 1e-6) ** 2)
+    return -np.linalg.solve(G[:, 1:, 1:] + prior, G[:, 1:, :1])[..., 0]
+
+
 def _products(z: np.ndarray, J: np.ndarray) -> Float[np.ndarray, "R m m"]:
     return gram(np.concatenate([z[None], J]).astype(np.float64))
 
@@ -124,19 +166,17 @@ def find_current(bench: Bench, look: Look) -> Law:
     v = _flow(bench, screen.kept)
     length = float(np.median(bench.data.times[-1, screen.kept]))
     columns = list(range(1, v.shape[2] + 1))
-    likely, won = np.zeros((v.shape[3], v.shape[2])), np.zeros(v.shape[3])
-    G, best, tried = np.zeros(0), 0, []
-    for _ in range(_ROUNDS):
-        push, slope = screen.in_current(np.einsum("nikr,rk->nir", v, likely))
-        J = screen.passed(np.einsum("nijr,njkr->nikr", slope, v))
-        z = screen.z[0] + screen.passed(push[:, :, None])[0] - np.einsum("kar,rk->ar", J, likely)
-        won = ((screen.z[0].astype(float) ** 2).sum(axis=0) - (z**2).sum(axis=0)) / 2
-        G = _products(z, J)
+
+    def fit(G: np.ndarray) -> tuple[Told, np.ndarray]:
         tried = [run_constants(G, columns, _bends(tau), screen.fold) for tau in _WANDER]
         best = int(np.argmax([told[0].sum() for told in tried]))
-        spread = tried[best][1]["std"] / _bends(_WANDER[best])[0] * _bends(_WANDER[best])
-        prior = np.diag(1 / np.maximum(spread, 1e-6) ** 2)
-        likely = -np.linalg.solve(G[:, 1:, 1:] + prior, G[:, 1:, :1])[..., 0]
+        gain, values, loss = tried[best]
+        bends = _bends(_WANDER[best])
+        std = values["std"] / bends[0]
+        numbers = {"std": float(std), "time_constant": float(length * _WANDER[best])}
+        return (gain, numbers, loss), std * bends
+
+    G, (heldout, numbers, _) = _refined(screen, v, np.zeros_like(v), fit)
 
     def lost(logs: np.ndarray) -> np.ndarray:
         """Nats by piece at the logarithms of standard deviation and time constant."""
@@ -144,10 +184,7 @@ def find_current(bench: Bench, look: Look) -> Law:
         return run_constants(G, columns, spread, screen.fold)[2](logs[:1] + np.log(spread[0]))
 
     share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
-    heldout, values, _ = tried[best]
-    std, tau = values["std"] / _bends(_WANDER[best])[0], length * _WANDER[best]
-    numbers = {"std": float(std), "time_constant": float(tau)}
-    law = Law("current_varying", "W", numbers, (heldout + won) * share, loss=lost)
+    law = Law("current_varying", "W", numbers, heldout * share, loss=lost)
     logs, covariance = estimated(law, np.arange(len(screen.kept)))
     numbers = dict(zip(numbers, np.exp(logs).tolist(), strict=True))
     unsure = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -169,47 +206,51 @@ def _bends(tau: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Swell:
-    """Waves from one direction ψ (rad), for each piece and frequency four amplitudes.
+    """Waves towards ψ (rad), for each piece and frequency two amplitudes (four if `flat`).
 
-    Water moves along ψ with cos θ and sin θ and up with cos θ and sin θ, θ = k (x cos ψ + y sin ψ)
-    - ω t, fading with exp(k z), ω² = g k (Airy; Faltinsen 1990, table 2.1, deep water).
+    Water moves along ψ with cos θ and up with sin θ, θ = k (x cos ψ + y sin ψ) - ω t, and a quarter
+    of a period later, fading with exp(k z), ω² = g k (Airy; Faltinsen 1990, table 2.1, deep water).
 
     Attributes:
         frequency: ω where there is most energy (rad/s).
         direction: ψ.
         sea: whether there are the frequencies of a wind sea, and not one alone.
+        flat: whether it moves along and up with amplitudes and phases of their own, as in shallow
+            water or under waves from several directions; ψ may be that of the other way then.
     """
 
     frequency: float
     direction: float
     sea: bool = False
+    flat: bool = False
 
     @property
     def spread(self) -> Float[np.ndarray, " k"]:
         """Standard deviations of the amplitudes that are tried first, all together `_FIRST`."""
         share = np.sqrt(_sea() / _sea().sum()) if self.sea else np.ones(1)
-        return _FIRST * np.repeat(share, 4)
+        return _FIRST * np.repeat(share, 4 if self.flat else 2)
 
     def water(
         self, bench: Bench, kept: np.ndarray
     ) -> tuple[Float[np.ndarray, "N 3 k R"], Float[np.ndarray, "N 3 k R"]]:
         """Velocities of 1 m/s at the surface and accelerations, in W."""
         X, t = bench.data.X[:-1][..., kept], _times(bench, kept)
-        ahead = np.cos(self.direction) * X[:, 4] + np.sin(self.direction) * X[:, 5]
-        motions = []
+        way = np.array([np.cos(self.direction), np.sin(self.direction), 0.0])
+        ahead = way[0] * X[:, 4] + way[1] * X[:, 5]
+        along, up = way[:, None], np.array([[0.0], [0.0], [1.0]])
+        v, a = [], []
         for omega in self.frequency * (_PARTS if self.sea else np.ones(1)):
             k = omega**2 / _GRAVITY
-            c, s = np.cos(k * ahead - omega * t), np.sin(k * ahead - omega * t)
             fade = np.exp(k * np.minimum(X[:, 6], 0.0))
-            motions += [(fade * c, omega * fade * s), (fade * s, -omega * fade * c)]
-        v, a = np.zeros((2, *t.shape[:1], 3, 2 * len(motions), len(kept)))
-        for number, motion in enumerate(motions):
-            along = 4 * (number // 2) + number % 2
-            for all_of_it, part in zip((v, a), motion, strict=True):
-                all_of_it[:, 0, along] = np.cos(self.direction) * part
-                all_of_it[:, 1, along] = np.sin(self.direction) * part
-                all_of_it[:, 2, along + 2] = part
-        return v, a
+            c, s = (fade * f(k * ahead - omega * t) for f in (np.cos, np.sin))
+            c, s = c[:, None], s[:, None]
+            pairs = [(c * along + s * up, s * along - c * up)]
+            if self.flat:
+                pairs = [(c * d, s * d) for d in (along, up)]
+            for first, second in pairs:  # a quarter of a period apart
+                v += [first, second]
+                a += [omega * second, -omega * first]
+        return np.stack(v, axis=2), np.stack(a, axis=2)
 
 
 def _sea() -> Float[np.ndarray, " k"]:
@@ -260,18 +301,42 @@ def _found(bench: Bench, look: Look) -> tuple[Swell, Law]:
     omega, error = _peak(finer, gains([Swell(w, direction) for w in finer]))
     best = Swell(omega, direction)
     heldout, values, loss = tried([best])[0]
-    # slow swell looks nearly alike from ahead and from astern
-    both = (direction, direction + np.pi)
-    seas = [Swell(share * omega, way, True) for share in _ABOUT for way in both]
-    for sea, told in zip(seas, tried(seas), strict=True):
-        if told[0].sum() > heldout.sum():
-            best, (heldout, values, loss), error = sea, told, 0.05 * sea.frequency
+    for alike in _others(omega, direction):
+        for other, told in zip(alike, tried(alike), strict=True):
+            if told[0].sum() > heldout.sum():
+                best, (heldout, values, loss) = other, told
+    if best.sea:
+        error = 0.05 * best.frequency
+    v, a = best.water(bench, screen.kept)
+    columns = list(range(1, v.shape[2] + 1))
+
+    def fit(G: np.ndarray) -> tuple[Told, np.ndarray]:
+        told = run_constants(G, columns, best.spread, screen.fold)
+        return told, told[1]["std"] / best.spread[0] * best.spread
+
+    heldout, values, loss = _refined(screen, v, a, fit)[1]
     speed, spread = _size(values["std"], loss, best.spread[0] / _FIRST)
+    size = float(np.sqrt(2)) / best.frequency
     turned = float(np.angle(np.exp(1j * best.direction)))
-    numbers = {"speed": speed, "frequency": best.frequency, "direction": turned}
-    errors = {"speed": spread, "frequency": error, "direction": unsure}
+    values = (size * speed, best.frequency, turned), (size * spread, error, unsure)
+    numbers, errors = (
+        dict(zip(("amplitude", "frequency", "direction"), v, strict=True)) for v in values
+    )
     share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
     return best, Law("waves", "W", numbers, heldout * share, errors=errors)
+
+
+def _others(omega: float, direction: float) -> list[list[Swell]]:
+    """What else is tried about the best single frequency: flat waves, seas and flat seas.
+
+    Flat slow swell looks nearly alike from ahead and from astern.
+    """
+    both = (direction, direction + np.pi)
+    return [
+        [Swell(omega, way, flat=True) for way in both],
+        [Swell(share * omega, direction, sea=True) for share in _ABOUT],
+        [Swell(share * omega, way, True, True) for share in _ABOUT for way in both],
+    ]
 
 
 def _size(std: float, loss: Callable[[np.ndarray], np.ndarray], part: float) -> tuple[float, float]:

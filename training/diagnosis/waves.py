@@ -115,14 +115,19 @@ def _refined(
 
     `fit` gives what is told by products, and the standard deviations that it finds.
     """
-    likely, still = np.zeros((v.shape[3], v.shape[2])), _squares(screen.z[0])
-    for _ in range(_ROUNDS):
+    still = _squares(screen.z[0])
+
+    def about(likely: np.ndarray) -> tuple[np.ndarray, Told, np.ndarray]:
         z, J = _about(screen, v, a, likely)
         G = _products(z, J)
         (gain, values, loss), spread = fit(G)
-        gain = gain + (still - _squares(z)) / 2
-        likely = _most_likely(G, spread)
-    return G, (gain, values, loss)
+        told = gain + (still - _squares(z)) / 2, values, loss
+        return G, told, _most_likely(G, spread)
+
+    G, told, likely = about(np.zeros((v.shape[3], v.shape[2])))
+    for _ in range(_ROUNDS - 1):
+        G, told, likely = about(likely)
+    return G, told
 
 
 def _squares(z: np.ndarray) -> Float[np.ndarray, " R"]:
@@ -318,10 +323,8 @@ def _found(bench: Bench, look: Look) -> tuple[Swell, Law]:
     speed, spread = _size(values["std"], loss, best.spread[0] / _FIRST)
     size = float(np.sqrt(2)) / best.frequency
     turned = float(np.angle(np.exp(1j * best.direction)))
-    values = (size * speed, best.frequency, turned), (size * spread, error, unsure)
-    numbers, errors = (
-        dict(zip(("amplitude", "frequency", "direction"), v, strict=True)) for v in values
-    )
+    numbers = {"amplitude": size * speed, "frequency": best.frequency, "direction": turned}
+    errors = {"amplitude": size * spread, "frequency": error, "direction": unsure}
     share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
     return best, Law("waves", "W", numbers, heldout * share, errors=errors)
 

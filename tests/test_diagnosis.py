@@ -12,6 +12,7 @@ from hidden.draw import draw
 from hidden.scenarios import Plan
 
 from spinndrift.models.effects import KINDS, Extended, Library
+from spinndrift.models.effects.base import AXES
 from spinndrift.models.errors import UserError
 from spinndrift.models.recording import Recording
 from spinndrift.models.recording_csv import read_csv
@@ -591,6 +592,58 @@ def test_axes_that_are_not_driven_and_filled_samples_are_told(tmp_path):
     assert "missing" in problems(_read(tmp_path / "gap", runs))[0][0]
     blows = draw(3, names=("disturbance_impacts",), size=3.0, plan=PLAN)
     assert problems(_read(tmp_path / "blows", blows.logged())) == ([], [])
+
+
+def test_a_small_jump_of_the_clock_is_told_and_a_lost_sample_is_none(tmp_path):
+    """Longer steps among even ones: the vehicle moves on as in one step, or as in all of it."""
+    from hidden.faults import change, clock_jump
+
+    from spinndrift.training.diagnosis.checks import problems
+
+    case = draw(3, "null", plan=PLAN)
+    runs = case.logged()
+    (told,) = problems(_read(tmp_path / "jump", _with_first(runs, clock_jump, 0.12)))[0]
+    assert "time stamps jump by 0.12 s" in told
+    assert "left out: 1 of" in told
+    kept = np.delete(np.arange(runs[0].columns["t"].size), [40, 70, 71])
+    lost = change(runs[0], **{name: x[kept] for name, x in runs[0].columns.items()})
+    assert problems(_read(tmp_path / "lost", [lost, *runs[1:]])) == ([], [])
+
+
+def _with_first(runs, fault, seconds):
+    return [fault(runs[0], np.random.default_rng(0), seconds)[0], *runs[1:]]
+
+
+@pytest.mark.parametrize("channel", ["v", "w", "q"])
+def test_a_velocity_of_the_wrong_sign_is_refused(tmp_path, channel):
+    from spinndrift.training.diagnosis.checks import problems
+
+    recording = recorded(tmp_path, 3, "null")[1]
+    recording.dataset["V_WB_B"][..., "uvwpqr".index(channel)] *= -1
+    with pytest.raises(UserError, match=f"^{channel}: the recorded sign is opposite.*NED/FRD"):
+        problems(recording)
+
+
+def test_commands_that_never_change_name_nothing_that_follows_them(tmp_path):
+    recording = recorded(tmp_path, 3, "null")[1]
+    recording.dataset["thruster_force"][...] = 3.0
+    diagnoser = Diagnoser(recording, VEHICLE)
+    assert diagnoser.faults[0].startswith("thruster_force never changes")
+    assert diagnoser.quiet == list(AXES)
+    names = {name for name, _ in diagnoser._names(diagnoser.bench, [], 0.0, 1.0).names}
+    assert not names & {"thruster_lag", "quadratic_drag", "proximity", "payload"}
+    assert names >= {"net_buoyancy", "current_steady", "dvl_scale"}
+
+
+def test_too_little_data_and_pulses_as_forces_are_refused(tmp_path):
+    recording = recorded(tmp_path, 3, "null")[1]
+    short = recording.dataset.isel(time=slice(0, 4))
+    with pytest.raises(UserError, match="too little for a diagnosis"):
+        Diagnoser(Recording(short), VEHICLE)
+    pulses = recording.dataset.copy(deep=True)
+    pulses["thruster_force"][...] = 1500.0 + 8 * pulses["thruster_force"]
+    with pytest.raises(UserError, match="times what one of bluerov2_heavy gives: give newtons"):
+        Diagnoser(Recording(pulses), VEHICLE)
 
 
 def test_times_below_those_of_sparse_commands_are_no_cause(tmp_path):

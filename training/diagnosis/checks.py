@@ -1,8 +1,13 @@
 """Data at fault, and what data can't tell, found before anything is explained by physics."""
 
+from collections.abc import Iterator
+
 import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from ...models.effects.base import AXES
+from ...models.errors import UserError
 from ...models.kinematics import spikes
 from ...models.recording import Recording
 from ...models.recording_schema import UNEVEN
@@ -13,6 +18,10 @@ _FILLED = 3  # samples on a straight line
 _HELD = 0.25
 """Share of the samples that repeat the one before where an instrument is slower than the rows."""
 _INSTRUMENTS = {"x,y,z": slice(4, 7), "u,v,w": slice(7, 10), "p,q,r": slice(10, 13)}
+_NAMED = 3
+"""Runs that are named."""
+_EVEN_SHARE, _SURE = 0.9, 5.0
+"""Share of even steps among which a longer one is odd; noises of a step that are no noise."""
 _STILL = 0.02
 """Share of the strongest axis' command below which an axis counts as not driven."""
 _CHANNELS = {
@@ -22,40 +31,54 @@ _CHANNELS = {
 
 
 def problems(recording: Recording) -> tuple[list[str], list[int]]:
-    """Sensors that stand still, jumps of the pose, outliers, stretches without samples.
+    """Sensors that stand still, jumps of pose and clock, outliers, stretches without samples.
 
     One sentence each, and the runs (by number, scenario by scenario) that have them. A channel is
     stuck where it repeats one value exactly for longer than half a second while others change; it
     is no fault if it does so in every run and is part of the pose (a vehicle held in place).
-    Samples on a straight line in all velocities were filled in: a gap or a jump of the clock. An
+    Samples on a straight line in all velocities were filled in: a gap or a jump of the clock. A
+    clock jumps in a step that is longer than others, though the vehicle moves as in one of them. An
     outlier is a single velocity far from both its neighbours, which agree: no blow is that short.
     Where a quarter of the samples repeat those before, an instrument is slower than the rows.
+
+    Raises:
+        UserError: a velocity has the sign opposite to the motion of the pose.
     """
     stuck: dict[str, list[int]] = {}
     jumps: list[int] = []
+    clock: list[int] = []
     spiked: list[int] = []
     filled: list[int] = []
     held: dict[str, list[float]] = {name: [] for name in _INSTRUMENTS}
-    longest, count = 0.0, 0
+    agreeing = np.zeros((3, 6))
+    longest, late, names = 0.0, 0.0, []
     for number, run in enumerate(recording.trajectories()):
-        count += 1
+        names.append(run.scenario)
         for name, values in (("X_WB", run.X_WB), ("V_WB_B", run.V_WB_B)):
             for label, column in zip(_CHANNELS[name], values.T, strict=True):
                 still = _longest(np.diff(column) == 0) * recording.dt
                 if still > _STUCK and np.isfinite(column).all():
-                    stuck.setdefault(f"{name}.{label}", []).append(number)
+                    stuck.setdefault(label, []).append(number)
         state = np.concatenate([run.X_WB, run.V_WB_B], axis=1)
         for name, columns in _INSTRUMENTS.items():
             same = (np.diff(state[:, columns], axis=0) == 0).all(axis=1)
             held[name].append(float((same & run.V_WB_B[1:].any(axis=1)).mean()))
-        moved = np.linalg.norm(np.diff(run.X_WB[:, 4:], axis=0), axis=1)
         elapsed = run.sensors.get(UNEVEN)
-        step = recording.dt if elapsed is None else np.diff(elapsed)
-        speed = np.linalg.norm(run.V_WB_B[:-1, :3], axis=1) * step
-        excess = np.abs(moved - speed)
+        step = np.full(len(state) - 1, recording.dt) if elapsed is None else np.diff(elapsed)
+        moved = motion(run.X_WB)
+        expected = (run.V_WB_B[1:] + run.V_WB_B[:-1]) / 2
+        both = np.isfinite(moved + expected)
+        per = np.where(both, moved, 0.0) / step[:, None]
+        of = np.where(both, expected, 0.0)
+        agreeing += np.array([(per * of).sum(axis=0), (of**2).sum(axis=0), (per**2).sum(axis=0)])
+        distance = np.linalg.norm(moved[:, :3], axis=1)
+        excess = np.abs(distance - np.linalg.norm(run.V_WB_B[:-1, :3], axis=1) * step)
         excess = excess[np.isfinite(excess)]
         if excess.size and np.any(excess > 30 * np.median(excess) + 0.1):
             jumps.append(number)
+        elif too_long := clock_jump(moved, expected, step):
+            clock.append(number)
+            late = max(late, too_long)
         if spikes(run.V_WB_B.T).any():
             spiked.append(number)
         bend = np.abs(np.diff(run.V_WB_B, 2, axis=0)).max(axis=1, initial=0.0)
@@ -63,9 +86,23 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
         if line >= _FILLED:
             filled.append(number)
             longest = max(longest, (line + 1) * recording.dt)
-    stuck = {c: r for c, r in stuck.items() if len(r) < count or c.startswith("V")}
+    _refuse_signs(agreeing, sum(recording.lengths.ravel()))
+    twist = _CHANNELS["V_WB_B"]
+    stuck = {c: r for c, r in stuck.items() if len(r) < len(names) or c in twist}
+
+    def which(runs: list[int]) -> str:
+        """Their scenarios, with the repetition where there are several."""
+        told = []
+        for number in runs[:_NAMED]:
+            first = names.index(names[number])
+            several = names.count(names[number]) > 1
+            told.append(names[number] + (f" (run {number - first + 1})" if several else ""))
+        more = f" and {len(runs) - _NAMED} more" if len(runs) > _NAMED else ""
+        return f"{', '.join(told)}{more}"
+
     found = [
-        f"{channel} repeats one value for {_STUCK:g} s or more in {len(runs)} runs: stuck?"
+        f"{channel} repeats one value for {_STUCK:g} s or more in {which(runs)}: stuck? Give the "
+        "column without it, or leave the run out"
         for channel, runs in stuck.items()
     ]
     found += [
@@ -75,23 +112,87 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
         if np.median(shares) > _HELD and not any(c in channel for channel in stuck for c in name)
     ]
     if jumps:
-        found.append(f"the position jumps by far more than the velocity says in {len(jumps)} runs")
+        found.append(f"the position jumps by far more than the velocity says in {which(jumps)}")
+    if clock:
+        found.append(
+            f"time stamps jump by {late:.2g} s in {which(clock)}, while the vehicle moves on as in "
+            "one step: a jump of the clock; mend the column t"
+        )
     if filled:
         found.append(
             f"samples were filled in on a straight line, for up to {longest:.2g} s, in "
-            f"{len(filled)} runs: lost samples or a jump of the clock"
+            f"{which(filled)}: lost samples or a jump of the clock"
         )
     if spiked:
         found.append(
-            f"single velocities lie far from both their neighbours in {len(spiked)} runs: outliers"
+            f"single velocities lie far from both their neighbours in {which(spiked)}: outliers"
         )
     found += [
         f"samples are missing, or the clock jumped: {note}"
         for note in recording.notes
         if "cut at" in note
     ]
-    bad = {*jumps, *filled, *spiked, *(n for runs in stuck.values() for n in runs)}
-    return found, sorted(bad)
+    bad = sorted({*jumps, *clock, *filled, *spiked, *(n for runs in stuck.values() for n in runs)})
+    if bad and len(bad) < len(names):
+        found[0] += f" (left out: {len(bad)} of {len(names)} runs)"
+    if not any(_changes(recording)):
+        found.append(
+            f"{recording.commands[0]} never changes: what follows the commands can't be told; "
+            "check that the outputs of the runs were logged"
+        )
+    return found, bad
+
+
+def _changes(recording: Recording) -> Iterator[bool]:
+    """Whether commands change: within each run, and between them."""
+    before = None
+    for run in recording.trajectories():
+        command = run.commands[recording.commands[0]][:-1]
+        yield bool(np.any(command != command[0] if before is None else command != before))
+        before = command[0]
+
+
+def motion(X_WB: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "M 6"]:
+    """Displacement and rotation vector from sample to sample, in the B in between."""
+    turns = Rotation.from_quat(np.nan_to_num(X_WB[:, [1, 2, 3, 0]], nan=1.0))
+    turn = (turns[:-1].inv() * turns[1:]).as_rotvec()
+    middle = turns[:-1] * Rotation.from_rotvec(turn / 2)
+    turn[~np.isfinite(np.diff(X_WB[:, :4], axis=0)).all(axis=1)] = np.nan
+    moved = np.diff(X_WB[:, 4:], axis=0)
+    return np.concatenate([middle.inv().apply(moved), turn], axis=1)
+
+
+def clock_jump(
+    moved: Float[np.ndarray, "M 6"], V: Float[np.ndarray, "M 6"], step: Float[np.ndarray, " M"]
+) -> float:
+    """By how much (s) the longest step, among even ones, is too long for what moved in it; or 0."""
+    usual = float(np.median(step))
+    even = np.abs(step - usual) < 0.1 * usual
+    if even.mean() < _EVEN_SHARE:
+        return 0.0
+    longest = 0.0
+    for part in (slice(0, 3), slice(3, 6)):
+        off = np.linalg.norm(moved[:, part] - V[:, part] * step[:, None], axis=1)
+        as_usual = np.linalg.norm(moved[:, part] - V[:, part] * usual, axis=1)
+        noise = np.nanmedian(off[even])
+        jumped = (step > 1.5 * usual) & (off > _SURE * noise) & (as_usual < off / 2)
+        longest = max(longest, float(step[jumped].max(initial=usual)) - usual)
+    return longest
+
+
+def _refuse_signs(agreeing: Float[np.ndarray, "3 6"], samples: int) -> None:
+    """`agreeing`: sums of motion times velocity, and of the squares of both."""
+    product, square, moved = agreeing
+    slope = product / np.maximum(square, 1e-12)
+    left = np.maximum(moved - slope * product, 0.0) / max(samples, 1)
+    error = np.sqrt(left / np.maximum(square, 1e-12))
+    turned = [c for c, s, e in zip("uvwpqr", slope, error, strict=True) if s < -max(0.5, 5 * e)]
+    if turned:
+        raise UserError(
+            f"{', '.join(turned)}: the recorded sign is opposite to the motion of the pose. B is x "
+            "forward, y left, z up, rates are right-handed about these axes, W is z up: turn the "
+            "sign of the column, or state the frames of the files (frames: NED/FRD)"
+        )
 
 
 def _longest(holds: np.ndarray) -> int:
@@ -111,6 +212,8 @@ def unexcited(data: Data, wrench_of: np.ndarray) -> list[str]:
     `wrench_of` (6, n) is the wrench of unit thruster forces.
     """
     w = data.weight[:, None]
+    if not np.any((data.u != data.u[:1, :, :1]) & (w > 0)):
+        return list(AXES)
     F = np.einsum("ij,njr->nir", wrench_of, data.u)
     rms = np.sqrt((F**2 * w).sum(axis=(0, 2)) / data.weight.sum())
     scale = np.repeat([rms[:3].max(), rms[3:].max()], 3)

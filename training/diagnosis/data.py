@@ -19,6 +19,10 @@ _BLOCKS, _LEAST = 8, 16
 """Pieces that a single run is cut into at least, and samples of a piece at least."""
 REMEMBERED, _OF_A_RUN = 0.5, 0.1
 """Time (s) before a piece whose commands its actuators may remember; share of a run at most."""
+_LEAST_ROWS, _LEAST_SECONDS = 60, 5.0
+"""Data below which nothing is told."""
+_BEYOND = 8.0
+"""Times a thruster's largest force that no command asks for."""
 _MOST_FOLDS = 10
 _FEW_RUNS = 6
 _EVEN = 1e-6
@@ -199,8 +203,13 @@ def make_data(
             sizes.append(b - a)
             scenario.append(j)
             run.append(number)
-    if not sizes:
-        raise UserError("recording: no run is long enough for a diagnosis")
+    if sum(sizes) < _LEAST_ROWS or sum(sizes) * recording.dt < _LEAST_SECONDS:
+        raise UserError(
+            f"recording: runs that are long enough have {sum(sizes)} samples, "
+            f"{sum(sizes) * recording.dt:.2g} s in all: too little for a diagnosis. Give runs of "
+            f"some seconds, at least {_LEAST_SECONDS:g} s and {_LEAST_ROWS} samples together"
+        )
+    _refuse_units(recording, vehicle, thrust)
     N = int(max(sizes))
     weight = (np.arange(N)[:, None] < np.array(sizes)).astype(float)
     step = _stack(pieces["step"], N)
@@ -222,6 +231,21 @@ def make_data(
         has_voltage=has_voltage,
         unmeasured=unmeasured,
     )
+
+
+def _refuse_units(
+    recording: Recording, vehicle: Vehicle, thrust: Float[np.ndarray, "S K N n"]
+) -> None:
+    """Forces far beyond what the thrusters give are no newtons."""
+    most = np.maximum(*(np.abs(np.asarray(f)) for f in vehicle.thrusters().force_limits()))
+    share = np.nanmax(np.abs(thrust), axis=(0, 1, 2)) / most
+    k = int(np.argmax(share))
+    if share[k] > _BEYOND:
+        raise UserError(
+            f"{recording.thrust_from} asks thruster {k + 1} for {share[k] * most[k]:.4g} N, "
+            f"{share[k]:.0f} times what one of {vehicle.name} gives: give newtons (pulses in µs "
+            "belong into columns pwm1, pwm2 …), or the --vehicle"
+        )
 
 
 def _stack(parts: list[np.ndarray], length: int) -> np.ndarray:

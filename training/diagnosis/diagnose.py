@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ...models.checks import check_numbers, require
 from ...models.dynamics import Dynamics
-from ...models.effects.base import Effect
+from ...models.effects.base import AXES, Effect
 from ...models.effects.extended import Extended
 from ...models.effects.library import Library
 from ...models.effects.thrust import AxisThrust
@@ -185,6 +185,8 @@ class Diagnoser:
         )
         residual = telling.residual(bench, final)
         left = telling.left_over(residual, causes, bench, final, least)
+        if len(self.quiet) == len(AXES):
+            left.insert(0, "commands never change, so what follows them can't be told")
         d = bench.data
         diagnosis = result.Diagnosis(
             version=result.VERSION,
@@ -283,7 +285,7 @@ class Diagnoser:
         for number in range(_MOST_UNKNOWN):
             self.progress(0.52 + 0.1 * number, "structure without a name")
             seen = seek(bench, nuisance, found, config.alpha, self.rng, self.quiet)
-            taken = {h[1] for h in found.hypotheses if h[0] == "unknown"}
+            taken = {e.places[0] for e in bench.library.effects if e.name == "unknown"}
             if seen is None or seen.matched.group.effect.acts_on in taken:
                 if number == 0 and not found.accepted:
                     bench = search.run(found).bench
@@ -373,9 +375,11 @@ def _diagnose(
     config: DiagnoseConfig,
     progress: Progress,
 ) -> Finding:
-    found = Diagnoser(recording, vehicle, base, config, progress).run()
+    diagnoser = Diagnoser(recording, vehicle, base, config, progress)
+    found = diagnoser.run()
     first = found.diagnosis
-    if config.refit != "auto" or not coefficients_are_off(first):
+    driven = len(diagnoser.quiet) < len(AXES)
+    if config.refit != "auto" or not driven or not coefficients_are_off(first):
         return found
     progress(0.0, "again with all coefficients fitted, for most are off")
     again = Diagnoser(recording, vehicle, base, replace(config, refit="all"), progress).run()

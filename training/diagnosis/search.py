@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
+from ...models.effects.base import AXES
 from ...models.effects.library import kind
 from .beside import Beside
 from .disturbance import SLOW, laws_of, won_by
@@ -32,6 +33,8 @@ BELIEFS = ("added_mass", "linear_drag", "quadratic_drag", "net_buoyancy")
 UNSCALED = ("axis_thrust", "linear_drag", "quadratic_drag", "net_buoyancy")
 """Those that a command of unknown scale leaves, with the inertia as it is believed."""
 REFITS = {"none": (), "scales": ("thrust_scale",), "linear": BELIEFS, "command": UNSCALED}
+_HANGING = ("net_buoyancy", "centre_of_gravity")
+"""What a vehicle shows that is left alone."""
 _TIMES = ("thruster_lag", "actuation_delay", "clock_offset")
 _CLOSE = 0.7
 _TAKEN_BACK = 2
@@ -94,6 +97,14 @@ def refitted(bench: Bench, refit: str) -> list[int]:
     return [i for i, e in entries if e.cause in REFITS[refit] and e.where != "centre_of_buoyancy"]
 
 
+def _asks_for_commands(named: Hypothesis, quiet: Sequence[str]) -> bool:
+    """Whether a cause can't be told because axes were not driven: its own, or all of them."""
+    name, where = named
+    if len(quiet) == len(AXES):
+        return kind(name).family in ("actuation", "body") and name not in _HANGING
+    return where in quiet and kind(name).family == "body"
+
+
 class Search:
     """Forward selection on a bench; `rng` draws what noise alone can win."""
 
@@ -115,7 +126,7 @@ class Search:
         self.names = [
             h
             for h in bench.library.hypotheses(single=False)
-            if h[0] not in free and not (h[1] in quiet and kind(h[0]).family == "body")
+            if h[0] not in free and not _asks_for_commands(h, quiet)
         ]
         self.shortest = shortest
         self._asked: tuple[Look, tuple[Choice | None, dict[Hypothesis, Fit]]] | None = None

@@ -282,9 +282,10 @@ def sentence(
     left: Sequence[str] = (),
 ) -> str:
     """The finding in a line or two; `refitted` if coefficients were fitted first."""
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    first = f"The data have faults: {problems[0]}{more}. " if problems else ""
     if not causes and left:
-        return f"No name explains the data: {left[0]}."
-    first = f"The data have faults ({len(problems)}), see there first. " if problems else ""
+        return first + f"No name explains the data: {left[0]}."
     if not causes and refitted:
         return first + "With its coefficients refitted, your model is adequate at this noise."
     if not causes:

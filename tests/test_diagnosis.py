@@ -597,21 +597,24 @@ def test_axes_that_are_not_driven_and_filled_samples_are_told(tmp_path):
 def test_a_small_jump_of_the_clock_is_told_and_a_lost_sample_is_none(tmp_path):
     """Longer steps among even ones: the vehicle moves on as in one step, or as in all of it."""
     from hidden.faults import change, clock_jump
+    from hidden.write import write_folder
 
     from spinndrift.training.diagnosis.checks import problems
 
-    case = draw(3, "null", plan=PLAN)
-    runs = case.logged()
-    (told,) = problems(_read(tmp_path / "jump", _with_first(runs, clock_jump, 0.12)))[0]
+    runs = draw(3, "null", plan=PLAN).logged()
+    moving = runs[2]
+    jumped = clock_jump(moving, np.random.default_rng(0), 0.12)[0]
+
+    def read(name, run):
+        write_folder(tmp_path / name, [*runs[:2], run, *runs[3:]])
+        return read_csv(tmp_path / name, resample=False)
+
+    (told,), faulty = problems(read("jump", jumped))
     assert "time stamps jump by 0.12 s" in told
-    assert "left out: 1 of" in told
-    kept = np.delete(np.arange(runs[0].columns["t"].size), [40, 70, 71])
-    lost = change(runs[0], **{name: x[kept] for name, x in runs[0].columns.items()})
-    assert problems(_read(tmp_path / "lost", [lost, *runs[1:]])) == ([], [])
-
-
-def _with_first(runs, fault, seconds):
-    return [fault(runs[0], np.random.default_rng(0), seconds)[0], *runs[1:]]
+    assert faulty == [2]
+    kept = np.delete(np.arange(moving.columns["t"].size), [40, 70, 71])
+    lost = change(moving, **{name: x[kept] for name, x in moving.columns.items()})
+    assert problems(read("lost", lost)) == ([], [])
 
 
 @pytest.mark.parametrize("channel", ["v", "w", "q"])

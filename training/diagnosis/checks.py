@@ -86,7 +86,7 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
         if line >= _FILLED:
             filled.append(number)
             longest = max(longest, (line + 1) * recording.dt)
-    _refuse_signs(agreeing, sum(recording.lengths.ravel()))
+    _refuse_signs(agreeing, int(recording.lengths.sum()))
     twist = _CHANNELS["V_WB_B"]
     stuck = {c: r for c, r in stuck.items() if len(r) < len(names) or c in twist}
 

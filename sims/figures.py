@@ -18,6 +18,9 @@ OBSTACLE, GOAL, LIMIT, WATER = "#8b96a1", "#2e8b57", "#b0413e", "#3d8fc4"
 INK, QUIET, GRID = "#1c2733", "#5b6b7a", "#e6ebef"
 AXES = ("#c4473a", "#3b8a4a", "#2f6fb5")  # x, y, z
 WIDTH = 9.6  # in: the width of a page's text
+_SPAN, _LONG = 5.0, 300.0
+"""Ratio of values from which on a logarithmic axis has two of 1, 2 and 5 on it, and ratio of its
+ends from which on these would be too many."""
 
 _STYLE = {
     "axes.axisbelow": True,
@@ -106,6 +109,21 @@ def common_legend(figure: Figure, axes: Axes) -> None:
 
 
 def plain_logs(axes: Axes) -> None:
-    """Numbers of a logarithmic axis as they are: 0.5, 2, 30."""
+    """Numbers of a logarithmic axis as they are: 0.5, 2, 30; powers of ten alone if it is long."""
+
+    def between(x: float, _: object) -> str:
+        low, high = axes.get_ylim()
+        return f"{x:g}" if f"{x:e}"[0] in "25" and high < _LONG * low else ""
+
     axes.yaxis.set_major_formatter(lambda x, _: f"{x:g}")
-    axes.yaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
+    axes.yaxis.set_minor_formatter(between)
+
+
+def scaled(ax: Axes, values: np.ndarray, bars: bool = False) -> None:
+    """A vertical axis with at least two numbers on it: logarithmic where values span much."""
+    finite = values[np.isfinite(values) & (values > 0)]
+    if len(finite) and finite.max() > _SPAN * finite.min():
+        ax.set_yscale("log")
+        plain_logs(ax)
+    elif bars:
+        ax.set_ylim(bottom=0)

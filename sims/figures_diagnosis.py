@@ -1,18 +1,22 @@
 """Figures of a diagnosis: what is wrong, which name explains it, what naming it wins."""
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
-from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..training.diagnosis.diagnose import Finding
-from ..training.diagnosis.looking import Look
 from ..training.diagnosis.result import Diagnosis
-from .figures import FLOWN, INK, PLANNED, QUIET, legend, panels, styled
+from .figures import FLOWN, INK, PLANNED, QUIET, common_legend, legend, panels, scaled, styled
+from .figures_maps import TWIST, run_times
 
-_TWIST = ("surge", "sway", "heave", "roll", "pitch", "yaw")
-_BINS = 12
+CONTENDERS = {
+    "base": "belief", "refitted": "refitted", "extended": "with the causes",
+    "black_box": "black box",
+}  # fmt: skip
+"""Models that are judged, as the page calls them."""
+_FAR, _APART, _ROOM = 2.5, 10.0, 1.15
+"""Times the larger error of belief and causes that a panel shows of other models, times the smaller
+that it shows of the larger, and room above."""
 
 
 @styled
@@ -40,7 +44,7 @@ def residual_figure(finding: Finding) -> Figure:
     figure, axes = panels(1, 2, 2.9)
     x = np.arange(12)
     labels = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
-    w = finding.data.weight
+    w, variances = finding.data.weight, []
     for k, (look, name, color) in enumerate(
         ((finding.base, "belief", PLANNED), (finding.final, "with the causes", FLOWN))
     ):
@@ -49,6 +53,8 @@ def residual_figure(finding: Finding) -> Figure:
         memory = (z[1:] * z[:-1]).sum(axis=(0, 2)) / np.maximum((z**2).sum(axis=(0, 2)), 1e-300)
         for ax, values in zip(axes[0], (variance, memory), strict=True):
             ax.bar(x + 0.38 * (k - 0.5), values * finding.data.told, 0.36, color=color, label=name)
+        variances.append(variance * finding.data.told)
+    scaled(axes[0, 0], np.array(variances), bars=True)
     axes[0, 0].axhline(1, color=INK, lw=1, ls="--")
     axes[0, 0].set_title("Variance against the noise's (1)")
     axes[0, 1].set_title("Correlation at one step (0)")
@@ -56,86 +62,6 @@ def residual_figure(finding: Finding) -> Figure:
         ax.set_xticks(x, labels, rotation=45)
     legend(axes[0, 1])
     return figure
-
-
-def variables(finding: Finding) -> dict[str, Float[np.ndarray, "N R"]]:
-    """What errors may depend on: states, commands, voltage, time, where each step begins."""
-    d = finding.data
-    qw, qx, qy, qz = (d.X[:-1, i] for i in range(4))
-    found = {n: d.V[:-1, i] for i, n in enumerate(("u", "v", "w", "p", "q", "r"))}
-    found["heading"] = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2))
-    found |= {"east": d.X[:-1, 4], "north": d.X[:-1, 5], "height": d.X[:-1, 6]}
-    found["voltage"] = d.voltage
-    found["effort"] = np.abs(d.u).sum(axis=1)
-    found["time"] = d.times[:-1]
-    return found
-
-
-def error_map(
-    z: Float[np.ndarray, "n a"], variables: Mapping[str, Float[np.ndarray, " n"]], most: int = _BINS
-) -> Float[np.ndarray, "a k"]:
-    """Nats by axis and variable: ½ Σ n m² of means m in bins of equal counts, less the bins.
-
-    White errors of unit variance give about zero; what depends on a variable gives much.
-    """
-    found = np.zeros((z.shape[1], len(variables)))
-    for k, values in enumerate(variables.values()):
-        edges = np.unique(np.quantile(values, np.linspace(0, 1, most + 1)))
-        if len(edges) < 3:
-            continue
-        bins = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
-        counts = np.bincount(bins, minlength=len(edges) - 1)
-        for i in range(z.shape[1]):
-            sums = np.bincount(bins, weights=z[:, i], minlength=len(counts))
-            nats = (sums**2 / np.maximum(counts, 1)).sum() / 2 - len(counts) / 2
-            found[i, k] = max(float(nats), 0.0)
-    return found
-
-
-def draw_map(
-    maps: Sequence[Float[np.ndarray, "a k"]],
-    titles: Sequence[str],
-    variables: Sequence[str],
-    axes_of: Sequence[str],
-) -> Figure:
-    """Maps of nats side by side, on one scale."""
-    height = 1.2 + 0.32 * len(axes_of)
-    figure, axes = panels(1, len(maps), height, sharey=True)
-    top = max(10.0, float(np.max(maps)))
-    images = []
-    for ax, values, title in zip(axes[0], maps, titles, strict=True):
-        image = ax.imshow(np.log10(1 + values), vmin=0, vmax=np.log10(1 + top), cmap="PuBu")
-        images.append(image)
-        ax.set_aspect("auto")
-        ax.set_xticks(range(len(variables)), list(variables), rotation=60)
-        ax.set_yticks(range(len(axes_of)), axes_of)
-        ax.grid(visible=False)
-        ax.set_title(title)
-    bar = figure.colorbar(images[0], ax=axes[0].tolist(), shrink=0.9)
-    ticks = [t for t in range(8) if t <= np.log10(1 + top)]
-    bar.set_ticks(ticks, labels=[f"{10**t:g}" for t in ticks])
-    bar.set_label("nats")
-    return figure
-
-
-def innovations_of(finding: Finding, look: Look) -> Float[np.ndarray, "n 6"]:
-    """Whitened innovations of the twist at all steps that exist."""
-    return look.z[:, 6:].swapaxes(1, 2)[finding.data.weight > 0].astype(float)
-
-
-def where_they_are(finding: Finding) -> dict[str, Float[np.ndarray, " n"]]:
-    """What innovations may depend on, at all steps that exist."""
-    exists = finding.data.weight > 0
-    return {name: values[exists] for name, values in variables(finding).items()}
-
-
-@styled
-def map_figure(finding: Finding) -> Figure:
-    """Where the error lives: axis against state and input, belief and explained."""
-    known = where_they_are(finding)
-    looks = (finding.base, finding.final)
-    maps = [error_map(innovations_of(finding, look), known) for look in looks]
-    return draw_map(maps, ("Belief", "With the causes"), list(known), _TWIST)
 
 
 @styled
@@ -161,24 +87,55 @@ def experiments_figure(diagnosis: Diagnosis) -> Figure | None:
 
 @styled
 def horizon_figure(diagnosis: Diagnosis) -> Figure:
-    """Errors and scores of simulations against their horizon, on data left out, with 95 %."""
-    figure, axes = panels(1, 4, 2.7)
+    """Errors and scores of simulations against their horizon, on data left out, with 95 %.
+
+    Of models whose errors are far beyond the others' the largest stands at the top, as a number.
+    """
+    figure, axes = panels(1, 4, 2.9)
     titles = ("position / m", "rotation / rad", "velocity / (m/s)", "energy score")
     colors = {"base": PLANNED, "refitted": QUIET, "black_box": INK, "extended": FLOWN}
-    for name, gain in diagnosis.gain.items():
-        tables = (gain.position_rmse, gain.rotation_rmse, gain.velocity_rmse, gain.energy_score)
-        style = {"base": "o-", "extended": "o-", "refitted": "s--", "black_box": "^:"}[name]
-        for ax, table, title in zip(axes[0], tables, titles, strict=True):
+    lines = {"base": "o-", "extended": "o-", "refitted": "s--", "black_box": "^:"}
+    for number, (ax, title) in enumerate(zip(axes[0], titles, strict=True)):
+        errors = {}
+        for name, g in diagnosis.gain.items():
+            tables = (g.position_rmse, g.rotation_rmse, g.velocity_rmse, g.energy_score)
+            table = tables[number]
             h = [float(k) for k in table]
-            value = [v.value for v in table.values()]
+            errors[name] = np.array([v.value for v in table.values()])
             low, high = np.array([v.interval95 for v in table.values()]).T
             ax.fill_between(h, low, high, color=colors[name], alpha=0.13, lw=0)
-            ax.plot(h, value, style, ms=3.5, color=colors[name], label=name.replace("_", " "))
-            ax.set_title(title)
-            ax.set_xlabel("horizon / s")
-            ax.set_ylim(bottom=0)
-    axes[0, 3].legend(loc="upper left", fontsize=7, frameon=False)
+            ax.plot(
+                h, errors[name], lines[name], ms=3.5, color=colors[name], label=CONTENDERS[name]
+            )
+        top = panel_top(errors)
+        ax.set_ylim(0, top)
+        ax.set_title(title)
+        ax.set_xlabel("horizon / s")
+        beyond = [n for n, e in errors.items() if not np.all(e <= top)]
+        for row, name in enumerate(beyond):
+            _note_beyond(ax, errors[name], row, CONTENDERS[name], colors[name])
+    common_legend(figure, axes[0, 3])
     return figure
+
+
+def panel_top(errors: dict[str, np.ndarray]) -> float:
+    """How high a panel reaches: to belief and causes, and to others unless they are far beyond."""
+    largest = {n: float(np.max(np.where(np.isnan(e), np.inf, e))) for n, e in errors.items()}
+    own = [e for n, e in largest.items() if n in ("base", "extended") and np.isfinite(e)]
+    own = own or [e for e in largest.values() if np.isfinite(e)] or [1.0]
+    bar = max(min(max(own), _APART * min(own)), 1e-12)
+    return _ROOM * max(e for e in (bar, *largest.values()) if e <= _FAR * bar)
+
+
+def _note_beyond(ax: Axes, errors: np.ndarray, row: int, name: str, color: str) -> None:
+    """Say at the top how large errors are that a panel does not show."""
+    finite = errors[np.isfinite(errors)]
+    size = f"{finite.max():.2g}" if len(finite) == len(errors) else "diverged"
+    ax.text(
+        0.98, 0.98 - 0.08 * row, f"↑ {name}: {size}", ha="right", va="top", fontsize=7,
+        color=color, transform=ax.transAxes,
+        bbox={"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 0.5},
+    )  # fmt: skip
 
 
 @styled
@@ -190,7 +147,7 @@ def innovations_figure(finding: Finding) -> Figure:
     worst = int(there[np.argmax([score[d.scenario == s].mean() for s in there])])
     own = d.scenario == worst
     figure, axes = panels(2, 3, 3.9, sharex=True, sharey=True)
-    bins = np.maximum(np.rint(d.times[1:, own] / d.dt).astype(int) - 1, 0)
+    bins = np.maximum(np.rint(run_times(d)[1:, own] / d.dt).astype(int) - 1, 0)
     count = np.bincount(bins.ravel(), d.weight[:, own].ravel())
     t = d.dt * np.arange(1, len(count) + 1)
     for i, ax in enumerate(axes.flat):
@@ -202,13 +159,15 @@ def innovations_figure(finding: Finding) -> Figure:
             total = np.bincount(bins.ravel(), look.z[:, 6 + i][:, own].ravel())
             mean = total / np.sqrt(np.maximum(count, 1))
             ax.plot(t, mean, color=color, lw=0.9, label=name)
-        ax.set_title(_TWIST[i])
+        ax.set_title(TWIST[i])
     for ax in axes[-1]:
         ax.set_xlabel("t / s")
     for ax in axes[:, 0]:
         ax.set_ylabel("standard errors")
+    number = len(np.unique(d.run[own]))
+    runs = f"{number} run{'s' * (number > 1)}"
     figure.suptitle(
-        f"Mean innovation of {int(own.sum())} runs of '{d.names[worst]}'; grey: what noise does",
+        f"Mean innovation of {runs} of '{d.names[worst]}'; grey: what noise does",
         fontsize=9.5, x=0.01, ha="left",
     )  # fmt: skip
     legend(axes[0, 2])

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from ..models import se3
 from ..training.diagnosis.diagnose import Finding
 from ..training.diagnosis.gain import Simulated
-from .figures import FLOWN, GRID, INK, PLANNED, common_legend, legend, panels, plain_logs, styled
-from .figures_diagnosis import draw_map, error_map, variables
+from .figures import FLOWN, GRID, INK, PLANNED, common_legend, legend, panels, scaled, styled
+from .figures_maps import draw_map, error_map, variables
 
 NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
 _UNITS = ("m", "m", "m", "°", "°", "°", "m/s", "m/s", "m/s", "°/s", "°/s", "°/s")
@@ -129,17 +129,20 @@ def axes_figure(finding: Finding) -> Figure:
 
 
 def at_ends(
-    finding: Finding, simulated: Simulated
+    finding: Finding, simulated: Simulated, noise: Simulated | None = None
 ) -> tuple[Float[np.ndarray, "k 12"], dict[str, Float[np.ndarray, " k"]], np.ndarray]:
-    """Errors at the ends of windows in units of the simulated spread, the means over each window of
-    what they may depend on, and the piece of each.
+    """Errors at the ends of windows in units of the simulated spread (of other simulations of the
+    same windows, `noise`, where these are given), the means over each window of what they may
+    depend on, and the piece of each.
     """
     every, data = simulated.every, finding.data
     e = simulated.errors.astype(float)
     ends = np.arange(every - 1, len(e), every)
     exists = data.weight[ends][:, simulated.pieces] > 0
     own = _bounded(e[ends].transpose(0, 3, 1, 2)[exists])
-    spread = own[:, :, 1:].std(axis=2)
+    other = simulated if noise is None else noise
+    drawn = _bounded(other.errors[ends].astype(float).transpose(0, 3, 1, 2)[exists])
+    spread = drawn[:, :, 1:].std(axis=2)
     means = {}
     for name, values in variables(finding).items():
         windows = np.stack([values[n + 1 - every : n + 1, simulated.pieces].mean(0) for n in ends])
@@ -151,9 +154,9 @@ def at_ends(
 @styled
 def simulated_map_figure(finding: Finding) -> Figure:
     """What the errors at the ends of simulations depend on, axis by axis."""
-    maps, names = [], []
+    maps, names, last = [], [], contenders(finding)[-1][0]
     for simulated, name, _ in contenders(finding):
-        z, means, _ = at_ends(finding, simulated)
+        z, means, _ = at_ends(finding, simulated, last)
         bins = max(2, min(8, len(z) // 12))
         maps.append(error_map(z, means, bins))
         names.append(name[0].upper() + name[1:])
@@ -171,8 +174,9 @@ def runs_figure(finding: Finding) -> Figure:
         count = np.maximum(data.weight.sum(axis=0) * data.told.sum(), 1)
         one = np.sqrt((look.z.astype(float) ** 2).sum(axis=(0, 1)) / count)
         _dots(axes[0, 0], np.arange(len(order)), one[order], name, color)
+    last = contenders(finding)[-1][0]
     for simulated, name, color in contenders(finding):
-        z, _, piece = at_ends(finding, simulated)
+        z, _, piece = at_ends(finding, simulated, last)
         square = (z[:, data.told > 0] ** 2).mean(axis=1)
         own = np.unique(piece)
         many = np.sqrt([square[piece == p].mean() for p in own])
@@ -181,8 +185,7 @@ def runs_figure(finding: Finding) -> Figure:
     edges = np.flatnonzero(np.diff(scenario)) + 0.5
     for ax, title in zip(axes[:, 0], ("One-step errors", "Errors of simulations"), strict=True):
         ax.axhline(1, color=INK, lw=1, ls="--")
-        ax.set_yscale("log")
-        plain_logs(ax)
+        scaled(ax, np.concatenate([line.get_ydata() for line in ax.lines]))
         ax.set_title(f"{title} by run; dashed: what noise does")
         for edge in edges:
             ax.axvline(edge, color=GRID, lw=1.0, zorder=0)

@@ -7,11 +7,10 @@ from matplotlib.figure import Figure
 from ..training.diagnosis.data import Data
 from ..training.diagnosis.diagnose import Finding
 from ..training.diagnosis.repeats import shares
-from .figures import INK, QUIET, common_legend, panels, plain_logs, styled
-from .figures_diagnosis import error_map, innovations_of, where_they_are
+from .figures import INK, QUIET, common_legend, panels, plain_logs, scaled, styled
+from .figures_maps import TWIST, error_map, innovations_of, labelled, where_they_are
 from .figures_simulated import MODELS
 
-_TWIST = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 _LONGEST = 2.0
 """Lags (s) of the autocorrelation."""
 _CELLS, _PANELS = 14, 3
@@ -33,12 +32,13 @@ def memory_figure(finding: Finding) -> Figure:
             axes[0, i].plot(d.dt * lags, memory, color=color, label=name)
             f, power = _spectrum(z, d)
             axes[1, i].plot(f, power, color=color)
-    for i, axis in enumerate(_TWIST):
+    for i, axis in enumerate(TWIST):
         axes[0, i].axhspan(-spread, spread, color=QUIET, alpha=0.2, lw=0)
         axes[0, i].set_title(axis)
         axes[0, i].set_xlabel("lag / s")
         axes[1, i].axhline(1, color=INK, lw=1, ls="--")
         axes[1, i].set_yscale("log")
+        plain_logs(axes[1, i])
         axes[1, i].set_xlabel("frequency / Hz")
     axes[0, 0].set_ylabel("autocorrelation")
     axes[1, 0].set_ylabel("power, 1 is noise")
@@ -69,12 +69,11 @@ def repeats_figure(finding: Finding) -> Figure:
         for k, (found, (name, color)) in enumerate(zip(by_model, MODELS.values(), strict=True)):
             ax.bar(x + 0.38 * (k - 0.5), found[number], 0.36, color=color, label=name)
         ax.axhline(1, color=INK, lw=1, ls="--")
-        ax.set_yscale("log")
-        plain_logs(ax)
         ax.set_title(title)
-        ax.set_xticks(x, _TWIST, rotation=30)
+        ax.set_xticks(x, TWIST, rotation=30)
         if np.isnan(by_model[0][number]).all():
             ax.text(0.5, 0.5, "no runs repeat", ha="center", color=QUIET, transform=ax.transAxes)
+    scaled(axes[0, 0], np.array([found[:3] for found in by_model]), bars=True)
     axes[0, 0].set_ylabel("variance, 1 is noise")
     common_legend(figure, axes[0, 2])
     return figure
@@ -83,7 +82,8 @@ def repeats_figure(finding: Finding) -> Figure:
 def most_telling(finding: Finding) -> list[tuple[int, str, str]]:
     """Axes with most structure in the belief's innovations, each with its two telling variables."""
     known = where_they_are(finding)
-    nats = error_map(innovations_of(finding, finding.base), known)
+    known.pop("run")  # no place in state space
+    nats = np.nan_to_num(error_map(innovations_of(finding, finding.base), known))
     names = list(known)
     order = np.argsort(-nats.max(axis=1))[:_PANELS]
     found = []
@@ -111,10 +111,10 @@ def state_space_figure(finding: Finding) -> Figure:
             total = np.histogram2d(known[a], known[b], edges, weights=z)[0]
             mean = np.where(count > 0, total / np.sqrt(np.maximum(count, 1)), np.nan)
             image = ax.pcolormesh(*edges, mean.T, cmap="RdBu_r", vmin=-6, vmax=6, rasterized=True)
-            ax.set_title(f"{_TWIST[i]}, {title}")
-            ax.set_ylabel(b)
+            ax.set_title(f"{TWIST[i]}, {title}")
+            ax.set_ylabel(labelled(b))
             ax.grid(visible=False)
-        axes[-1, column].set_xlabel(a)
+        axes[-1, column].set_xlabel(labelled(a))
     assert image is not None
     bar = figure.colorbar(image, ax=axes.ravel().tolist(), shrink=0.8)
     bar.set_label("mean innovation / standard errors")

@@ -1,8 +1,10 @@
 """What a diagnosis says: the content of `diagnosis.json`, and its schema."""
 
 import dataclasses
+import inspect
 import json
 import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import UnionType
@@ -16,7 +18,13 @@ VERSION = 4
 
 @dataclass(frozen=True)
 class Value:
-    """An estimate with its 95 % interval."""
+    """An estimate with its 95 % interval.
+
+    Attributes:
+        value: the estimate, in `unit`.
+        unit: as text; 1 where it has none.
+        interval95: lower and upper end, in `unit`; of Student's t, clustered by runs.
+    """
 
     value: float
     unit: str
@@ -29,6 +37,11 @@ class Support:
 
     The p value is of a test clustered by runs; where few runs bound it, and the gain is clear (1.5
     to 5 times what noise wins), of the gain less that factor in noise alone.
+
+    Attributes:
+        p_value: probability that noise alone makes one of all names look so good; 0 where below
+            1e-300.
+        heldout_gain: log likelihood won on data left out of the fit (nats, in all).
     """
 
     p_value: float
@@ -37,7 +50,13 @@ class Support:
 
 @dataclass(frozen=True)
 class Rival:
-    """Another name and what it would have won."""
+    """Another name and what it would have won.
+
+    Attributes:
+        name: of the effect.
+        where: axis, thruster or frame, as of a cause.
+        heldout_gain: what it would have won in the cause's place on data left out (nats, in all).
+    """
 
     name: str
     where: str
@@ -54,9 +73,10 @@ class Structure:
         description: one sentence.
         lag: time over which it remembers (s), if it does.
         frequency: at which it rings (Hz), if it does.
-        region: of each variable, where it was seen.
-        heldout_gain: nats won on data left out.
-        best_name_gain: what the best name would have won of them.
+        region: of each variable, where it was seen: 2nd and 98th percentile (m, rad, m/s, rad/s,
+            N).
+        heldout_gain: won on data left out (nats, in all).
+        best_name_gain: what the best name would have won of them (nats, in all).
     """
 
     acts_on: str
@@ -74,9 +94,16 @@ class Cause:
     """One named cause.
 
     Attributes:
+        name: of the effect, or `unknown` for structure without a name.
+        where: axis, thruster (1 to n, or `all`) or frame it is in.
+        parameters: estimates by name, each with its unit.
+        evidence: why it is believed.
+        rivals: names that would have won most in its place, best first.
+        indistinguishable_from: names that these data can't tell it from.
         next_experiment: what would tell it from what it is confused with, in words.
         experiments: nats a minute that each maneuver of a set is expected to tell by; empty where
             maneuvers make no difference.
+        structure: what is known of structure without a name; null for a name.
     """
 
     name: str
@@ -95,10 +122,10 @@ class AxisResidual:
     """What is left on an axis, against what the noise explains.
 
     Attributes:
-        variance_ratio: innovations' variance over the predicted one; 1 is all explained, null
-            (all three) what was not measured.
-        autocorrelation: at one step; 0 for white.
-        mean: in standard errors of a mean of independent numbers.
+        variance_ratio: innovations' variance over the predicted one, dimensionless; 1 is all
+            explained, null (all three) what was not measured.
+        autocorrelation: of innovations one step apart, dimensionless; 0 for white.
+        mean: of innovations, in standard errors of a mean of independent numbers.
     """
 
     variance_ratio: float
@@ -108,7 +135,12 @@ class AxisResidual:
 
 @dataclass(frozen=True)
 class Interval:
-    """A number with its 95 % interval by bootstrap over scenarios."""
+    """A number with its 95 % interval by bootstrap over what was left out in turn.
+
+    Attributes:
+        value: in the unit of the field that holds it; null of simulations that diverged.
+        interval95: lower and upper end, in the same unit.
+    """
 
     value: float
     interval95: tuple[float, float]
@@ -119,11 +151,16 @@ class ModelGain:
     """A model on data left out of its fit; horizons are seconds as text.
 
     Attributes:
-        log_score: log density of the innovations, nats a sample; larger is better.
-        log_score_gain: what it wins over the base, sample by sample.
-        energy_score: of simulated laws, m, rad, m/s and rad/s alike; smaller is better.
-        position_rmse, rotation_rmse, velocity_rmse: of noise-free simulations (m, rad, m/s).
-        coverage: share of records inside the bands of 50 and 90 %, mean over axes.
+        log_score: log density of the innovations (nats a sample); larger is better.
+        log_score_gain: what it wins over the base (nats a sample).
+        energy_score: by horizon, of simulations with noise: their mean distance from the record
+            less half their mean distance from each other, m, rad, m/s and rad/s counted alike;
+            smaller is better.
+        position_rmse: by horizon, root mean square error of noise-free simulations (m).
+        rotation_rmse: by horizon, of the rotation (rad).
+        velocity_rmse: by horizon, of the velocity (m/s).
+        coverage: by band (`50 %`, `90 %`) and horizon, share of records inside the band, 0 to 1,
+            mean over axes.
     """
 
     log_score: Interval
@@ -137,7 +174,15 @@ class ModelGain:
 
 @dataclass(frozen=True)
 class Refitted:
-    """A coefficient that was fitted before any cause was named: believed and fitted value."""
+    """A coefficient that was fitted before any cause was named: believed and fitted value.
+
+    Attributes:
+        name: of the effect that changes it.
+        where: axis or thruster.
+        parameter: of the effect.
+        believed: value of the belief, in the unit of `fitted`.
+        fitted: value found.
+    """
 
     name: str
     where: str
@@ -148,7 +193,14 @@ class Refitted:
 
 @dataclass(frozen=True)
 class Ratio:
-    """A coefficient over inertia, which data tell whatever the mass: believed and found."""
+    """A coefficient over inertia, which data tell whatever the mass: believed and found.
+
+    Attributes:
+        name: of the coefficient.
+        where: axis.
+        believed: value of the belief, in the unit of `found`.
+        found: value found.
+    """
 
     name: str
     where: str
@@ -158,7 +210,20 @@ class Ratio:
 
 @dataclass(frozen=True)
 class DataSummary:
-    """What was there (`seconds` that are predicted), what was missing, what could not be told."""
+    """What was there, what was missing, what could not be told.
+
+    Attributes:
+        scenarios: names.
+        runs: how many were looked at.
+        seconds: time of theirs that is predicted (s).
+        step: mean time between samples (s).
+        command: what commands were made of: thruster_force, pwm or F_Bo_B.
+        problems: faults of the data, a sentence each.
+        limits: what these data can't tell, a sentence each.
+        noise: estimated levels: standard deviations of the records, mean over axes (`position_m`,
+            `attitude_rad`, `velocity_m_s` in m/s, `rate_rad_s` in rad/s), and the diffusion of
+            the disturbance (`diffusion_surge`, sway, heave in N√s; roll, pitch, yaw in N·m√s).
+    """
 
     scenarios: list[str]
     runs: int
@@ -175,14 +240,22 @@ class Diagnosis:
     """The whole finding.
 
     Attributes:
+        version: of this format.
         verdict: adequate (no cause), explained (all by names, or by coefficients), partly_explained
             (names and `unknown`), unexplained (`unknown` alone).
+        sentence: the verdict in words.
+        causes: what is named, first found first.
         refitted: coefficients fitted before any cause was named.
         ratios: what such a fit tells whatever the mass; with `--refit all` only.
-        gain: of base, refitted, extended (where there are causes) and black_box.
+        residual: what the causes leave, by channel: x, y, z, roll, pitch, yaw, u, v, w, p, q, r.
+        gain: of base (the belief), refitted (its coefficients fitted, no cause named), extended
+            (with the causes, where there are any) and black_box (a regression beside the belief).
         left_out: what was left out in turn, for gains here and in causes.
-        tested, threshold, alpha: names tried; nats that noise alone wins of so many, and how often.
-        seconds: that it took.
+        data: what was looked at.
+        tested: names tried.
+        threshold: what noise alone wins of so many names as often as `alpha` says (nats, in all).
+        alpha: rate of false alarms over all names together.
+        seconds: that it took (s).
     """
 
     version: int
@@ -227,16 +300,26 @@ def schema(cls: Any = Diagnosis) -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **body, "$defs": definitions}
 
 
+def described(cls: type) -> dict[str, str]:
+    """Each field's description, from the attributes in a dataclass' docstring."""
+    text = inspect.cleandoc(cls.__doc__ or "").partition("Attributes:\n")[2]
+    entries = re.findall(r"^    (\w+): (.*(?:\n        .*)*)", text, re.MULTILINE)
+    return {name: " ".join(words.split()) for name, words in entries}
+
+
 def _schema(kind: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         name = kind.__name__
         if name not in definitions:
             definitions[name] = {}
-            hints = get_type_hints(kind)
+            hints, told = get_type_hints(kind), described(kind)
             definitions[name] = {
                 "type": "object",
                 "description": (kind.__doc__ or "").split("\n")[0],
-                "properties": {k: _schema(v, definitions) for k, v in hints.items()},
+                "properties": {
+                    k: {**_schema(v, definitions), "description": told.get(k, "")}
+                    for k, v in hints.items()
+                },
                 "required": [f.name for f in dataclasses.fields(kind)],
                 "additionalProperties": False,
             }

@@ -174,6 +174,8 @@ def clock_jump(
     for part in (slice(0, 3), slice(3, 6)):
         off = np.linalg.norm(moved[:, part] - V[:, part] * step[:, None], axis=1)
         as_usual = np.linalg.norm(moved[:, part] - V[:, part] * usual, axis=1)
+        if not np.isfinite(off[even]).any():
+            continue  # positions that were not measured
         noise = np.nanmedian(off[even])
         jumped = (step > 1.5 * usual) & (off > _SURE * noise) & (as_usual < off / 2)
         longest = max(longest, float(step[jumped].max(initial=usual)) - usual)

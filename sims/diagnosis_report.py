@@ -238,7 +238,8 @@ def _told(name: str, v: Value) -> str:
 
 def _valued(v: Value) -> str:
     low, high = v.interval95
-    return f"{v.value:.4g} ({low:.4g} … {high:.4g}) {v.unit}"
+    between = f"({low:.4g} … {high:.4g})" if math.isfinite(low) else "(not estimated)"
+    return f"{v.value:.4g} {between} {v.unit}"
 
 
 def _gains(d: Diagnosis) -> list[tuple[str, ...]]:

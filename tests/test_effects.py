@@ -416,6 +416,9 @@ def test_effects_by_hand_refuse_what_they_do_not_know():
 
 def test_further_fields_are_stored(tmp_path):
     near = KINDS["proximity"].of("bottom", force=3.0, options={"floor": -4.5})
+    assert near.assumed("bottom") == {"boundary": (-4.5, "m")}
+    assert near.assumed("surface") == {"boundary": (0.0, "m")}
+    assert near.assumed("wall_east") == {"boundary": (10.0, "m")}
     late = KINDS["actuation_delay"].of(delay=0.3, options={"steps": 30})
     model = Extended.create(BASE, (near, late), THRUSTERS)
     save_model(tmp_path / "model.spinn", model)

@@ -162,6 +162,11 @@ class Effect(eqx.Module):
         """Whether this kind overrides a hook."""
         return getattr(cls, hook) is not getattr(Effect, hook)
 
+    def assumed(self, place: str) -> dict[str, tuple[float, str]]:
+        """Values and units that parameters at a place refer to, and that are not estimated."""
+        del place
+        return {}
+
     def part(self, i: int, like: Array) -> Array:
         """Value i, of the rank of one component of `like`."""
         return expand(self.values[i], like.ndim - 1)

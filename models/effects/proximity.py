@@ -33,6 +33,11 @@ class Proximity(Effect):
     floor: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=-10.0)
     walls: Float[Array, "4"] = eqx.field(converter=jnp.asarray, default=(-10.0, 10.0, -10.0, 10.0))
 
+    def assumed(self, place: str) -> dict[str, tuple[float, str]]:
+        """Where the boundary is taken to be (m in W: a height, or east or north)."""
+        at = (self.floor, 0.0, *self.walls)[self.places.index(place)]
+        return {"boundary": (float(at), "m")}
+
     def wrench(
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
     ) -> Float[Array, "6 *#batch"]:

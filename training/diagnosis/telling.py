@@ -64,6 +64,13 @@ def values_of(
     return found
 
 
+def _assumed(bench: Bench, name: str, where: str) -> dict[str, result.Value]:
+    """What a cause's parameters refer to, without an interval."""
+    own = (e for e in bench.library.effects if e.name == name and where in e.places)
+    told = next(own).assumed(where)
+    return {what: result.Value(at, unit, (_NAN, _NAN)) for what, (at, unit) in told.items()}
+
+
 def cause(
     choice: Choice,
     bench: Bench,
@@ -78,7 +85,8 @@ def cause(
     return result.Cause(
         name=name,
         where=where,
-        parameters=values_of(bench, look.theta, bench.library.at(name, where), joint),
+        parameters=values_of(bench, look.theta, bench.library.at(name, where), joint)
+        | _assumed(bench, name, where),
         evidence=result.Support(choice.p_value, choice.fit.heldout_gain),
         rivals=rivals,
         indistinguishable_from=list(dict.fromkeys(h[0] for h in choice.ties if h[0] != name)),

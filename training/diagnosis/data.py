@@ -19,7 +19,7 @@ _BLOCKS, _LEAST = 8, 16
 """Pieces that a single run is cut into at least, and samples of a piece at least."""
 REMEMBERED, _OF_A_RUN = 0.5, 0.1
 """Time (s) before a piece whose commands its actuators may remember; share of a run at most."""
-_LEAST_ROWS, _LEAST_SECONDS = 60, 5.0
+_LEAST_ROWS, _LEAST_SECONDS = 60, 3.0
 """Data below which nothing is told."""
 _BEYOND = 8.0
 """Times a thruster's largest force that no command asks for."""

@@ -1,35 +1,15 @@
 """The console command `spinndrift`."""
 
+import os
+import signal
 import sys
-from collections.abc import Sequence
-from importlib.metadata import version
-from typing import Annotated
-
-import tyro
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+from typing import Protocol, runtime_checkable
 
 from ..models.errors import UserError
-from .commands.check import Check
-from .commands.demo import Demo
-from .commands.diagnose import Diagnose
-from .commands.evaluate import Evaluate
-from .commands.generate import Generate
-from .commands.import_log import Import
-from .commands.run import Run
-from .commands.study import Study
-from .commands.train import Train
-from .compile_cache import keep_compiled
-
-Command = (
-    Annotated[Import, tyro.conf.subcommand("import")]
-    | Annotated[Generate, tyro.conf.subcommand("generate")]
-    | Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Run, tyro.conf.subcommand("run")]
-    | Annotated[Diagnose, tyro.conf.subcommand("diagnose")]
-    | Annotated[Check, tyro.conf.subcommand("check")]
-    | Annotated[Study, tyro.conf.subcommand("study")]
-    | Annotated[Demo, tyro.conf.subcommand("demo")]
-)
 
 _DESCRIPTION = """Learned stochastic dynamics and control for underwater vehicles.
 
@@ -40,27 +20,112 @@ on simulated data, `demo` goes the whole way from a log that comes along to a di
 `spinndrift COMMAND --help` explains each."""
 
 
+@runtime_checkable
+class _Command(Protocol):
+    def run(self) -> None: ...
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command; exit code 2 and one sentence for bad input, 130 after Ctrl-C."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    if given == ["--version"]:
-        print(version("spinndrift"))  # noqa: T201 - the answer asked for
-        return
-    command = tyro.cli(Command, args=given, prog="spinndrift", description=_DESCRIPTION)
-    import jax
-
-    keep_compiled()
-    jax.config.update("jax_enable_x64", True)
-    # Small programs then run in line: a call from a diagram costs 10 µs instead of up to 40.
-    jax.config.update("jax_cpu_enable_async_dispatch", False)
     try:
-        command.run()
+        with _interrupted_between_imports(sys._getframe()):
+            _run(given)
     except UserError as error:
         _fail(f"spinndrift: {error}", 2)
     except KeyboardInterrupt:
         _fail("spinndrift: interrupted; what is on disk is whole", 130)
     except BrokenPipeError:
         sys.exit(141)
+
+
+@contextmanager
+def _interrupted_between_imports(home: FrameType) -> Iterator[None]:
+    """Let Ctrl-C wait until an import is done: extension modules swallow it or raise another.
+
+    `home` is the frame below which imports count.
+    """
+    again: threading.Timer | None = None
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal again
+        again = None
+        if not _importing(frame, home):
+            raise KeyboardInterrupt
+        again = threading.Timer(0.05, os.kill, (os.getpid(), number))
+        again.daemon = True
+        again.start()
+
+    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not usual or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if again is not None:
+            again.cancel()
+            raise KeyboardInterrupt
+
+
+def _importing(frame: FrameType | None, home: FrameType) -> bool:
+    while frame is not None and frame is not home:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _run(given: list[str]) -> None:
+    if given == ["--version"]:
+        from importlib.metadata import version
+
+        print(version("spinndrift"))  # noqa: T201 - the answer asked for
+        return
+    command = _parsed(given)
+    import jax
+
+    from ..models.files import check_writable
+    from .compile_cache import keep_compiled
+
+    keep_compiled()
+    jax.config.update("jax_enable_x64", True)
+    # Small programs then run in line: a call from a diagram costs 10 µs instead of up to 40.
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    if (out := getattr(command, "out", None)) is not None:
+        check_writable(out, "--out")
+    command.run()
+
+
+def _parsed(given: list[str]) -> _Command:
+    from typing import Annotated
+
+    import tyro
+
+    from .commands.check import Check
+    from .commands.demo import Demo
+    from .commands.diagnose import Diagnose
+    from .commands.evaluate import Evaluate
+    from .commands.generate import Generate
+    from .commands.import_log import Import
+    from .commands.run import Run
+    from .commands.study import Study
+    from .commands.train import Train
+
+    commands = (
+        Annotated[Import, tyro.conf.subcommand("import")]
+        | Annotated[Generate, tyro.conf.subcommand("generate")]
+        | Annotated[Train, tyro.conf.subcommand("train")]
+        | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+        | Annotated[Run, tyro.conf.subcommand("run")]
+        | Annotated[Diagnose, tyro.conf.subcommand("diagnose")]
+        | Annotated[Check, tyro.conf.subcommand("check")]
+        | Annotated[Study, tyro.conf.subcommand("study")]
+        | Annotated[Demo, tyro.conf.subcommand("demo")]
+    )
+    return tyro.cli(commands, args=given, prog="spinndrift", description=_DESCRIPTION)
 
 
 def _fail(message: str, code: int) -> None:

@@ -93,6 +93,13 @@ def split_parts(
     """
 
     def cut(part: Recording, stride: float, name: str) -> Windows:
+        longest = (part.lengths.max() - 1) * part.dt
+        if longest < config.length_s - part.dt / 2:
+            raise UserError(
+                f"{name} part of the data: its longest piece lasts {longest:.3g} s, and a window "
+                f"is {config.length_s:g} s long; record longer runs, or give a shorter "
+                "`windows: {length_s: …}` in the settings (`spinndrift train --config`)"
+            )
         try:
             return make_windows(
                 part,

@@ -96,6 +96,12 @@ def test_every_option_is_explained(command, capsys):
         (("run", "station_keeping_calm", "--scenario-text", "duration: -1"), ("duration",)),
         (("demo", "--log", "empty.tlog"), ("empty.tlog",)),
         (("generate", "--maneuvers", "loop"), ("loop", "surge")),
+        (("diagnose", EMBEDDED, "--out", "/proc/nope"), ("--out /proc/nope", "written")),
+        (("diagnose", EMBEDDED, "--out", "empty.tlog"), ("--out empty.tlog", "is a file")),
+        (("diagnose", EMBEDDED, "--alpha", "2"), ("--alpha 2", "below 0.5")),
+        (("diagnose", EMBEDDED, "--alpha", "nan"), ("--alpha nan",)),
+        (("diagnose", EMBEDDED, "--diffusion", "nan", *"11111"), ("--diffusion", "finite")),
+        (("train", EMBEDDED, "--out", "empty.tlog/deep"), ("--out", "empty.tlog is no folder")),
     ],
 )
 def test_bad_input_is_refused_in_one_sentence(arguments, words, capsys, tmp_path, monkeypatch):
@@ -124,6 +130,22 @@ def test_an_error_in_a_fresh_process_has_exit_code_two():
     assert run_python(code).split() == ["2", "1"]
 
 
+def test_an_interrupt_while_modules_are_imported_has_exit_code_130():
+    code = (
+        "import os, signal, subprocess, sys, time\n"
+        "script = 'from spinndrift.sims.cli import main; print(flush=True); main([\"train\", '\n"
+        "script += '\"no.nc\"])'\n"
+        "done = subprocess.Popen([sys.executable, '-c', script], stdout=-1, stderr=-1, text=True)\n"
+        "done.stdout.readline()\n"
+        "time.sleep(0.2)\n"
+        "done.send_signal(signal.SIGINT)\n"
+        "told = done.communicate()[1]\n"
+        "print(done.returncode, told)"
+    )
+    told = run_python(code)
+    assert told.strip() == "130 spinndrift: interrupted; what is on disk is whole"
+
+
 def test_import_writes_a_recording(tmp_path, capsys):
     out = tmp_path / "dive.nc"
     assert called("import", EMBEDDED, "--out", out, "--rate", "10") is None
@@ -139,6 +161,15 @@ def test_generate_writes_what_was_asked_for(generated):
     assert recording.lengths.shape == (2, 3)
     surge = recording.select("surge-forward").dataset["V_WB_B"].to_numpy()[..., -1, 0]
     assert np.all(surge > 0.1)
+
+
+def test_pieces_too_short_to_train_on_are_told_with_the_remedy(generated, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert called("train", generated, "--out", out) == 2
+    told = capsys.readouterr().err
+    for word in ("held-out part", "lasts", "4 s long", "windows: {length_s: …}", "--config"):
+        assert word in told
+    assert not out.exists()
 
 
 def test_train_resume_and_evaluate(generated, tmp_path, capsys, monkeypatch):

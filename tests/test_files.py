@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from spinndrift.models.errors import UserError
-from spinndrift.models.files import atomic_path
+from spinndrift.models.files import atomic_files, atomic_path, check_writable
 
 
 @pytest.fixture
@@ -152,3 +152,105 @@ def test_relative_paths_follow_the_working_folder(tmp_path: Path, monkeypatch):
     with atomic_path("a.yaml") as partial:
         partial.write_text("a: 1")
     assert (tmp_path / "a.yaml").read_text() == "a: 1"
+
+
+def fill(partial: Path, words: str) -> None:
+    (partial / "deep").mkdir()
+    for name in ("a.json", "b.html", "deep/c.spinn"):
+        (partial / name).write_text(words)
+
+
+def content(folder: Path) -> dict[str, str]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_text() for path in files}
+
+
+WHOLE = {"a.json": "new", "b.html": "new", "deep/c.spinn": "new"}
+
+
+def test_files_of_a_new_folder_appear_together(tmp_path: Path):
+    out = tmp_path / "runs" / "out"
+    with atomic_files(out) as partial:
+        fill(partial, "new")
+        assert not out.exists()
+    assert content(tmp_path / "runs") == {f"out/{name}": text for name, text in WHOLE.items()}
+
+
+def test_files_replace_their_namesakes_and_leave_the_others(tmp_path: Path):
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / "a.json").write_text("old")
+    (tmp_path / "a.json").chmod(0o600)
+    with atomic_files(tmp_path) as partial:
+        fill(partial, "new")
+        assert (tmp_path / "a.json").read_text() == "old"
+    assert content(tmp_path) == WHOLE | {"mine.txt": "mine"}
+    assert {p.name for p in tmp_path.iterdir()} == {"mine.txt", "a.json", "b.html", "deep"}
+    assert (tmp_path / "a.json").stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize("there", [False, True])
+@pytest.mark.parametrize("fault", [RuntimeError, KeyboardInterrupt])
+def test_a_fault_among_files_leaves_the_folder_as_it_was(tmp_path: Path, fault, there: bool):
+    out = tmp_path / "out"
+    if there:
+        out.mkdir()
+        (out / "a.json").write_text("old")
+
+    def write():
+        with atomic_files(out) as partial:
+            fill(partial, "new")
+            raise fault
+
+    with pytest.raises(fault):
+        write()
+    assert content(tmp_path) == ({"out/a.json": "old"} if there else {})
+    assert out.exists() == there
+
+
+def test_an_interrupt_between_replacements_waits_until_all_are_done(tmp_path: Path, monkeypatch):
+    (tmp_path / "b.html").write_text("old")
+    replace, moved = os.replace, []
+
+    def interrupted(*paths):
+        replace(*paths)
+        moved.append(paths)
+        if len(moved) == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), atomic_files(tmp_path) as partial:
+        fill(partial, "new")
+    assert signal.getsignal(signal.SIGINT) is before
+    assert content(tmp_path) == WHOLE
+    assert len(moved) == 3
+
+
+@pytest.mark.parametrize(("name", "words"), [("deep", "no folder"), ("b.html", "no regular file")])
+def test_what_can_not_be_replaced_is_told_before_anything_is(tmp_path: Path, name, words):
+    (tmp_path / "a.json").write_text("old")
+    if name == "deep":
+        (tmp_path / name).write_text("mine")
+    else:
+        (tmp_path / name).mkdir()
+    before = content(tmp_path)
+    with pytest.raises(UserError, match=words), atomic_files(tmp_path) as partial:
+        fill(partial, "new")
+    assert content(tmp_path) == before
+
+
+def test_places_that_can_be_written_are_let_through_untouched(target: Path):
+    for path in (target, target.parent, target.parent / "a" / "b" / "c"):
+        check_writable(path)
+    assert content(target.parent) == {target.name: "old"}
+    assert os.listdir(target.parent) == [target.name]
+
+
+def test_places_that_can_not_be_written_are_refused(target: Path):
+    for path in (target / "out", target / "deep" / "out"):
+        with pytest.raises(UserError, match=r"^--out .*is no folder; name"):
+            check_writable(path, "--out")
+    with pytest.raises(UserError, match=r"^--out /proc/nope: nothing can be written there"):
+        check_writable("/proc/nope", "--out")
+    with pytest.raises(UserError, match="nothing can be written there"):
+        check_writable(target.parent / ("n" * 300) / "out")

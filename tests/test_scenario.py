@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from spinndrift.models import config
+from spinndrift.models.effects.by_hand import EffectConfig, check_distinct
 from spinndrift.models.errors import UserError
 from spinndrift.sims.criteria import FollowPath, ReachGoal
 from spinndrift.sims.run_loop import simulate
@@ -119,7 +120,27 @@ def test_changes():
         ),
         (
             "{station: {effects: [{name: proximity, where: bottom, options: {height: 1}}]}}",
-            "proximity.options.*height",
+            "proximity.options has no 'height': take one of floor, walls",
+        ),
+        (
+            "{station: {effects: [{name: proximity, where: bottom, options: {walls: [1, 2]}}]}}",
+            r"proximity.options.walls is .*: give 4 finite numbers",
+        ),
+        (
+            "{station: {effects: [{name: actuation_delay, options: {steps: 1.5}}]}}",
+            r"actuation_delay.options.steps is 1.5: give 1, 2, 3",
+        ),
+        (
+            "{station: {effects: [{name: linear_drag, where: surge, options: {a: 1}}]}}",
+            "linear_drag.options has no 'a': it has none; leave it out",
+        ),
+        (
+            "{station: {effects: [{name: thruster_lag, parameters: {dtype: 1}}]}}",
+            "no 'dtype': it has time_constant",
+        ),
+        (
+            "{station: {effects: [{name: thruster_lag}]}}",
+            "thruster_lag has no parameters.*give one of time_constant",
         ),
         ("{", "--scenario-text"),
     ],
@@ -137,3 +158,12 @@ def test_unknown_scenarios_are_told(tmp_path):
     (tmp_path / "mine.yaml").write_text(BASE.replace("duration", "durtion"))
     with pytest.raises(UserError, match=r"mine\.yaml:3: durtion"):
         load_scenario(tmp_path / "mine.yaml")
+
+
+def test_an_effect_twice_at_one_place_is_told():
+    lag = EffectConfig("thruster_lag", parameters={"time_constant": 0.1})
+    one = replace(lag, where="1")
+    check_distinct((lag, one, replace(lag, where="2")))
+    for twice in ((lag, one, one), (lag, replace(lag, where="all"))):
+        with pytest.raises(UserError, match=r"thruster_lag.*is there twice"):
+            check_distinct(twice)

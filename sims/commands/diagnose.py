@@ -1,5 +1,6 @@
 """`spinndrift diagnose`: what a simulation gets wrong, by name."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -8,6 +9,10 @@ from tyro.conf import Positional
 
 from ...models.errors import UserError
 from ..progress import console, progress_bar
+
+_USUAL = "bluerov2_heavy"
+_STATE_VEHICLES = (".nc", ".nc4", ".h5", ".yaml", ".yml")
+"""Endings of files that can state their vehicle; logs can't."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +26,8 @@ class Diagnose:
     data: Positional[Path]
     """Recording (.nc), CSV folder or log (.tlog, .BIN)."""
     vehicle: str | None = None
-    """Preset name or YAML file; by default what the data name."""
+    """Preset name or YAML file; by default what the data name, else the model's, else
+    bluerov2_heavy."""
     model: Path | None = None
     """Model file (.spinn) to believe instead of the preset."""
     diffusion: tuple[float, float, float, float, float, float] | None = None
@@ -47,41 +53,41 @@ class Diagnose:
         import numpy as np
 
         from ...models.checkpoint import load_model, save_model
+        from ...models.files import atomic_files
         from ...models.vehicle import load_vehicle
         from ...systems.mavlink.logs import LogOptions, load_data
         from ...training.diagnosis.diagnose import DiagnoseConfig, diagnose
         from ...training.diagnosis.result import schema
         from ..diagnosis_report import diagnosis_page
 
-        if self.out.exists() and not self.out.is_dir():
-            raise UserError(f"--out {self.out}: is a file; name a folder")
+        self._check()
         config = DiagnoseConfig(alpha=self.alpha, refit=self.refit)
+        base, metadata = (None, {}) if self.model is None else load_model(self.model, dtype=float)
+        named = metadata.get("vehicle")
         with progress_bar(f"reading {self.data.name}") as update:
             recording = load_data(
                 self.data,
-                vehicle=self.vehicle,
+                vehicle=self.vehicle or (named if self._is_log() else None),
                 options=LogOptions(water_density=self.water_density),
                 resample=False,
                 progress=update,
             )
-        base = None if self.model is None else load_model(self.model, dtype=float)[0]
-        vehicle = load_vehicle(self.vehicle or recording.vehicle or "bluerov2_heavy")
+        vehicle = load_vehicle(self._vehicle(recording.vehicle, named))
         if self.diffusion is not None:
-            if base is not None:
-                raise UserError("--diffusion: the model of --model has its own; leave one out")
-            if min(self.diffusion) < 0:
-                raise UserError("--diffusion: give six numbers of at least 0")
             base = vehicle.dynamics(np.array(self.diffusion))
         with progress_bar("diagnosing") as update:
             finding = diagnose(recording, vehicle, base, config, update)
-        finding.diagnosis.save(self.out / "diagnosis.json")
-        (self.out / "diagnosis.schema.json").write_text(json.dumps(schema(), indent=2) + "\n")
-        save_model(
-            self.out / "extended" / "model.spinn",
-            finding.extended,
-            {"vehicle": vehicle.name, "source": str(self.data), "dt": recording.dt},
-        )
-        diagnosis_page(finding, f"Diagnosis of {self.data.name}").write(self.out / "report.html")
+        page = diagnosis_page(finding, f"Diagnosis of {self.data.name}")
+        with atomic_files(self.out) as partial:
+            finding.diagnosis.save(partial / "diagnosis.json")
+            text = json.dumps(schema(), indent=2) + "\n"
+            (partial / "diagnosis.schema.json").write_text(text, encoding="utf-8")
+            save_model(
+                partial / "extended" / "model.spinn",
+                finding.extended,
+                {"vehicle": vehicle.name, "source": str(self.data), "dt": recording.dt},
+            )
+            page.write(partial / "report.html")
         shown = console()
         shown.print(finding.diagnosis.sentence)
         for cause in finding.diagnosis.causes:
@@ -90,3 +96,27 @@ class Diagnose:
                 told = cause.structure.description
             shown.print(f"  {cause.name} ({cause.where}): {told}")
         shown.print(f"wrote {self.out}")
+
+    def _check(self) -> None:
+        """Refuse options that can't be meant, before anything is read."""
+        if self.out.exists() and not self.out.is_dir():
+            raise UserError(f"--out {self.out}: is a file; name a folder")
+        if not 0 < self.alpha < 0.5:
+            raise UserError(f"--alpha {self.alpha:g}: give a rate above 0 and below 0.5")
+        if self.diffusion is None:
+            return
+        if self.model is not None:
+            raise UserError("--diffusion: the model of --model has its own; leave one out")
+        if not all(0 <= b < math.inf for b in self.diffusion):
+            raise UserError("--diffusion: give six finite numbers of at least 0")
+
+    def _vehicle(self, recorded: str, named: str | None) -> str:
+        """The vehicle given, that the data state or a model names; or the usual, which is told."""
+        stated = self.vehicle or ("" if self._is_log() else recorded) or named
+        if not stated:
+            told = f"{self.data.name} states no vehicle, so {_USUAL} is assumed; name another with "
+            console().print(told + "--vehicle", soft_wrap=True)
+        return stated or _USUAL
+
+    def _is_log(self) -> bool:
+        return self.data.is_file() and self.data.suffix.lower() not in _STATE_VEHICLES

@@ -1,6 +1,7 @@
 """`python -m hidden FOLDER`: write blind cases for `spinndrift check diagnosis --cases FOLDER`."""
 
 import argparse
+import difflib
 import shutil
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -22,14 +23,21 @@ def main() -> None:
     given = parser.parse_args()
     plan, nulls = SCALES[given.scale]
     nulls = nulls if given.nulls is None else given.nulls
+    names, taken = [], 0
     for blind in table(plan, nulls, given.seeds, given.sizes, given.mixed, given.data):
         folder = given.folder / blind.name
+        names.append(blind.name)
         if not any(fnmatchcase(blind.name, only) for only in given.only):
             continue
+        taken += 1
         if not (folder / "truth.yaml").exists():
             shutil.rmtree(folder, ignore_errors=True)
             blind.write(folder)
         print(blind.name)  # noqa: T201
+    if not taken:
+        near = difflib.get_close_matches(given.only[0], dict.fromkeys(names), n=8, cutoff=0.0)
+        there = f"{len(names)} cases, such as {', '.join(near)}" if names else "no case at all"
+        parser.error(f"--only {' '.join(given.only)}: no case is called so; there are {there}")
 
 
 if __name__ == "__main__":

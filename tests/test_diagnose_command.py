@@ -1,0 +1,88 @@
+"""`spinndrift diagnose`: its files appear together, and it says what it assumes."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_cli import called
+
+from spinndrift.models.recording import Recording, Trajectory
+
+FILES = {"diagnosis.json", "diagnosis.schema.json", "extended/model.spinn", "report.html"}
+
+
+class Told:
+    """A diagnosis and its page in place of real ones, which take half a minute."""
+
+    sentence = "Nothing differs."
+    causes = ()
+
+    def __init__(self, fault=None):
+        self.fault = fault
+
+    def save(self, path):
+        path.write_text("new")
+
+    def write(self, path):
+        if self.fault is not None:
+            raise self.fault
+        path.write_text("new")
+
+
+@pytest.fixture
+def diagnosing(monkeypatch):
+    def stand_in(fault=None):
+        told = Told(fault)
+
+        def diagnose(recording, vehicle, *_):
+            assert vehicle.name == "bluerov2_heavy"
+            return SimpleNamespace(diagnosis=told, extended=vehicle.dynamics())
+
+        monkeypatch.setattr("spinndrift.training.diagnosis.diagnose.diagnose", diagnose)
+        monkeypatch.setattr("spinndrift.sims.diagnosis_report.diagnosis_page", lambda *_: told)
+
+    return stand_in
+
+
+def recorded(path, vehicle):
+    n = 20
+    pose = np.tile([1.0, 0, 0, 0, 0, 0, -1], (n, 1))
+    still = Trajectory("still", pose, np.zeros((n, 6)), {"F_Bo_B": np.zeros((n, 6))})
+    Recording.from_trajectories([still], 0.05, vehicle=vehicle).save(path)
+    return path
+
+
+def files(folder):
+    return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("stated", "given", "said"),
+    [("", False, True), ("", True, False), ("bluerov2_heavy", False, False)],
+)
+def test_a_vehicle_that_nobody_states_is_told(tmp_path, diagnosing, capsys, stated, given, said):
+    diagnosing()
+    data, out = recorded(tmp_path / "still.nc", stated), tmp_path / "out"
+    more = ("--vehicle", "bluerov2_heavy") if given else ()
+    assert called("diagnose", data, "--out", out, *more) is None
+    told = "still.nc states no vehicle, so bluerov2_heavy is assumed" in capsys.readouterr().err
+    assert told == said
+    assert files(out) == FILES
+
+
+def test_an_interrupt_while_writing_leaves_the_folder_as_it_was(tmp_path, diagnosing, capsys):
+    diagnosing(KeyboardInterrupt())
+    data, out = recorded(tmp_path / "still.nc", "bluerov2_heavy"), tmp_path / "out"
+    assert called("diagnose", data, "--out", out) == 130
+    assert not out.exists()
+    out.mkdir()
+    for name in ("diagnosis.json", "mine.txt"):
+        (out / name).write_text("old")
+    assert called("diagnose", data, "--out", out) == 130
+    assert files(out) == {"diagnosis.json", "mine.txt"}
+    assert (out / "diagnosis.json").read_text() == "old"
+    assert "what is on disk is whole" in capsys.readouterr().err
+    diagnosing()
+    assert called("diagnose", data, "--out", out) is None
+    assert files(out) == FILES | {"mine.txt"}
+    assert (out / "diagnosis.json").read_text() == "new"

@@ -99,7 +99,7 @@ class Cause:
         parameters: estimates by name, each with its unit.
         evidence: why it is believed.
         rivals: names that would have won most in its place, best first.
-        indistinguishable_from: names that these data can't tell it from.
+        indistinguishable_from: names that these data can't tell it from; of its own also the place.
         next_experiment: what would tell it from what it is confused with, in words.
         experiments: nats a minute that each maneuver of a set is expected to tell by; empty where
             maneuvers make no difference.

@@ -89,7 +89,9 @@ def cause(
         | _assumed(bench, name, where),
         evidence=result.Support(choice.p_value, choice.fit.heldout_gain),
         rivals=rivals,
-        indistinguishable_from=list(dict.fromkeys(h[0] for h in choice.ties if h[0] != name)),
+        indistinguishable_from=list(
+            dict.fromkeys(other if other != name else f"{name} ({at})" for other, at in choice.ties)
+        ),
         next_experiment=experiment.text,
         experiments=experiment.nats,
         structure=structure,
@@ -142,9 +144,10 @@ def left_over(
         )
     gain, std = thrust_by_run(bench, look)
     if gain > max(least, *(c.evidence.heldout_gain for c in causes if _is_random(c.name)), 0.0):
+        when = "within the run" if bench.data.left_out == "block" else "from run to run"
         left.append(
-            f"thrust differs from run to run (by {100 * std:.1f} %, standard deviation), as with a "
-            "supply voltage that was not recorded"
+            f"thrust differs {when} (by {100 * std:.1f} %, standard deviation), as with a supply "
+            "voltage that was not recorded or a thruster that fails"
         )
     return left
 

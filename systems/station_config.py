@@ -10,7 +10,7 @@ from ..models.checkpoint import load_model
 from ..models.checks import Vector6, check_numbers, require
 from ..models.disturbances import Combined, Kind, OrnsteinUhlenbeckWrench, preset
 from ..models.dynamics import Dynamics
-from ..models.effects.by_hand import EffectConfig
+from ..models.effects.by_hand import EffectConfig, check_distinct
 from ..models.effects.extended import Extended, core
 from ..models.sensors import Compass, DepthSensor, Dvl, Imu
 from ..models.spinn import Spinn
@@ -76,6 +76,7 @@ class StationConfig:
         require(0 <= self.seed < 2**32, self, "seed", "give a whole number from 0 to 4294967295")
         require(self.voltage is None or self.voltage > 0, self, "voltage", "give a voltage above 0")
         preset(self.disturbance_set)
+        check_distinct(self.effects)
 
     def load_vehicle(self) -> Vehicle:
         """The vehicle.

@@ -640,7 +640,7 @@ def test_commands_that_never_change_name_nothing_that_follows_them(tmp_path):
 
 def test_too_little_data_and_pulses_as_forces_are_refused(tmp_path):
     recording = recorded(tmp_path, 3, "null")[1]
-    short = recording.dataset.isel(time=slice(0, 4))
+    short = recording.dataset.isel(scenario=slice(0, 3), time=slice(0, 6))
     with pytest.raises(UserError, match="too little for a diagnosis"):
         Diagnoser(Recording(short), VEHICLE)
     pulses = recording.dataset.copy(deep=True)

@@ -18,6 +18,8 @@ _FILLED = 3  # samples on a straight line
 _HELD = 0.25
 """Share of the samples that repeat the one before where an instrument is slower than the rows."""
 _INSTRUMENTS = {"x,y,z": slice(4, 7), "u,v,w": slice(7, 10), "p,q,r": slice(10, 13)}
+_LEAST_ROWS, _LEAST_SECONDS = 60, 3.0
+"""Data below which nothing is told."""
 _NAMED = 3
 """Runs that are named."""
 _EVEN_SHARE, _SURE = 0.9, 5.0
@@ -194,6 +196,21 @@ def _refuse_signs(agreeing: Float[np.ndarray, "3 6"], samples: int) -> None:
             f"{', '.join(turned)}: the recorded sign is opposite to the motion of the pose. B is x "
             "forward, y left, z up, rates are right-handed about these axes, W is z up: turn the "
             "sign of the column, or state the frames of the files (frames: NED/FRD)"
+        )
+
+
+def require_enough(data: Data) -> None:
+    """Refuse data that tell nothing.
+
+    Raises:
+        UserError: they are too few.
+    """
+    seconds = data.steps * data.dt
+    if data.steps < _LEAST_ROWS or seconds < _LEAST_SECONDS:
+        raise UserError(
+            f"recording: runs that are long enough have {data.steps} samples, {seconds:.2g} s in "
+            f"all: too little for a diagnosis. Give runs of some seconds, at least "
+            f"{_LEAST_SECONDS:g} s and {_LEAST_ROWS} samples together"
         )
 
 

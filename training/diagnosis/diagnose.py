@@ -20,7 +20,7 @@ from ...models.recording import Recording
 from ...models.vehicle import Vehicle
 from . import result, telling
 from .blackbox import train
-from .checks import SPARSE, limits, problems, unexcited
+from .checks import SPARSE, limits, problems, require_enough, unexcited
 from .data import Data
 from .disturbance import OF_OTHERS, all_laws, best_law, passing
 from .disturbance import told as told_laws
@@ -120,6 +120,7 @@ class Diagnoser:
         self.tell = progress
         self.faults, faulty = problems(recording)
         self.bench = Bench.of(recording, vehicle, base, faulty)
+        require_enough(self.bench.data)
         if self.config.refit == "command" and not self.bench.library.has("axis_thrust"):
             self.bench = self.bench.with_effect(AxisThrust.neutral())
         self.resampled = any("resampled" in note for note in recording.notes)

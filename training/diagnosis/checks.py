@@ -1,7 +1,5 @@
 """Data at fault, and what data can't tell, found before anything is explained by physics."""
 
-from collections.abc import Iterator
-
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
@@ -137,21 +135,7 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
     bad = sorted({*jumps, *clock, *filled, *spiked, *(n for runs in stuck.values() for n in runs)})
     if bad and len(bad) < len(names):
         found[0] += f" (left out: {len(bad)} of {len(names)} runs)"
-    if not any(_changes(recording)):
-        found.append(
-            f"{recording.commands[0]} never changes: what follows the commands can't be told; "
-            "check that the outputs of the runs were logged"
-        )
     return found, bad
-
-
-def _changes(recording: Recording) -> Iterator[bool]:
-    """Whether commands change: within each run, and between them."""
-    before = None
-    for run in recording.trajectories():
-        command = run.commands[recording.commands[0]][:-1]
-        yield bool(np.any(command != command[0] if before is None else command != before))
-        before = command[0]
 
 
 def motion(X_WB: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "M 6"]:

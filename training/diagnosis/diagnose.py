@@ -127,6 +127,12 @@ class Diagnoser:
         self.command_period = recording.command_period
         directions = np.asarray(self.bench.model.allocate(jnp.eye(self.bench.data.u.shape[1])))
         self.quiet = unexcited(self.bench.data, directions)
+        self.driven = len(self.quiet) < len(AXES)
+        if not self.driven:
+            self.faults.append(
+                f"{recording.commands[0]} never changes: what follows the commands can't be told; "
+                "check that the outputs of the runs were logged"
+            )
         self.rng = np.random.default_rng(self.config.seed)
 
     def progress(self, fraction: float, remark: str) -> None:
@@ -186,7 +192,7 @@ class Diagnoser:
         )
         residual = telling.residual(bench, final)
         left = telling.left_over(residual, causes, bench, final, least)
-        if len(self.quiet) == len(AXES):
+        if not self.driven:
             left.insert(0, "commands never change, so what follows them can't be told")
         d = bench.data
         diagnosis = result.Diagnosis(
@@ -379,8 +385,7 @@ def _diagnose(
     diagnoser = Diagnoser(recording, vehicle, base, config, progress)
     found = diagnoser.run()
     first = found.diagnosis
-    driven = len(diagnoser.quiet) < len(AXES)
-    if config.refit != "auto" or not driven or not coefficients_are_off(first):
+    if config.refit != "auto" or not diagnoser.driven or not coefficients_are_off(first):
         return found
     progress(0.0, "again with all coefficients fitted, for most are off")
     again = Diagnoser(recording, vehicle, base, replace(config, refit="all"), progress).run()

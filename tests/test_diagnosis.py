@@ -446,7 +446,8 @@ def test_steps_of_any_length_are_predicted_with_what_thrusters_remember():
 
 def test_structure_without_a_name_is_found_where_it_is(tmp_path):
     """The flow's memory on one axis: seen there, with its time and frequency, and on no other."""
-    from spinndrift.training.diagnosis.structures import Screen, _memory, refined
+    from spinndrift.training.diagnosis.candidates import _memory, refined
+    from spinndrift.training.diagnosis.structures import Screen
 
     case, recording = recorded(tmp_path, 70002, "unknown", names=("memory",))
     hidden = case.answer()["causes"][0]
@@ -467,23 +468,33 @@ def test_structure_without_a_name_is_found_where_it_is(tmp_path):
     assert effect.numbers[1] == pytest.approx(parameters["frequency"]["value"], rel=0.15)
 
 
-def test_backlash_is_told_with_its_thruster_and_width(tmp_path):
-    """One thruster of eight follows its command with play: that one and no other, how much."""
-    from spinndrift.training.diagnosis.structures import described, refined
+@pytest.mark.parametrize(
+    ("name", "seed", "kind", "words"),
+    [
+        ("backlash", 70013, "play", "backlash"),
+        ("slew", 70004, "slew", "N/s at most"),
+        ("exchange", 70005, "exchange", "take each other's command"),
+    ],
+)
+def test_how_thrusters_follow_is_told_with_number_and_place(tmp_path, name, seed, kind, words):
+    """One thruster of eight with play, all at a limited rate, two wired to each other's drive."""
+    from spinndrift.training.diagnosis.candidates import described, refined
     from spinndrift.training.diagnosis.unknowns import screened
 
-    case, recording = recorded(tmp_path, 70013, "unknown", names=("backlash",))
+    case, recording = recorded(tmp_path, seed, "unknown", names=(name,))
     hidden = case.answer()["causes"][0]
     bench = Diagnoser(recording, VEHICLE).bench
     rng = np.random.default_rng(0)
     seen = screened(bench, bench.look(bench.believed), [], 0.01, rng)
     assert seen is not None
     effect = refined(seen[0], seen[1], rng)
-    assert (effect.kind, effect.acts_on) == ("play", hidden["where"])
-    assert effect.numbers[0] == pytest.approx(hidden["parameters"]["width"]["value"], rel=0.1)
+    assert (effect.kind, effect.acts_on) == (kind, hidden["where"])
     told = described(effect, np.ones(1), bench)
-    assert told["variables"] == [f"f{hidden['where']}"]
-    assert "backlash" in told["description"]
+    assert told["variables"] == list(case.answer()["causes"][0]["variables"])
+    if name != "exchange":
+        (number,) = hidden["parameters"].values()
+        assert effect.numbers[0] == pytest.approx(number["value"], rel=0.1)
+    assert words in told["description"]
 
 
 def test_single_precision_is_refused_with_a_remedy(tmp_path):

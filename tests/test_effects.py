@@ -12,10 +12,11 @@ from spinndrift.models import se3
 from spinndrift.models.checkpoint import load_model, save_model
 from spinndrift.models.effects import KINDS, Extended, Library
 from spinndrift.models.effects.drag import COUPLINGS
+from spinndrift.models.effects.following import FOLLOWERS, ramped, taken_up
 from spinndrift.models.effects.predict import advance
 from spinndrift.models.effects.recent import Recent
 from spinndrift.models.effects.thrust import REFERENCE
-from spinndrift.models.effects.unknown import Unknown, taken_up
+from spinndrift.models.effects.unknown import Unknown
 from spinndrift.models.errors import UserError
 from spinndrift.models.integrate import rollout
 from spinndrift.models.vehicle import load_vehicle
@@ -503,7 +504,7 @@ def test_play_encloses_its_area_at_any_speed_and_refinement():
     command = A * jnp.sin(jnp.linspace(0.0, 6 * np.pi, 3 * steps - 2))
 
     def followed(u):
-        return jax.lax.scan(lambda f, x: 2 * (taken_up(f, x, play),), jnp.zeros(1), u[:, None])[1]
+        return jax.lax.scan(lambda f, x: taken_up(f, x, 0.1, play), jnp.zeros(1), u[:, None])[1]
 
     out = np.asarray(followed(command))[:, 0]
     assert np.abs(out - command).max() <= play + 1e-12
@@ -513,6 +514,43 @@ def test_play_encloses_its_area_at_any_speed_and_refinement():
     turns = np.flatnonzero(np.diff(np.diff(np.asarray(command)) > 0)) + 1
     kept = np.unique([0, *turns, *range(0, len(command), 37)])
     np.testing.assert_array_equal(np.asarray(followed(command[kept]))[:, 0], out[kept])
+
+
+def test_a_drive_of_limited_rate_follows_as_its_differential_equation():
+    """ḟ = R sign(u - f) until f = u, by fine steps; means over steps are exact."""
+    rate, h, fine = 25.0, 0.05, 2000
+    commands = np.random.default_rng(0).normal(0, 5, (40, 3))
+    f, seen = np.zeros(3), []
+    for u in commands:
+        path = []
+        for _ in range(fine):
+            after = f + np.clip(u - f, -rate * h / fine, rate * h / fine)
+            path.append((f + after) / 2)
+            f = after
+        seen.append((f, np.mean(path, axis=0)))
+    now = jnp.zeros(3)
+    for u, (end, mean) in zip(commands, seen, strict=True):
+        now, over = ramped(now, jnp.asarray(u), h, rate)
+        np.testing.assert_allclose(now, end, atol=1e-9)
+        np.testing.assert_allclose(over, mean, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", FOLLOWERS)
+def test_what_follows_stays_where_its_command_stays(kind):
+    u = jnp.array([-3.0, 0.0, 7.0])
+    for part in FOLLOWERS[kind](u, u, 0.1, 2.0):
+        np.testing.assert_array_equal(part, u)
+
+
+def test_two_exchanged_thrusters_do_what_the_other_is_told():
+    force = jnp.arange(8.0)[:, None]
+    rest = se3.identity(jnp.float64)[:, None], jnp.zeros((6, 1))
+    plain = PLAIN.push(force, *rest)
+    swapped = force[np.array([0, 4, 2, 3, 1, 5, 6, 7])]
+    effect = Unknown.neutral(kind="exchange", acts_on="thrusters", numbers=(2.0, 5.0))
+    for share, wanted in ((0.0, plain), (1.0, PLAIN.push(swapped, *rest))):
+        model = PLAIN.with_effects((dataclasses.replace(effect, values=share + effect.values),))
+        np.testing.assert_allclose(model.push(force, *rest), wanted, atol=1e-12)
 
 
 @pytest.mark.parametrize("where", ["thrusters", "3"])

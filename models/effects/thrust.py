@@ -48,6 +48,7 @@ class ThrustCurve(Effect):
     )
     places: ClassVar = ALL_OR_ONE
     simpler: ClassVar = ("thrust_scale", "thruster_gain")
+    essential: ClassVar = ("exponent",)
     order: ClassVar[int] = 11
     source: ClassVar[str] = "5 to 15 % between bollard tests"
 

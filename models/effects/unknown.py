@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from .. import se3
 from ..networks import expand
 from .base import AXES, Effect, Parameter, Plant, axes_only, force_only
+from .following import FOLLOWERS
 
 TWIST = ("u", "v", "w", "p", "q", "r")
 MOTION: dict[str, Callable[[Array], Array]] = {
@@ -29,9 +30,9 @@ POSE = ("cos ψ", "sin ψ", "cos 2ψ", "sin 2ψ", "φ", "θ")
 POWERS = ("|f|f", "f²", "f³")
 """Terms in a thruster's own force, in tens of newtons."""
 WORLD = ("east", "north", "up")
-_SIZES = {"flow": 0.004, "place": 0.1, "depth": 0.1, "play": 0.3}
-_TAKEN_UP = 2.0
-"""Seconds of commands after which the side on which play lies is known, about."""
+_SIZES = {"flow": 0.004, "place": 0.1, "depth": 0.1, "play": 0.3, "slew": 0.3, "exchange": 0.1}
+_FOLLOWED = 2.0
+"""Seconds of commands after which it is known where thrusters that follow them are, about."""
 _PUSHES = ("motion", "pose", "place", "depth", "damping")
 
 
@@ -45,8 +46,9 @@ class Unknown(Effect):
     for each; numbers s (m) and centres. `flow`: the same as a velocity of the water. `depth`: a
     force in W of (z - c) / s and its square, in three directions; numbers c and s (m). `damping`:
     a wrench on an axis of (z - c) / s times its own velocity, and times that velocity's square.
-    `play`: one thruster or all (`thrusters`) follow commands with backlash of ± numbers[0] (N),
-    weighed against following them at once.
+    `play` and `slew`: one thruster or all (`thrusters`) follow commands with backlash of
+    ± numbers[0] (N) or at most at numbers[0] (N/s), weighed against following them at once.
+    `exchange`: two thrusters, by number, take each other's command, of which it is the share.
     """
 
     name: ClassVar[str] = "unknown"
@@ -76,8 +78,8 @@ class Unknown(Effect):
             return POSE
         if self.kind == "thruster":
             return POWERS
-        if self.kind == "play":
-            return ("play",)
+        if self.kind in FOLLOWERS or self.kind == "exchange":
+            return (self.kind,)
         if self.kind == "depth":
             return tuple(f"{d} z{p}" for p in ("", "²") for d in WORLD)
         if self.kind == "damping":
@@ -92,14 +94,16 @@ class Unknown(Effect):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        unit = {"flow": "m/s", "play": "1"}.get(self.kind, "N a unit or N·m a unit")
+        units = {"flow": "m/s", "exchange": "1", **dict.fromkeys(FOLLOWERS, "1")}
+        unit = units.get(self.kind, "N a unit or N·m a unit")
         return tuple(Parameter(t, unit, (_SIZES.get(self.kind, 1.0),)) for t in self.terms)
 
     def size(self) -> int:  # pyright: ignore[reportIncompatibleMethodOverride]
         return len(self.terms)
 
     def acts(self, hook: str) -> bool:  # pyright: ignore[reportIncompatibleMethodOverride]
-        acting = {"flow": "flow", "memory": "feel", "thruster": "thrust", "play": "actuate"}
+        acting = {"flow": "flow", "memory": "feel", "thruster": "thrust", "exchange": "thrust"}
+        acting |= dict.fromkeys(FOLLOWERS, "actuate")
         return hook == acting.get(self.kind, "wrench")
 
     # ---------------------------------------------------------------------------------- terms
@@ -161,6 +165,11 @@ class Unknown(Effect):
         voltage: Float[Array, "1 *#batch"],
         plant: Plant,
     ) -> Float[Array, "n *#batch"]:
+        if self.kind == "exchange":
+            order = list(range(len(force)))
+            i, j = (int(k) - 1 for k in self.numbers)
+            order[i], order[j] = j, i
+            return force + self.column(force) * (force[np.array(order)] - force)
         if self.kind != "thruster":
             return force
         k = int(self.acts_on) - 1
@@ -177,15 +186,17 @@ class Unknown(Effect):
 
     @property
     def memory_size(self) -> int:
-        return {"memory": 2, "play": self.thrusters}.get(self.kind, 0)
+        return self.thrusters if self.kind in FOLLOWERS else 2 * (self.kind == "memory")
 
     @property
     def lasts(self) -> float:
-        return {"memory": 5 * self.numbers[0], "play": _TAKEN_UP}.get(self.kind, 0.0)
+        if self.kind in FOLLOWERS:
+            return _FOLLOWED
+        return 5 * self.numbers[0] if self.kind == "memory" else 0.0
 
     def initial(self, command: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
-        """Of play the command itself: on which side the play lies is not known."""
-        return command if self.kind == "play" else super().initial(command)
+        """Of thrusters that follow, the command itself: where they are is not known."""
+        return command if self.kind in FOLLOWERS else super().initial(command)
 
     def actuate(
         self,
@@ -193,16 +204,17 @@ class Unknown(Effect):
         level: Float[Array, "n *#batch S"],
         dt: Float[Array, "..."],
     ) -> tuple[Float[Array, "m *#batch"], Float[Array, "n *#batch S"]]:
-        if self.kind != "play":
+        if self.kind not in FOLLOWERS:
             return memory, level
-        weight, followed = self.column(level[..., 0]), []
+        follow, h = FOLLOWERS[self.kind], dt / level.shape[-1]
+        weight, means = self.column(level[..., 0]), []
         if self.acts_on != "thrusters":
             one = jnp.arange(len(level)) == int(self.acts_on) - 1
             weight = weight * expand(one.astype(level.dtype), level.ndim - 1)
         for s in range(level.shape[-1]):
-            memory = taken_up(memory, level[..., s], self.numbers[0])
-            followed.append(level[..., s] + weight * (memory - level[..., s]))
-        return memory, jnp.stack(followed, axis=-1)
+            memory, mean = follow(memory, level[..., s], h, self.numbers[0])
+            means.append(level[..., s] + weight * (mean - level[..., s]))
+        return memory, jnp.stack(means, axis=-1)
 
     def feel(
         self, memory: Float[Array, "2 *#batch"], V_WB_B: Float[Array, "6 *#batch"], dt: Any
@@ -229,16 +241,6 @@ def convolved(
     square = a * a + b * b
     re, im = ((c - 1) * a + s * b) / square, (s * a - (c - 1) * b) / square
     return jnp.stack([c * z[0] - s * z[1] + re * x, s * z[0] + c * z[1] + im * x])
-
-
-def taken_up(
-    before: Float[Array, "n *#b"], command: Float[Array, "n *#b"], play: float
-) -> Float[Array, "n *b"]:
-    """What follows a command with backlash of ± `play`: it moves where the command pushes it.
-
-    The play operator of hysteresis (Krasnosel'skii and Pokrovskii 1989).
-    """
-    return jnp.clip(before, command - play, command + play)
 
 
 def powers(force: Float[Array, " *b"]) -> Float[Array, "3 *b"]:

@@ -40,6 +40,7 @@ class Check:
         """Diagnose, judge, tell."""
         from rich.table import Table as Shown
 
+        from ...models.checks import require_rate
         from ..check.cases import find_cases
         from ..check.pages import write_page
         from ..check.run import run_cases
@@ -47,6 +48,7 @@ class Check:
 
         if self.docs is not None and self.docs.suffix != ".md":
             raise UserError(f"--docs {self.docs}: end the name in .md")
+        require_rate(self.alpha, "--alpha")
         cases = find_cases(self.cases, self.only)
         with progress_bar(f"{len(cases)} cases") as update:
             rows, failed = run_cases(cases, self.out, self.alpha, update, self.rivals, self.workers)

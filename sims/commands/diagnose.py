@@ -99,10 +99,11 @@ class Diagnose:
 
     def _check(self) -> None:
         """Refuse options that can't be meant, before anything is read."""
+        from ...models.checks import require_rate
+
         if self.out.exists() and not self.out.is_dir():
             raise UserError(f"--out {self.out}: is a file; name a folder")
-        if not 0 < self.alpha < 0.5:
-            raise UserError(f"--alpha {self.alpha:g}: give a rate above 0 and below 0.5")
+        require_rate(self.alpha, "--alpha")
         if self.diffusion is None:
             return
         if self.model is not None:

@@ -87,8 +87,8 @@ class Effect:
         """(8,) s."""
         return np.zeros(8)
 
-    def follow(self, before: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """What the drive takes the command (8, B) for, `before` being what it took the last for."""
+    def follow(self, before: np.ndarray, u: np.ndarray, h: float) -> np.ndarray:
+        """What the drive makes of the command (8, B) within h s, `before` being what it made."""
         return u
 
     def distort(self, u: np.ndarray, volts: np.ndarray) -> np.ndarray:

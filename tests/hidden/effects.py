@@ -68,6 +68,8 @@ UNKNOWN: dict[str, type] = {
     "appendage": unknown.Appendage,
     "memory": unknown.Memory,
     "backlash": unknown.Backlash,
+    "slew": unknown.Slew,
+    "exchange": unknown.Exchange,
 }
 
 

@@ -169,7 +169,7 @@ class Backlash(_Unknown):
     def neutral(self) -> bool:
         return self.width == 0
 
-    def follow(self, before: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def follow(self, before: np.ndarray, u: np.ndarray, h: float) -> np.ndarray:
         taken = np.minimum(np.maximum(before, u - self.width), u + self.width)
         concerned = np.isin(np.arange(1, 9), self.thruster or np.arange(1, 9))[:, None]
         return np.where(concerned, taken, u)
@@ -179,3 +179,64 @@ class Backlash(_Unknown):
         if rng.uniform() < 0.5:
             return cls(around(rng, 1.0 * size))
         return cls(around(rng, 2.0 * size), int(rng.integers(1, 9)))
+
+
+@dataclass(frozen=True)
+class Slew(_Unknown):
+    """Drives follow their command at most at a rate: ḟ = R sign(u − f) until f = u."""
+
+    kind = "slew"
+    variables = tuple(f"f{k}" for k in range(1, 9))
+    rate: float = np.inf
+
+    @property
+    def where(self) -> str:
+        return "thrusters"
+
+    def parameters(self) -> Parameters:
+        return {"rate": value(self.rate, "N/s")}
+
+    def neutral(self) -> bool:
+        return self.rate == np.inf
+
+    def follow(self, before: np.ndarray, u: np.ndarray, h: float) -> np.ndarray:
+        return before + np.clip(u - before, -self.rate * h, self.rate * h)
+
+    @classmethod
+    def drawn(cls, rng: Any, size: float) -> "Slew":
+        return cls(around(rng, 40.0 / size))
+
+
+@dataclass(frozen=True)
+class Exchange(_Unknown):
+    """Two thrusters are wired to each other's drive: each does what the other is told."""
+
+    kind = "exchange"
+    pair: tuple[int, int] = (1, 2)
+    share: float = 0.0
+
+    @property
+    def variables(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return tuple(f"f{k}" for k in self.pair)
+
+    @property
+    def where(self) -> str:
+        return "thrusters"
+
+    def parameters(self) -> Parameters:
+        return {"share": value(self.share, "1")}
+
+    def neutral(self) -> bool:
+        return self.share == 0
+
+    def distort(self, u: np.ndarray, volts: np.ndarray) -> np.ndarray:
+        mine, others = (k - 1 for k in self.pair)
+        found = u.copy()
+        found[mine] += self.share * (u[others] - u[mine])
+        found[others] += self.share * (u[mine] - u[others])
+        return found
+
+    @classmethod
+    def drawn(cls, rng: Any, size: float) -> "Exchange":
+        i, j = sorted(int(k) for k in rng.choice(8, 2, replace=False))
+        return cls((i + 1, j + 1), min(size, 1.0))

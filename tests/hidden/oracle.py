@@ -71,7 +71,7 @@ def predict(
     B = truth.states.shape[2]
     run = np.arange(B)
     samples = np.rint(truth.t / h).astype(int) + lead
-    taken = plant.followed(truth.held)
+    taken = plant.followed(truth.held, h)
     X, V = [], []
     for n in starts:
         span = samples[n : n + steps + 1] - samples[n]

@@ -42,19 +42,19 @@ class Plant:
             u = effect.distort(u, volts)
         return u
 
-    def follow(self, before: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def follow(self, before: np.ndarray, u: np.ndarray, h: float) -> np.ndarray:
         for effect in self.effects:
-            u = effect.follow(before, u)
+            u = effect.follow(before, u, h)
         return u
 
-    def followed(self, held: np.ndarray) -> np.ndarray:
+    def followed(self, held: np.ndarray, h: float) -> np.ndarray:
         """`follow` over commands by inner step (steps, 8, B), from a drive at rest."""
         if all(type(e).follow is Effect.follow for e in self.effects):
             return held
         taken = np.empty_like(held)
         before = np.zeros_like(held[0])
         for i, u in enumerate(held):
-            taken[i] = before = self.follow(before, u)
+            taken[i] = before = self.follow(before, u, h)
         return taken
 
     def flow(self, p: np.ndarray, t: float, latents: dict[int, Latent]) -> tuple | None:

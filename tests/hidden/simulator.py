@@ -138,7 +138,7 @@ def simulate(
             forces[n, :, due] = wanted.T
             index[due] += 1
         held[i] = current
-        taken[i] = plant.follow(taken[i - 1], current)
+        taken[i] = plant.follow(taken[i - 1], current, h)
         u = delayed(taken, i, plant.delay, h)
         steady = plant.steady_thrust(u, setup.voltage)
         latents = {k: e.advance(latents[k], h, own[k]) for k, e in enumerate(plant.effects)}

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ...models.checks import check_numbers, require
+from ...models.checks import check_numbers, require, require_rate
 from ...models.dynamics import Dynamics
 from ...models.effects.base import AXES, Effect
 from ...models.effects.extended import Extended
@@ -82,7 +82,7 @@ class DiagnoseConfig:
 
     def __post_init__(self) -> None:
         check_numbers(self)
-        require(0 < self.alpha < 0.5, self, "alpha", "give a rate between 0 and 0.5")
+        require_rate(self.alpha, "DiagnoseConfig.alpha")
         require(self.most >= 1, self, "most", "give at least 1")
         require(self.horizon > 0, self, "horizon", "give a positive time")
 
@@ -222,7 +222,6 @@ class Diagnoser:
             alpha=config.alpha,
             seconds=time.monotonic() - started,
         )
-        self.progress(1.0, "done")
         extended = Extended.create(
             bench.model.base,
             (*bench.library.used(final.theta), *stirring),
@@ -386,9 +385,11 @@ def _diagnose(
     found = diagnoser.run()
     first = found.diagnosis
     if config.refit != "auto" or not diagnoser.driven or not coefficients_are_off(first):
+        progress(1.0, "done")
         return found
     progress(0.0, "again with all coefficients fitted, for most are off")
     again = Diagnoser(recording, vehicle, base, replace(config, refit="all"), progress).run()
+    progress(1.0, "done")
     second = again.diagnosis
     if best_gain(second) < best_gain(first) + _CLEARLY:
         return found

@@ -10,10 +10,9 @@ chosen with the fit; groups with nodes (time constants, frequencies) take the be
 folds. Groups are added one at a time, each beside those before (orthogonal matching by groups).
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -25,7 +24,7 @@ from ...models import se3
 from ...models.dynamics import Flow
 from ...models.effects.base import AXES
 from ...models.effects.extended import Extended, times
-from ...models.effects.unknown import MOTION, TWIST, Unknown, powers
+from ...models.effects.unknown import Unknown
 from .hypotheses import Chance
 from .looking import Bench, Look
 from .naming import CLEAR
@@ -34,19 +33,6 @@ from .responses import through
 LANES = 24
 PIECES = 60
 """Columns that one call of the compiled program takes, and pieces that are looked at."""
-_TENTHS = tuple(round(0.1 * k, 1) for k in range(5, 16))
-NODES = {
-    0.4: (0.0, 0.35, 1.0, 2.0),
-    1.2: (0.0, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0),
-    4.0: (0.0, 0.2, 0.35, *_TENTHS, 1.7, 2.0, 2.5, 3.0),
-}
-"""Times (s) that a memory fades in, and frequencies (Hz) for each, closest where vehicles and what
-hangs on them ring."""
-PLAYS = (0.3, 0.6, 1.2, 2.4, 4.8)
-"""Backlash (N) of thrusters that is tried, ±."""
-_CORRELATED, _MOST_CORRELATED = 0.1, 2
-"""Correlation of neighbouring innovations from which an axis may remember other velocities, and so
-many axes at most."""
 _PRIORS = (0.3, 3.0, 30.0)
 _LEAST, _ROBUST = 8.0, 2.5
 """Nats below which a gain is not looked at further, and standard errors between runs below which it
@@ -64,7 +50,7 @@ class Group:
         columns: of the wrench (N, component of the action, k, R) for a range of pieces.
         nodes: columns of each alternative.
         labels: the effect's first numbers at each node: time constant (s) and frequency (Hz) of a
-            memory, the play (N) of thrusters.
+            memory, the play (N) or rate (N/s) of thrusters, two that are exchanged.
     """
 
     effect: Unknown
@@ -92,9 +78,6 @@ class Matched:
     def gain(self) -> float:
         """Held-out nats."""
         return float(self.heldout.sum())
-
-
-# ------------------------------------------------------------------------------- the filter
 
 
 @eqx.filter_jit
@@ -353,243 +336,3 @@ def _of_water(
     unit = jnp.broadcast_to(jnp.eye(6, dtype=X.dtype)[:, :, None, None], (6, *current.shape))
     columns = jax.vmap(lambda e: jax.jvp(drift, (current,), (e,))[1])(unit)
     return drift(current), jnp.moveaxis(columns, 0, 1)
-
-
-# ------------------------------------------------------------------------------- the groups
-
-
-def groups(bench: Bench, look: Look, quiet: Sequence[str] = ()) -> Iterator[Group]:
-    """Everything that is tried; what axes that are `quiet` do with their motion can't be told."""
-    d = bench.data
-    nodes = [(time, f) for time, frequencies in NODES.items() for f in frequencies]
-    moving = [i for i, axis in enumerate(AXES) if axis not in quiet]
-    for i in _correlated(look):
-        for j in moving:
-            if j != i and i in moving:
-                yield _memory(bench, i, j, nodes)
-    for i in moving:
-        axis = AXES[i]
-        yield _memory(bench, i, i, nodes)
-        yield _of_state(bench, Unknown.neutral(kind="motion", acts_on=axis, numbers=_ALL_MOTION))
-        yield _of_state(bench, Unknown.neutral(kind="pose", acts_on=axis))
-    level = d.command != "F_Bo_B"
-    for k in range(d.u.shape[1] if level else 0):
-        yield _of_thruster(bench, k)
-        yield _of_play(bench, str(k + 1), PLAYS)
-    if level:
-        yield _of_play(bench, "thrusters", PLAYS)
-    z = d.X[:-1, 6][d.weight > 0]
-    numbers = (float(z.mean()), float(z.std() + 1e-3))
-    yield _of_state(bench, Unknown.neutral(kind="depth", acts_on="W", numbers=numbers))
-    for i in moving:
-        yield _of_state(bench, Unknown.neutral(kind="damping", acts_on=AXES[i], numbers=numbers))
-    bumps = _bumps(d.X[:-1, 4][d.weight > 0], d.X[:-1, 5][d.weight > 0])
-    if len(bumps) > 9:
-        for kind in ("place", "flow"):
-            yield _of_state(bench, Unknown.neutral(kind=kind, acts_on="W", numbers=bumps))
-
-
-_ALL_MOTION = tuple(float(i) for i in range(len(MOTION)))
-_VARIABLES = {
-    "motion": TWIST, "pose": ("heading", "roll", "pitch"), "depth": ("z",), "place": ("x", "y"),
-    "flow": ("x", "y"), "damping": ("z",),
-}  # fmt: skip
-
-
-def _of_state(bench: Bench, effect: Unknown) -> Group:
-    d, k = bench.data, effect.size()
-
-    def columns(kept: np.ndarray) -> np.ndarray:
-        X, V = (jnp.asarray(a[:-1][..., kept].swapaxes(0, 1)) for a in (d.X, d.V))
-        phi = np.moveaxis(np.asarray(effect.of_state(X, V)), 1, 0)  # (N, k, R)
-        if effect.acts_on != "W":
-            return phi[:, None]
-        count, found = phi.shape[1], np.zeros((len(phi), 3, k, len(kept)))
-        for number in range(k):
-            way, row = divmod(number, count)
-            if effect.kind == "depth":
-                row, way = divmod(number, 3)
-            found[:, way, number] = phi[:, row]
-        return found
-
-    action = {"place": "force", "depth": "force", "flow": "flow"}.get(effect.kind, "wrench")
-    return Group(effect, action, _VARIABLES[effect.kind], columns, (tuple(range(k)),))
-
-
-def _of_thruster(bench: Bench, k: int) -> Group:
-    effect = Unknown.neutral(kind="thruster", acts_on=str(k + 1))
-
-    def columns(kept: np.ndarray) -> np.ndarray:
-        return np.moveaxis(np.asarray(powers(jnp.asarray(bench.data.u[:, k][:, kept]))), 0, 1)[
-            :, None
-        ]
-
-    return Group(effect, "thruster", (f"f{k + 1}",), columns, (tuple(range(effect.size())),))
-
-
-def _of_play(bench: Bench, where: str, plays: Sequence[float]) -> Group:
-    """Backlash of one thruster or of all, one width a node."""
-    model, d = bench.model, bench.data
-    count, single = d.u.shape[1], where != "thrusters"
-    effect = Unknown.neutral(kind="play", acts_on=where, numbers=(plays[0],), thrusters=count)
-    of = [int(where) - 1] if single else list(range(count))
-
-    def columns(kept: np.ndarray) -> np.ndarray:
-        past, u = d.past[..., kept][:, of], d.u[..., kept][:, of]
-        behind = np.array([taken_up_by(past, u, play) - u for play in plays])  # (k, N, n, R)
-        acting = np.moveaxis(behind, 2, 0)  # (n, k, N, R)
-        if not single:
-            acting = np.asarray(model.allocate(jnp.asarray(acting)))
-        return np.moveaxis(acting, (0, 1), (1, 2))
-
-    variables = tuple(f"f{k + 1}" for k in of)
-    nodes = tuple((k,) for k in range(len(plays)))
-    action = "thruster" if single else "thrusters"
-    return Group(effect, action, variables, columns, nodes, tuple((p,) for p in plays))
-
-
-def taken_up_by(
-    past: Float[np.ndarray, "P n R"], u: Float[np.ndarray, "N n R"], play: float
-) -> Float[np.ndarray, "N n R"]:
-    """What follows commands u with backlash, those before them taken up too."""
-    found, state = np.empty_like(u), past[0]
-    for command in past:
-        state = np.clip(state, command - play, command + play)
-    for n, command in enumerate(u):
-        found[n] = state = np.clip(state, command - play, command + play)
-    return found
-
-
-def _correlated(look: Look) -> list[int]:
-    """Axes whose neighbouring innovations are correlated most, if they are."""
-    correlation = look.correlation[6:]
-    first = np.argsort(-correlation)[:_MOST_CORRELATED]
-    return [int(i) for i in first if correlation[i] > _CORRELATED]
-
-
-def _memory(bench: Bench, axis: int, of: int, nodes: Sequence[tuple[float, float]]) -> Group:
-    """A wrench on an axis that remembers a component of the twist."""
-    effect = Unknown.neutral(kind="memory", acts_on=AXES[axis], numbers=(*nodes[0], float(of)))
-
-    def columns(kept: np.ndarray) -> np.ndarray:
-        v = bench.data.V[:-1, of][:, kept]
-        rates = np.array([complex(-1 / t, 2 * np.pi * f) for t, f in nodes])[:, None]
-        z, found = np.zeros((len(nodes), len(kept)), complex), []
-        for x, h in zip(v, bench.data.step[:, kept], strict=True):
-            turn = np.exp(rates * h)
-            gain = (turn - 1) / rates
-            after = turn * z + gain * x
-            mean = (z + after) / 2
-            both = np.stack([mean.real, mean.imag], axis=1).reshape(2 * len(nodes), -1)
-            found.append(np.concatenate([x[None], both]))
-            z = after
-        return np.array(found)[:, None]
-
-    # at f = 0 the imaginary part is zero
-    columns_of = [
-        (0, 1 + 2 * i) if f == 0 else (0, 1 + 2 * i, 2 + 2 * i) for i, (_, f) in enumerate(nodes)
-    ]
-    return Group(effect, "wrench", (TWIST[of],), columns, tuple(columns_of), tuple(nodes))
-
-
-def _bumps(x: np.ndarray, y: np.ndarray, most: int = 16) -> tuple[float, ...]:
-    """Width and centres of bumps where the vehicle was, a width apart."""
-    width = 0.4
-    while True:
-        cells, counts = np.unique(
-            np.round(np.stack([x, y]) / width).astype(int), axis=1, return_counts=True
-        )
-        centres = cells[:, counts > 0.002 * len(x)] * width
-        if centres.shape[1] <= most:
-            return (width, *(float(c) for c in centres.T.ravel()))
-        width *= 1.2
-
-
-# --------------------------------------------------------------------------- what was found
-
-
-_FINER = (1.4, 1.18, 1.08)
-"""Factors by which numbers between nodes are sought."""
-
-
-def refined(screen: Screen, found: Matched, rng: np.random.Generator) -> Unknown:
-    """The effect of a match: a memory's numbers between the nodes, the few terms of a motion."""
-    effect = found.group.effect
-    if effect.kind == "memory":
-        axis, of = AXES.index(effect.acts_on), effect.remembered
-        T, f = found.group.labels[found.node]
-        for spread in _FINER:
-            # a ring that decays within the runs tells its frequency to a fraction of 1 / T
-            step = (spread - 1) * max(f, 0.2)
-            frequencies = [g for g in (f - step, f, f + step) if g >= 0.03] if f else [0.0]
-            times = (T / spread, T, T * spread)
-            finer = _memory(screen.bench, axis, of, [(t, g) for g in frequencies for t in times])
-            again = screen.match(finer, 0.01, rng, draws=0)
-            T, f = finer.labels[again.node]
-        return Unknown.neutral(kind="memory", acts_on=effect.acts_on, numbers=(T, f, float(of)))
-    if effect.kind == "play":
-        (width,) = found.group.labels[found.node]
-        for spread in _FINER:
-            plays = (width / spread, width, width * spread)
-            finer = _of_play(screen.bench, effect.acts_on, plays)
-            width = plays[screen.match(finer, 0.01, rng, draws=0).node]
-        return replace(effect, numbers=(width,))
-    if effect.kind == "motion":
-        chosen = screen.sparse(found.group)
-        return Unknown.neutral(kind="motion", acts_on=effect.acts_on, numbers=chosen)
-    return effect
-
-
-def described(effect: Unknown, weights: np.ndarray, bench: Bench) -> dict[str, Any]:
-    """Variables, one sentence, lag, frequency and region of what was matched."""
-    d = bench.data
-    exists = d.weight > 0
-    heading = np.arctan2(
-        2 * (d.X[:-1, 0] * d.X[:-1, 3] + d.X[:-1, 1] * d.X[:-1, 2]),
-        1 - 2 * (d.X[:-1, 2] ** 2 + d.X[:-1, 3] ** 2),
-    )
-    seen = {n: d.V[:-1, i] for i, n in enumerate(TWIST)}
-    seen |= {"x": d.X[:-1, 4], "y": d.X[:-1, 5], "z": d.X[:-1, 6], "heading": heading}
-    seen |= {f"f{k + 1}": d.u[:, k] for k in range(d.u.shape[1])}
-    lag = frequency = None
-    where = effect.acts_on
-    variables: Sequence[str] = _VARIABLES.get(effect.kind, ())
-    if effect.kind == "memory":
-        lag, frequency = effect.numbers[:2]
-        variables = (effect.terms[0],)
-        rings = f" and rings at {frequency:.2f} Hz" if frequency else ""
-        told = f"a wrench on {where} that remembers {variables[0]} for {lag:.2g} s{rings}"
-    elif effect.kind == "motion":
-        order = np.argsort(-np.abs(weights))
-        told = f"a wrench on {where} in " + ", ".join(effect.terms[i] for i in order)
-        variables = [n for n in TWIST if any(n in effect.terms[i] for i in order)]
-    elif effect.kind == "thruster":
-        variables = (f"f{where}",)
-        told = f"the force of thruster {where} against its command"
-    elif effect.kind == "play":
-        single = where != "thrusters"
-        variables = (f"f{where}",) if single else tuple(f"f{k + 1}" for k in range(d.u.shape[1]))
-        who = f"thruster {where} following its" if single else "thrusters that follow their"
-        told = f"{who} commands with backlash of {effect.numbers[0]:.2g} N"
-    elif effect.kind == "pose":
-        told = f"a wrench on {where} that depends on heading, roll or pitch"
-    elif effect.kind == "damping":
-        variables = ("z", TWIST[AXES.index(where)])
-        told = f"damping of {where} that depends on depth"
-    elif effect.kind == "depth":
-        told = "a force in W that depends on depth"
-    else:
-        what = "moving water" if effect.kind == "flow" else "a force"
-        count = len(weights) // 2
-        size = np.hypot(weights[:count], weights[count:])
-        x, y = np.array(effect.numbers[1:]).reshape(-1, 2)[int(np.argmax(size))]
-        told = f"{what} that depends on the place in W (x, y), largest near ({x:.1f}, {y:.1f}) m"
-    region = {}
-    for name in variables:
-        if name in seen:
-            low, high = np.percentile(seen[name][exists], (2, 98))
-            region[name] = (float(low), float(high))
-    return {
-        "acts_on": where, "variables": list(variables), "description": told, "lag": lag,
-        "frequency": frequency or None, "region": region,
-    }  # fmt: skip

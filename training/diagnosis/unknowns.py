@@ -7,13 +7,14 @@ import numpy as np
 from jaxtyping import Float
 
 from . import result
+from .candidates import described, groups, refined
 from .disturbance import best_law
 from .hypotheses import Design, Fit
 from .looking import Bench, Look
 from .naming import Choice, admissible, parameters_of
 from .responses import respond
 from .search import Found
-from .structures import Matched, Screen, described, groups, refined
+from .structures import Matched, Screen
 
 BEATS = 1.5
 """Times the best name's gain that structure without a name must win."""

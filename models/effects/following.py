@@ -1,0 +1,36 @@
+"""How drives follow commands that they can't follow at once, by one number each."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Follower = Callable[[Array, Array, Any, Any], tuple[Array, Array]]
+"""What follows a command that is held for a time (s): at the end of it, and its mean."""
+
+
+def taken_up(
+    before: Float[Array, "*#b"], command: Float[Array, "*#b"], held: Any, play: Any
+) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+    """With backlash of ± `play` (N): it moves where the command pushes it.
+
+    The play operator of hysteresis (Krasnosel'skii and Pokrovskii 1989).
+    """
+    del held
+    after = jnp.clip(before, command - play, command + play)
+    return after, after
+
+
+def ramped(
+    before: Float[Array, "*#b"], command: Float[Array, "*#b"], held: Any, rate: Any
+) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+    """At most at `rate` (N/s): a straight way to the command, then the command; exact means."""
+    way, most = command - before, rate * held
+    after = before + jnp.clip(way, -most, most)
+    there = jnp.abs(way) < most
+    on_the_way = -way * jnp.abs(way) / (2 * most)
+    return after, jnp.where(there, command + on_the_way, (before + after) / 2)
+
+
+FOLLOWERS: dict[str, Follower] = {"play": taken_up, "slew": ramped}

@@ -41,7 +41,9 @@ Refit = Literal["auto", "none", "scales", "linear", "command", "all"]
 _CLEARLY, _MANY = 0.05, 3
 """Nats a sample that coefficients fitted to other runs must win over all causes together before a
 belief counts as wrong in most of them, and causes beyond which it may be."""
-_MOST_UNKNOWN = 2
+_MOST_UNKNOWN, _NAMES_FIRST = 2, 2
+"""Structures without a name at most, and names after which the first is looked for where more names
+are to come: what has none takes many."""
 _RIVALS = 0.25
 """Share of what the best law wins below which names leave it to structure without a name."""
 _RESAMPLED, _OF_A_STEP, _NO_TIME = 0.02, 0.1, 0.06
@@ -278,7 +280,8 @@ class Diagnoser:
     ) -> tuple[Bench, list[int], dict[Hypothesis, result.Structure]]:
         """Names, structure without a name, and names beside it; it widens the library by an effect.
 
-        Where a law of the disturbance wins far more than any name, structure is looked for first.
+        Where a law of the disturbance wins far more than any name, structure is looked for first;
+        where more than two names are needed, it is looked for before the third.
         """
         config, structures = self.config, {}
         search = self._names(bench, nuisance, 0.1, 0.5)
@@ -286,11 +289,21 @@ class Diagnoser:
         found.fits = found.left
         best = 0.0 if choice is None else choice.fit.heldout_gain
         law = best_law(bench, found.first)
+        seen = None
         if _RIVALS * law < max(best, found.threshold + _LAW_MARGIN):
+            search.most = min(_NAMES_FIRST, config.most)
             bench = search.run(found).bench
+            if len(found.accepted) == _NAMES_FIRST and search.next(found)[0] is not None:
+                found.left = search.next(found)[1]
+                seen = seek(bench, nuisance, found, config.alpha, self.rng, self.quiet)
+            search.most = config.most
+            if found.accepted or seen is None:  # else in place of names
+                seen = None
+                bench = search.run(found).bench
         for number in range(_MOST_UNKNOWN):
             self.progress(0.52 + 0.1 * number, "structure without a name")
-            seen = seek(bench, nuisance, found, config.alpha, self.rng, self.quiet)
+            if seen is None:
+                seen = seek(bench, nuisance, found, config.alpha, self.rng, self.quiet)
             taken = {e.places[0] for e in bench.library.effects if e.name == "unknown"}
             if seen is None or seen.matched.group.effect.acts_on in taken:
                 if number == 0 and not found.accepted:
@@ -301,7 +314,7 @@ class Diagnoser:
             where = found.hypotheses[-1][1]
             structures["unknown", where] = structure(bench, where, found.current.theta, seen)
             again = self._names(bench, nuisance, 0.55 + 0.1 * number, 0.6 + 0.1 * number)
-            bench = again.run(found).bench
+            bench, seen = again.run(found).bench, None
         return bench, nuisance, structures
 
     def _gain(

@@ -460,6 +460,7 @@ def test_a_memory_without_a_name_is_its_convolution(of):
         ("depth", "W", (-3.0, 0.5)),
         ("pose", "heave", (0.0,)),
         ("damping", "heave", (-3.0, 0.5)),
+        ("exchange", "thrusters", (2.0, 5.0)),
     ],
 )
 def test_what_has_no_name_is_stored_and_moves_the_vehicle(tmp_path, kind, acts_on, numbers):
@@ -554,8 +555,13 @@ def test_two_exchanged_thrusters_do_what_the_other_is_told():
 
 
 @pytest.mark.parametrize("where", ["thrusters", "3"])
-def test_play_acts_on_the_thrusters_that_have_it(tmp_path, where):
-    effect = Unknown.neutral(kind="play", acts_on=where, numbers=(1.5,))
+@pytest.mark.parametrize(
+    ("kind", "number", "means"),
+    # means over the second half of steps of 0.05 s
+    [("play", 1.5, (0.5, -2.5, -1.5)), ("slew", 20.0, (0.75, 0.25, 0.0))],
+)
+def test_followers_act_on_the_thrusters_that_are_such(tmp_path, where, kind, number, means):
+    effect = Unknown.neutral(kind=kind, acts_on=where, numbers=(number,))
     model = PLAIN.with_effects((dataclasses.replace(effect, values=1 + effect.values),))
     save_model(tmp_path / "m.spinn", model)
     model = load_model(tmp_path / "m.spinn")[0]
@@ -566,8 +572,8 @@ def test_play_acts_on_the_thrusters_that_have_it(tmp_path, where):
         memory, level = model.actuate(memory, jnp.broadcast_to(jnp.asarray(u), (8, 1)), 0.05, 2)
         forces.append(np.asarray(level)[:, 0, -1])
     concerned = np.isin(np.arange(1, 9), range(1, 9) if where == "thrusters" else [int(where)])
-    for force, plays, prompt in zip(forces, (0.5, -2.5, -1.5), (2.0, -4.0, 0.0), strict=True):
-        np.testing.assert_allclose(force, np.where(concerned, plays, prompt), atol=1e-12)
+    for force, follows, prompt in zip(forces, means, (2.0, -4.0, 0.0), strict=True):
+        np.testing.assert_allclose(force, np.where(concerned, follows, prompt), atol=1e-12)
 
 
 def test_a_late_twist_that_differs_from_the_prediction_keeps_what_drag_leaves():

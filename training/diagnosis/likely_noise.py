@@ -125,7 +125,10 @@ def most_likely(
     moved = np.concatenate([heard, ~held])
     x = model.likeliest(np.log(start), np.log(least), moved)
     found = np.exp(x)
-    curvature = model.fisher(x, model.loss(x)[1])[1][np.ix_(moved, moved)] * len(blocks) / 2
+    loss, inverse = model.loss(x)
+    if not np.isfinite(loss):  # predictions that nearly diverge
+        return start, start[12:]
+    curvature = model.fisher(x, inverse)[1][np.ix_(moved, moved)] * len(blocks) / 2
     size = np.sqrt(np.diag(curvature))  # poses and forces are of unlike sizes
     covariance = np.linalg.pinv(curvature / np.outer(size, size), hermitian=True)
     relative = np.zeros(len(found))

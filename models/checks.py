@@ -22,7 +22,7 @@ def require(condition: bool, config: Any, field: str, remedy: str) -> None:
 def require_rate(value: float, named: str) -> None:
     """Raise `UserError`, by the name that a user knows, unless it is a rate of false alarms."""
     if not 0 < value < 0.5:
-        raise UserError(f"{named} is {value:g}: give a rate above 0 and below 0.5")
+        raise UserError(f"{named} {value:g}: give a rate above 0 and below 0.5")
 
 
 def check_numbers(config: Any) -> None:

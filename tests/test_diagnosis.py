@@ -239,7 +239,7 @@ def test_a_lag_is_named_measured_and_extended(tmp_path):
         assert table["1"].value == pytest.approx(float(band.split()[0]) / 100, abs=0.1)
     assert [effect.name for effect in finding.extended.effects] == ["thruster_lag"]
     assert seen == sorted(seen)
-    assert seen[-1] == 1
+    assert 0.9 < seen[-1] < 1, "a second pass may follow"
     check(json.loads(d.as_json()), schema())
     assert min(d.causes[0].experiments.values()) >= 0
     html = diagnosis_page(finding, "A lag").html()

@@ -77,6 +77,23 @@ def check_writable(path: str | os.PathLike[str], called: str = "") -> None:
 
 
 @contextmanager
+def partial_folder(partial: Path, called: str | os.PathLike[str]) -> Iterator[Path]:
+    """Make a folder that is gone when the block ends, unless it was moved to its place: `called`.
+
+    Raises:
+        UserError: it can't be made.
+    """
+    try:
+        partial.mkdir(parents=True)
+    except OSError as error:
+        raise UserError(f"{called}: can't make this folder ({error.strerror})") from error
+    try:
+        yield partial
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextmanager
 def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary folder whose files take their places in `folder` when the block ends.
 
@@ -90,11 +107,7 @@ def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
     final = Path(os.path.realpath(folder))
     name = f".partial-{secrets.token_hex(8)}"
     partial = final / name if final.is_dir() else final.with_name(name)
-    try:
-        partial.mkdir(parents=True)
-    except OSError as error:
-        raise UserError(f"{folder}: can't make this folder ({error.strerror})") from error
-    try:
+    with partial_folder(partial, folder):
         yield partial
         if not final.exists():
             os.replace(partial, final)
@@ -115,8 +128,6 @@ def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
         with interrupts_held():
             for new, at in files.items():
                 os.replace(new, at)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 import json
 import os
 import secrets
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
@@ -14,6 +13,7 @@ import numpy as np
 
 from ..models import config
 from ..models.errors import UserError
+from ..models.files import partial_folder
 from ..systems.wrench_limits import ThrusterLimits
 from ..training.provenance import revision
 from .criteria import ReachGoal
@@ -131,13 +131,6 @@ def atomic_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
     """
     final = Path(folder)
     check_free(final)
-    partial = final.with_name(f".partial-{secrets.token_hex(8)}")
-    try:
-        partial.mkdir(parents=True)
-    except OSError as error:
-        raise UserError(f"{final}: can't make this folder ({error.strerror})") from error
-    try:
+    with partial_folder(final.with_name(f".partial-{secrets.token_hex(8)}"), final) as partial:
         yield partial
         os.replace(partial, final)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)

@@ -291,12 +291,10 @@ class Diagnoser:
         law = best_law(bench, found.first)
         seen = None
         if _RIVALS * law < max(best, found.threshold + _LAW_MARGIN):
-            search.most = min(_NAMES_FIRST, config.most)
-            bench = search.run(found).bench
+            bench = search.run(found, _NAMES_FIRST).bench
             if len(found.accepted) == _NAMES_FIRST and search.next(found)[0] is not None:
                 found.left = search.next(found)[1]
                 seen = seek(bench, nuisance, found, config.alpha, self.rng, self.quiet)
-            search.most = config.most
             if found.accepted or seen is None:  # else in place of names
                 seen = None
                 bench = search.run(found).bench

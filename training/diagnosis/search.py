@@ -131,14 +131,14 @@ class Search:
         self.shortest = shortest
         self._asked: tuple[Look, tuple[Choice | None, dict[Hypothesis, Fit]]] | None = None
 
-    def run(self, found: Found) -> "Search":
-        """Add causes to `found` until none passes; all accepted are refitted together.
+    def run(self, found: Found, most: int | None = None) -> "Search":
+        """Add causes to `found` until none passes, or `most` are there; all are refitted together.
 
         Where exact fits take back what was added `_TAKEN_BACK` times in a row, what names promise
         is not to be had: the rest of them is not tried.
         """
         taken_back = 0
-        for number in range(len(found.accepted), self.most):
+        for number in range(len(found.accepted), min(most or self.most, self.most)):
             self.progress(number / self.most, f"{number} causes so far")
             choice, fits = self.next(found)
             found.fits = found.fits or fits

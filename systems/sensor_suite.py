@@ -12,12 +12,15 @@ from jaxtyping import Array
 from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from ..models.sensors import Compass, DepthSensor, Dvl, Imu, Sensor
+from ..models.sensors import Compass, DepthSensor, Dvl, Imu, Sensor, SensorFault
+from ..models.sensors.faults import FaultySensor
 from .jit import VectorFunction, value_or_zeros
-from .pure import Event, Inputs, Pure, State, shown
+from .pure import Event, Inputs, Pure, State
+from .pure import shown as shown_group
 
 Outputs = tuple[Array, ...]
 Motion = tuple[Array, Array, Array]
+NAMES = ("imu", "dvl", "depth", "compass")
 
 
 class SensorSuite(LeafSystem):
@@ -32,6 +35,10 @@ class SensorSuite(LeafSystem):
     A reading is new when its time is. At initialisation `initial_noise` draws the sensors' biases,
     offsets and scale errors. All four sensors take their unit Gaussians from `noise`, which should
     be drawn anew every IMU period. Unconnected inputs count as zero.
+
+    Faults (`models.sensors.faults`) act on what is shown; the sensors' own states and noise are
+    those without them. Faults that take chance have an input of their own, `fault_noise`, drawn as
+    `noise` is; without them there is no such port.
 
     .. pydrake_system::
 
@@ -56,8 +63,9 @@ class SensorSuite(LeafSystem):
         dvl: Dvl | None = None,
         depth: DepthSensor | None = None,
         compass: Compass | None = None,
+        faults: tuple[SensorFault, ...] = (),
     ):
-        """Carry the given sensors, or their defaults."""
+        """Carry the given sensors, or their defaults, with `faults` in what they show."""
         super().__init__()
         imu, dvl = imu or Imu(), dvl or Dvl()
         depth, compass = depth or DepthSensor(), compass or Compass()
@@ -72,10 +80,21 @@ class SensorSuite(LeafSystem):
         self._initial_noise = self.DeclareVectorInputPort(
             "initial_noise", sum(initial_sizes), gaussian
         )
+        shown = [
+            _Shown(s, tuple(f for f in faults if f.sensor == name))
+            for name, s in zip(NAMES, sensors, strict=True)
+        ]
+        fault_sizes = [part.noise_size for part in shown]
+        self._draws = [self._noise]
+        if sum(fault_sizes):
+            port = self.DeclareVectorInputPort("fault_noise", sum(fault_sizes), gaussian)
+            self._draws.append(port)
+
         self._sizes = [*(s.state_size for s in sensors), 6, 7, 3, 3]
+        self._sizes += [part.memory_size for part in shown if part.faults]
         groups = [self.DeclareDiscreteState(size) for size in self._sizes]
-        self._states, self._shown = groups[:4], groups[4:]
-        for name, index in zip(("imu", "dvl", "depth", "compass"), self._shown, strict=True):
+        self._states, self._shown = groups[:4], groups[4:8]
+        for name, index in zip(NAMES, self._shown, strict=True):
             self.DeclareStateOutputPort(name, index)
 
         self._start = VectorFunction(
@@ -84,26 +103,39 @@ class SensorSuite(LeafSystem):
             [s.state_size for s in sensors],
         )
         self.DeclareInitializationDiscreteUpdateEvent(self._initialise)
-        ends = np.cumsum([0, *sizes])
-        shares = [slice(a, b) for a, b in pairwise(ends)]
+        ends = np.cumsum([0, *sizes, *fault_sizes])
+        draws = [slice(a, b) for a, b in pairwise(ends)]
+        memories = iter(range(8, len(groups)))
 
-        def tick(motion: Motion, t: Array, w: Array, state: Array, dvl_state: Array) -> Outputs:
-            X, V, A = motion
-            state = imu.measure(state, X, V, A, t, w[shares[0]])
-            # A reading of the DVL becomes visible between its pings.
-            return state, imu.reading(state, t), dvl.reading(dvl_state, t)
+        def measured(i: int) -> _Part:
+            """A sensor's measurement; the DVL's appears between its pings and is shown apart."""
+            part, sensor = shown[i], sensors[i]
+            late = sensor is dvl
+            memory = (next(memories),) if part.faults and not late else ()
 
-        def ping(motion: Motion, t: Array, w: Array, state: Array) -> Outputs:
-            X, V, A = motion
-            return (dvl.measure(state, X, V, A, t, w[shares[1]]),)
+            def measure(motion: Motion, t: Array, w: Array, state: Array, *kept: Array) -> Outputs:
+                state = sensor.measure(state, *motion, t, w[draws[i]])
+                if late:
+                    return (state,)
+                reading = sensor.reading(state, t)
+                if sensor is not imu:  # it goes with a valid mark and its time
+                    reading = jnp.concatenate([reading, jnp.stack([jnp.ones_like(t), t])])
+                return state, *part.show(reading, t, w[draws[4 + i]], *kept)
 
-        n = [int(index) for index in groups]
-        parts = [
-            _Part(imu.rate, tick, (n[0], n[1]), (n[0], n[4], n[5])),
-            _Part(dvl.rate, ping, (n[1],), (n[1],)),
-            _Part(depth.rate, _stamped(depth, shares[2]), (n[2],), (n[2], n[6])),
-            _Part(compass.rate, _stamped(compass, shares[3]), (n[3],), (n[3], n[7])),
-        ]
+            writes = (i,) if late else (i, 4 + i, *memory)
+            return _Part(sensor.rate, measure, (i, *memory), writes)
+
+        def dvl_appears() -> _Part:
+            part = shown[1]
+            memory = (next(memories),) if part.faults else ()
+
+            def appear(motion: Motion, t: Array, w: Array, state: Array, *kept: Array) -> Outputs:
+                del motion
+                return part.show_held(dvl.reading(state, t), w[draws[5]], *kept)
+
+            return _Part(imu.rate, appear, (1, *((5, *memory) if memory else ())), (5, *memory))
+
+        parts = [measured(0), dvl_appears(), *(measured(i) for i in (1, 2, 3))]
         self._parts = parts
         # Sensors whose period is a multiple of the IMU's share its events and its calls.
         shared = [part for part in parts if _divides(part.rate, imu.rate)]
@@ -118,10 +150,11 @@ class SensorSuite(LeafSystem):
 
         def event(part: _Part) -> Event:
             def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
-                X, V, A, w = (
+                X, V, A, *draws = (
                     inputs.get(port.get_name(), jnp.zeros(port.size()))
-                    for port in (self._X, self._V, self._A, self._noise)
+                    for port in (self._X, self._V, self._A, *self._draws)
                 )
+                w = _joined(draws)
                 own = [state[index] for index in part.reads]
                 return dict(zip(part.writes, part.measure((X, V, A), t, w, *own), strict=True))
 
@@ -129,13 +162,14 @@ class SensorSuite(LeafSystem):
                 return Event(1 / base, update, round(base / part.rate))
             return Event(1 / part.rate, update)
 
-        names = ("imu", "dvl", "depth", "compass")
-        outputs = {name: shown(len(names) + i) for i, name in enumerate(names)}
-        return Pure(tuple(event(part) for part in self._parts), outputs, ("noise",))
+        outputs = {name: shown_group(len(NAMES) + i) for i, name in enumerate(NAMES)}
+        noise = tuple(port.get_name() for port in self._draws)
+        return Pure(tuple(event(part) for part in self._parts), outputs, noise)
 
     def _declare(self, parts: list["_Part"]) -> None:
         """Declare events at the first part's rate; the others take part in every so many."""
-        ports = (self._X, self._V, self._A, self._noise)
+        ports = (self._X, self._V, self._A, *self._draws)
+        drawn = [port.size() for port in self._draws]
         period = 1 / parts[0].rate
         every = [round(parts[0].rate / part.rate) for part in parts]
 
@@ -146,13 +180,14 @@ class SensorSuite(LeafSystem):
             reads = [index for part in used for index in part.reads]
             writes = [index for part in used for index in part.writes]
 
-            def packed(t: Array, X: Array, V: Array, A: Array, w: Array, *own: Array) -> Outputs:
-                values = iter(own)
+            def packed(t: Array, X: Array, V: Array, A: Array, *rest: Array) -> Outputs:
+                values = iter(rest)
+                w = _joined(list(islice(values, len(drawn))))
                 return sum(
                     (p.measure((X, V, A), t[0], w, *islice(values, len(p.reads))) for p in used), ()
                 )
 
-            inputs = [1, 7, 6, 6, self._noise.size(), *(self._sizes[i] for i in reads)]
+            inputs = [1, 7, 6, 6, *drawn, *(self._sizes[i] for i in reads)]
             function = VectorFunction(packed, inputs, [self._sizes[i] for i in writes])
             return function, reads, writes
 
@@ -195,12 +230,49 @@ def _divides(rate: float, of: float) -> bool:
     return ratio > 0.5 and abs(ratio - round(ratio)) < 1e-9 * ratio
 
 
-def _stamped(sensor: Sensor, share: slice) -> Callable[..., Outputs]:
-    """A measurement whose reading goes with a valid mark and its time."""
+def _joined(draws: list[Array]) -> Array:
+    return jnp.concatenate(draws) if len(draws) > 1 else draws[0]
 
-    def measure(motion: Motion, t: Array, w: Array, state: Array) -> Outputs:
-        X, V, A = motion
-        state = sensor.measure(state, X, V, A, t, w[share])
-        return state, jnp.concatenate([sensor.reading(state, t), jnp.stack([jnp.ones_like(t), t])])
 
-    return measure
+@dataclass(frozen=True)
+class _Shown:
+    """A sensor with the faults of what it shows."""
+
+    sensor: Sensor
+    faults: tuple[SensorFault, ...]
+
+    @property
+    def _faulty(self) -> FaultySensor:
+        return FaultySensor(self.sensor, self.faults)
+
+    @property
+    def noise_size(self) -> int:
+        """Unit Gaussians that the faults of one reading take."""
+        return self._faulty.noise_size
+
+    @property
+    def memory_size(self) -> int:
+        """Numbers that the faults remember, the DVL's also the reading that it held last."""
+        held = self.sensor.reading_size if isinstance(self.sensor, Dvl) else 0
+        return held + self._faulty.memory_size
+
+    def show(self, reading: Array, t: Array, w: Array, *memory: Array) -> Outputs:
+        """What is shown of a reading measured at t, and with faults their memory."""
+        if not self.faults:
+            return (reading,)
+        n = self.sensor.reading_size
+        marks = [jnp.stack([jnp.ones_like(t), t])] if reading.size == n else []  # the IMU's
+        kept, seen = self._faulty.show(memory[0], jnp.concatenate([reading, *marks]), t, w)
+        return seen[: reading.size], kept
+
+    def show_held(self, reading: Array, w: Array, *memory: Array) -> Outputs:
+        """The same of the DVL's reading, which a fault meets once, when it appears."""
+        if not self.faults:
+            return (reading,)
+        before, kept = memory
+        last, own = kept[: reading.size], kept[reading.size :]
+        bare = jnp.concatenate([reading[:4], reading[6:]])
+        own, seen = self._faulty.show(own, bare, reading[6], w)
+        seen = jnp.concatenate([seen[:4], reading[4:6], seen[4:]])
+        new = jnp.any(reading != last)
+        return jnp.where(new, seen, before), jnp.where(new, jnp.concatenate([reading, own]), kept)

@@ -83,7 +83,7 @@ def _simulated(config: StationConfig) -> Diagram:
     body = LearnedPlant(config.dynamics(), config.period, config.substeps, X0, V0, thrusters)
     plant = add("plant", body)
     water = add("disturbances", DisturbanceSource(config.disturbance(), water_period))
-    sensors = add("sensors", SensorSuite(s.imu, s.dvl, s.depth, s.compass))
+    sensors = add("sensors", SensorSuite(s.imu, s.dvl, s.depth, s.compass, s.faults))
     ekf = add("ekf", Ekf(s.imu, s.dvl, s.depth, s.compass, s.ekf, X0, V0))
 
     def connect(source, output: str, target, name: str | None = None) -> None:
@@ -108,6 +108,8 @@ def _simulated(config: StationConfig) -> Diagram:
     add_noise(builder, sensors, "noise", 1 / s.imu.rate)
     for system in (water, sensors, ekf):
         add_noise(builder, system, "initial_noise", _NEVER)
+    if sensors.HasInputPort("fault_noise"):  # the last source: it leaves the others their seeds
+        add_noise(builder, sensors, "fault_noise", 1 / s.imu.rate)
 
     builder.ExportInput(allocation.GetInputPort("F_Bo_B"), "F_Bo_B")
     for name in ("X_WB", "V_WB_B", "covariance"):

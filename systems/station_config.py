@@ -12,7 +12,7 @@ from ..models.disturbances import Combined, Kind, OrnsteinUhlenbeckWrench, prese
 from ..models.dynamics import Dynamics
 from ..models.effects.by_hand import EffectConfig, check_distinct
 from ..models.effects.extended import Extended, core
-from ..models.sensors import Compass, DepthSensor, Dvl, Imu
+from ..models.sensors import Compass, DepthSensor, Dvl, Imu, SensorFault
 from ..models.spinn import Spinn
 from ..models.vehicle import Vehicle, load_vehicle
 from .filtering.delayed import EkfConfig
@@ -22,13 +22,18 @@ from .paths import PoseConfig
 
 @dataclass(frozen=True)
 class Sensing:
-    """The sensors on board and the filter that fuses them."""
+    """The sensors on board, what goes wrong with them, and the filter that fuses them.
+
+    Attributes:
+        faults: of what the sensors show (`docs/sensor-faults.md`); the filter isn't told.
+    """
 
     imu: Imu = field(default_factory=Imu)
     dvl: Dvl = field(default_factory=Dvl)
     depth: DepthSensor = field(default_factory=DepthSensor)
     compass: Compass = field(default_factory=Compass)
     ekf: EkfConfig = field(default_factory=EkfConfig)
+    faults: tuple[SensorFault, ...] = ()
 
 
 @dataclass(frozen=True)

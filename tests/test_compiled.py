@@ -221,11 +221,14 @@ def test_a_state_that_runs_away_is_told():
     assert simulator.get_mutable_context().get_time() == 0.05
 
 
-STATION = "{duration: 1.5, station: {sensing: {dvl: {rate: 3.0}}}}"
+FAULTS = """[{sensor: imu, fault: frozen, start: 0.5, duration: 0.1},
+    {sensor: depth, fault: offset, start: 0.8, size: 0.2, share: 0.7}]"""
+STATION = f"{{duration: 1.5, station: {{sensing: {{dvl: {{rate: 3.0}}, faults: {FAULTS}}}}}}}"
 
 
 def test_the_station_in_a_harbour_flies_as_in_drake():
-    """All systems of a run without a planner; the DVL's period is no multiple of the IMU's."""
+    """All systems of a run without a planner; the DVL's period is no multiple of the IMU's, and
+    sensors fail."""
     scenario = load_scenario("trajectory_tracking_harbour", STATION)
     drake, loop = (simulate(scenario, engine=engine) for engine in ("drake", "compiled"))
     assert (drake.timing.engine, loop.timing.engine) == ("drake", "compiled")

@@ -5,4 +5,5 @@ from .compass import Compass as Compass
 from .compass import wrap as wrap
 from .depth import DepthSensor as DepthSensor
 from .dvl import Dvl as Dvl
+from .faults import SensorFault as SensorFault
 from .imu import Imu as Imu

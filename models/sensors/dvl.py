@@ -34,7 +34,8 @@ class Dvl(Sensor):
         scale_std: standard deviation of the scale error, constant during a run (1).
         earliest_latency: lower end of the latency's range (s).
         latest_latency: upper end (s), at most 1/rate; the latency is uniform between the two.
-        dropout_share: share of measurements that are in drop-outs (1).
+        dropout_share: share of measurements that are in drop-outs (1); at most L / (1 + L) with
+            L = dropout_length · rate, when a single measurement parts one drop-out from the next.
         dropout_length: mean length of a drop-out (s), at least 1/rate.
         outlier_share: share of the measurements that are outliers (1).
         outlier_std: standard deviation of an outlier's error (m/s).
@@ -63,8 +64,8 @@ class Dvl(Sensor):
         """Check signs, shares and that a reading appears before the next measurement."""
         super().__post_init__()
         self._require_not_negative("noise", "scale_std", "earliest_latency", "outlier_std")
-        for field in ("dropout_share", "outlier_share"):
-            require(0 <= getattr(self, field) <= 0.5, self, field, "give a share of 0 to 0.5")
+        require(0 <= self.outlier_share <= 1, self, "outlier_share", "give a share of 0 to 1")
+        require(0 <= self.dropout_share < 1, self, "dropout_share", "give a share of 0 to below 1")
         period = 1 / self.rate
         slack = 1e-9
         require(
@@ -75,6 +76,14 @@ class Dvl(Sensor):
         )
         long_enough = self.dropout_length >= period - slack
         require(long_enough, self, "dropout_length", "give at least 1/rate")
+        length = self.dropout_length * self.rate
+        require(
+            self.dropout_share <= length / (1 + length) + slack,
+            self,
+            "dropout_share",
+            f"drop-outs of {self.dropout_length:g} s with a valid measurement between them take a "
+            f"share of {length / (1 + length):.3g} at most; give less, or a longer dropout_length",
+        )
         require(
             self.highest_altitude > self.lowest_altitude,
             self,

@@ -1,0 +1,367 @@
+"""What can go wrong between a sensor and those who read it, by name and time.
+
+A fault acts on what a sensor shows: its reading, the valid mark and the stamp. Truth, the sensor's
+own errors and its saturation come before it. `docs/sensor-faults.md` lists all of them.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal, NamedTuple, get_args
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..checks import check_numbers, require
+from ..randomness import bernoulli, column
+from .base import Sensor
+from .compass import Compass, wrap
+from .depth import DepthSensor
+from .dvl import Dvl
+from .imu import Imu
+
+SensorName = Literal["imu", "dvl", "depth", "compass"]
+FaultName = Literal[
+    "nan",
+    "infinite",
+    "constant",
+    "offset",
+    "drift",
+    "scale",
+    "noise",
+    "frozen",
+    "dropout",
+    "latency",
+    "frozen_stamp",
+    "stamp_offset",
+]
+VALUES: Mapping[str, int] = {"imu": 6, "dvl": 3, "depth": 1, "compass": 1}
+"""Values in a reading: specific force and angular rate, velocity, depth, yaw."""
+
+_LONGEST = 10.0  # s of latency: that many readings are kept
+_SLACK = 1e-6  # of a reading's number: times are whole periods but for rounding
+
+
+@dataclass(frozen=True)
+class SensorFault:
+    """One fault: `{sensor: dvl, fault: frozen, start: 5, duration: 20, components: [0]}`.
+
+    It hits the readings measured from `start` on and before `start + duration`. Several faults of
+    one sensor act one after the other, in their order.
+
+    Attributes:
+        sensor: whose readings.
+        fault: what happens to them.
+        start: of the fault (s).
+        duration: of the fault (s); until the end if left out, a single reading if zero.
+        components: of the values, from 0; all if empty.
+        size: how much, in the fault's unit (`docs/sensor-faults.md`); some have none.
+        share: probability that a reading in this time is hit (1), each for itself.
+    """
+
+    sensor: SensorName
+    fault: FaultName
+    start: float = 0.0
+    duration: float | None = None
+    components: tuple[int, ...] = ()
+    size: float | None = None
+    share: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check names, numbers and that the fault makes sense for the sensor."""
+        check_numbers(self)
+        for field, names in (("sensor", get_args(SensorName)), ("fault", get_args(FaultName))):
+            known = ", ".join(names)
+            require(getattr(self, field) in names, self, field, f"take one of {known}")
+        require(self.start >= 0, self, "start", "give a time of zero or more")
+        require(
+            self.duration is None or self.duration >= 0,
+            self,
+            "duration",
+            "give zero or more, or leave it out for a fault that stays",
+        )
+        require(0 <= self.share <= 1, self, "share", "give a probability from 0 to 1")
+        self._check_fault()
+
+    def _check_fault(self) -> None:
+        kind, n = _KINDS[self.fault], VALUES[self.sensor]
+        require(
+            self.sensor != "imu" or not kind.marks,
+            self,
+            "fault",
+            "the IMU's readings have neither valid mark nor stamp; take frozen or latency, or "
+            "another sensor",
+        )
+        require(
+            not self.components or not kind.marks,
+            self,
+            "components",
+            f"{self.fault} concerns the whole reading; leave them out",
+        )
+        known = set(self.components) <= set(range(n))
+        several = len(set(self.components)) < len(self.components)
+        which = "0 is the only one" if n == 1 else f"take some of 0 to {n - 1}, each once"
+        remedy = f"of the values of {self.sensor} {which}"
+        require(known and not several, self, "components", remedy)
+        if kind.size is None:
+            require(self.size is None, self, "size", f"{self.fault} has none; leave it out")
+            return
+        require(self.size is not None, self, "size", f"{self.fault} needs one: give {kind.size}")
+        low, high = kind.limits
+        require(low <= (self.size or 0.0) <= high, self, "size", f"give {kind.size}")
+
+    def readings(self, rate: float) -> tuple[float, float]:
+        """Numbers of the first reading in the fault's time and of the first after it."""
+        first = math.ceil(self.start * rate - _SLACK)
+        if self.duration is None:
+            return float(first), math.inf
+        end = math.ceil((self.start + self.duration) * rate - _SLACK)
+        return float(first), float(max(first + 1, end))
+
+    def kept(self, rate: float) -> int:
+        """Readings that are remembered."""
+        return _KINDS[self.fault].kept(self.size or 0.0, rate)
+
+    @property
+    def noise_size(self) -> int:
+        """Unit Gaussians that one reading takes."""
+        noise = VALUES[self.sensor] if self.fault == "noise" else 0
+        return noise + (0 < self.share < 1)
+
+    def show(
+        self,
+        sensor: Sensor,
+        memory: Float[Array, "m *batch"],
+        reading: Float[Array, "r *batch"],
+        t: Float[Array, "*batch"],
+        w: Float[Array, "w *batch"],
+    ) -> tuple[Float[Array, "m *batch"], Float[Array, "r *batch"]]:
+        """The memory after a reading [values, valid, stamp] measured at t, and what is shown of it.
+
+        The memory, if there is any, is a mark that it holds something and the newest `kept`
+        readings, all zero before the first.
+        """
+        n, batch = VALUES[self.sensor], reading.shape[1:]
+        first, end = self.readings(sensor.rate)
+        number = jnp.round(t * sensor.rate)
+        hit = (number >= first) & (number < end)
+        if self.share < 1:
+            hit = hit & (bernoulli(w[-1], self.share) if self.share > 0 else False)
+
+        memory, ring = self._remember(memory, reading, hit)
+        chosen = np.isin(np.arange(n), self.components or np.arange(n))
+        look = _Look(self, sensor, reading, ring, t - self.start, w, bool(chosen.all()))
+        values, valid, stamp = _KINDS[self.fault].act(look)
+        if isinstance(sensor, Compass):
+            values = _in_range(values)
+        values = jnp.where(chosen.reshape((-1,) + (1,) * len(batch)), values, reading[:n])
+        faulty = jnp.concatenate([values, valid[None], stamp[None]])
+        return memory, jnp.where(hit, faulty, reading)
+
+    def _remember(self, memory: Array, reading: Array, hit: Array) -> tuple[Array, Array]:
+        """The memory with this reading in it, and the readings in it, the newest first."""
+        if not len(memory):
+            return memory, reading[:0]
+        n, batch = VALUES[self.sensor], reading.shape[1:]
+        old = memory[1:].reshape(-1, n + 2, *batch)
+        new = jnp.where(memory[0] > 0, jnp.concatenate([reading[None], old[:-1]]), reading[None])
+        # What is late are all readings; what stays frozen is the last good one.
+        good = (~hit & (reading[n] > 0)) | (old[0, n] <= 0)
+        ring = new if self.fault == "latency" else jnp.where(good, new, old)
+        return jnp.concatenate([jnp.ones_like(memory[:1]), ring.reshape(-1, *batch)]), ring
+
+
+@dataclass(frozen=True)
+class FaultySensor:
+    """The faults of one sensor as one function of its readings.
+
+    Attributes:
+        sensor: as it is without them.
+        faults: in the order in which they act, all of this sensor.
+    """
+
+    sensor: Sensor
+    faults: tuple[SensorFault, ...]
+
+    @property
+    def memory_size(self) -> int:
+        """Numbers that the faults remember; all zero before the first reading."""
+        return sum(self._memory_sizes)
+
+    @property
+    def _memory_sizes(self) -> list[int]:
+        kept = [fault.kept(self.sensor.rate) for fault in self.faults]
+        sizes = [VALUES[fault.sensor] + 2 for fault in self.faults]
+        return [1 + k * size if k else 0 for k, size in zip(kept, sizes, strict=True)]
+
+    @property
+    def noise_size(self) -> int:
+        """Unit Gaussians that one reading takes."""
+        return sum(fault.noise_size for fault in self.faults)
+
+    def show(
+        self,
+        memory: Float[Array, "m *batch"],
+        reading: Float[Array, "r *batch"],
+        t: Float[Array, "*batch"],
+        w: Float[Array, "w *batch"],
+    ) -> tuple[Float[Array, "m *batch"], Float[Array, "r *batch"]]:
+        """As `SensorFault.show`, of all faults."""
+        kept, shown = [], reading
+        places = pairwise(np.cumsum([0, *self._memory_sizes]))
+        noises = pairwise(np.cumsum([0, *(fault.noise_size for fault in self.faults)]))
+        for fault, (a, b), (c, d) in zip(self.faults, places, noises, strict=True):
+            own, shown = fault.show(self.sensor, memory[a:b], shown, t, w[c:d])
+            kept.append(own)
+        return jnp.concatenate(kept), shown
+
+
+# --------------------------------------------------------------------------------- what they do
+
+
+class _Look(NamedTuple):
+    """All that a fault may look at."""
+
+    fault: SensorFault
+    sensor: Sensor
+    reading: Float[Array, "r *batch"]
+    """[values, valid, stamp]."""
+    ring: Float[Array, "k r *batch"]
+    """What is remembered, the newest first."""
+    elapsed: Float[Array, "*batch"]
+    """Since the start (s)."""
+    w: Float[Array, "w *batch"]
+    whole: bool
+    """Whether all values are concerned."""
+
+    @property
+    def size(self) -> float:
+        return self.fault.size or 0.0
+
+    @property
+    def parts(self) -> tuple[Array, Array, Array]:
+        """Values, valid mark and stamp."""
+        return self.reading[:-2], self.reading[-2], self.reading[-1]
+
+
+_Parts = tuple[Array, Array, Array]
+
+
+def _valued(change: Callable[[Array, _Look], Array]) -> Callable[[_Look], _Parts]:
+    """What changes the values alone."""
+
+    def act(look: _Look) -> _Parts:
+        values, valid, stamp = look.parts
+        return change(values, look), valid, stamp
+
+    return act
+
+
+def _constant(look: _Look) -> _Parts:
+    values, valid, stamp = look.parts
+    return jnp.full_like(values, look.size), jnp.ones_like(valid) if look.whole else valid, stamp
+
+
+def _noisy(values: Array, look: _Look) -> Array:
+    """White noise that comes to the sensor's own, so that both together are `size` times it."""
+    std = column(_noise_std(look.sensor), values) * math.sqrt(look.size**2 - 1)
+    return values + std * look.w[: len(values)]
+
+
+def _frozen(look: _Look) -> _Parts:
+    _, valid, stamp = look.parts
+    held = look.ring[0]
+    return held[:-2], held[-2] if look.whole else valid, stamp
+
+
+def _dropout(look: _Look) -> _Parts:
+    values, valid, stamp = look.parts
+    return jnp.zeros_like(values), jnp.zeros_like(valid), stamp
+
+
+def _late(look: _Look) -> _Parts:
+    """Linear between the two readings about the time that was `size` ago."""
+    _, valid, stamp = look.parts
+    whole, part = _periods(look.size, look.sensor.rate)
+    older = look.ring[whole]
+    values, mark = older[:-2], older[-2]
+    if part:
+        change = look.ring[whole + 1][:-2] - values
+        change = wrap(change) if isinstance(look.sensor, Compass) else change
+        values, mark = values + part * change, mark * look.ring[whole + 1][-2]
+    return values, mark if look.whole else mark * valid, stamp
+
+
+def _frozen_stamp(look: _Look) -> _Parts:
+    values, valid, _ = look.parts
+    return values, valid, look.ring[0][-1]
+
+
+def _stamp_offset(look: _Look) -> _Parts:
+    values, valid, stamp = look.parts
+    return values, valid, stamp + look.size
+
+
+def _periods(time: float, rate: float) -> tuple[int, float]:
+    """A time in whole periods and what is left of it, nothing if that is rounding."""
+    whole = math.floor(time * rate + _SLACK)
+    part = time * rate - whole
+    return whole, part if part > _SLACK else 0.0
+
+
+def _kept_late(size: float, rate: float) -> int:
+    whole, part = _periods(size, rate)
+    return whole + (2 if part else 1)
+
+
+def _noise_std(sensor: Sensor) -> tuple[float, ...]:
+    """Standard deviation of each value's white noise."""
+    if isinstance(sensor, Imu):
+        accelerometer, gyroscope = sensor.noise_std()
+        return (accelerometer,) * 3 + (gyroscope,) * 3
+    assert isinstance(sensor, Dvl | DepthSensor | Compass)
+    return (sensor.noise,) * (3 if isinstance(sensor, Dvl) else 1)
+
+
+def _in_range(yaw: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """An angle brought to [−π, π); one that is there, or not finite, keeps its bits."""
+    outside: Bool[Array, "*shape"] = jnp.isfinite(yaw) & ((yaw < -math.pi) | (yaw >= math.pi))
+    return jnp.where(outside, wrap(yaw), yaw)
+
+
+class _Kind(NamedTuple):
+    """What makes a fault."""
+
+    act: Callable[[_Look], _Parts]
+    size: str | None = None
+    """In words, for a remedy."""
+    limits: tuple[float, float] = (-math.inf, math.inf)
+    marks: bool = False
+    """Whether it concerns valid mark or stamp."""
+    kept: Callable[[float, float], int] = lambda size, rate: 0
+    """Readings that it remembers, for its size and the sensor's rate."""
+
+
+_UNIT = "in the unit of the values (m/s² and rad/s, m/s, m, rad)"
+_ONE: Callable[[float, float], int] = lambda size, rate: 1  # noqa: E731
+_KINDS: Mapping[str, _Kind] = {
+    "nan": _Kind(_valued(lambda values, _: jnp.full_like(values, jnp.nan))),
+    "infinite": _Kind(_valued(lambda values, _: jnp.full_like(values, jnp.inf))),
+    "constant": _Kind(_constant, f"the value that is shown, {_UNIT}"),
+    "offset": _Kind(_valued(lambda values, look: values + look.size), f"an offset, {_UNIT}"),
+    "drift": _Kind(
+        _valued(lambda values, look: values + look.size * look.elapsed), f"a rate a second, {_UNIT}"
+    ),
+    "scale": _Kind(_valued(lambda values, look: look.size * values), "a factor"),
+    "noise": _Kind(_valued(_noisy), "a factor of 1 or more on the sensor's noise", (1.0, math.inf)),
+    "frozen": _Kind(_frozen, kept=_ONE),
+    "dropout": _Kind(_dropout, marks=True),
+    "latency": _Kind(
+        _late, f"a time (s) above zero, at most {_LONGEST:g}", (1e-3, _LONGEST), kept=_kept_late
+    ),
+    "frozen_stamp": _Kind(_frozen_stamp, marks=True, kept=_ONE),
+    "stamp_offset": _Kind(_stamp_offset, "a time (s) that is added to the stamp", marks=True),
+}
+assert set(_KINDS) == set(get_args(FaultName))

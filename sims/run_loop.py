@@ -19,7 +19,7 @@ from ..systems.compiled import CompiledSimulator
 from ..systems.network import NotPureError
 from .criteria import Monitor, Outcome
 from .run_log import RunLog
-from .run_signals import PlanTap, collect, log_periods, with_present
+from .run_signals import PlanTap, collect, log_commands, log_periods
 from .scenario import Scenario
 
 Progress = Callable[[float, str], None]
@@ -107,7 +107,10 @@ def simulate_seeds(
     tell = progress or (lambda fraction, remark: None)
     tell(0.0, "building")
     diagram = build_diagram(
-        scenario.station, scenario.controller, log_periods=log_periods(scenario)
+        scenario.station,
+        scenario.controller,
+        log_periods=log_periods(scenario),
+        extend=log_commands(scenario),
     )
     warm = False
     for seed in seeds:
@@ -138,8 +141,7 @@ def _one(diagram: Diagram, scenario: Scenario, warm: bool, tell: Progress, engin
     timing.compilation = time.perf_counter() - started
     with _stop_on_interrupt() as stopped, _few_collections():
         outcome = _fly(scenario, diagram, simulator, monitor, tap, timing, tell, stopped)
-    signals = with_present(logged(diagram, context), diagram, context)
-    log = collect(scenario, signals, tap, outcome.time)
+    log = collect(scenario, logged(diagram, context), tap, outcome.time)
     return Run(scenario, log, outcome, timing)
 
 
@@ -149,9 +151,8 @@ def _simulator(
     """Who steps a diagram."""
     if engine == "drake" or (engine == "auto" and scenario.duration < _WORTH_A_LOOP):
         return Simulator(diagram)
-    periods = {f"log_{name}": period for name, period in log_periods(scenario).items()}
     try:
-        return CompiledSimulator(diagram, periods)
+        return CompiledSimulator(diagram, {"log_F_acting": scenario.station.period})
     except NotPureError as error:
         if engine == "compiled":
             raise UserError(
@@ -203,7 +204,7 @@ def _fly(
                 tell(done, f"{t:.0f} s, {timing.speed(200):.1f} × real time")
             if outcome is None and stopped.is_set():
                 outcome = Outcome("interrupted", t, f"Stopped by hand after {t:.1f} s.")
-        # one period more, in which the filter has its say on the last sample
+        # on to the last sample's row: what the updates of its time make of it
         simulator.AdvanceTo(k * dt + scenario.station.period)
     except FloatingPointError as error:  # it names what was not finite
         log = sinks[0].FindLog(context)

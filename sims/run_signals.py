@@ -1,66 +1,59 @@
 """From a flown diagram's signals to one log on a uniform grid."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
+from pydrake.systems.primitives import LogVectorOutput
 
 from ..systems.closed_loop import Signal
 from ..systems.filtering.error_state import ERRORS
+from ..systems.signal_log import add_log
 from .run_log import Plans, RunLog
 from .scenario import Scenario
 
-_ESTIMATES = ("X_WB", "V_WB_B", "covariance")
 _PLAN_STEP = 0.2  # s between the states of a plan that are kept
 _NOTES = (
     "X_WB and V_WB_B are the simulation's truth, not an estimate.",
-    "F_Bo_B is the mean of the commanded wrench over each step; the thrusters' lag is not in it. "
-    "pwm is the command at the sample.",
+    "F_Bo_B is the mean over each step of the wrench commanded of the thrusters; their lag is not "
+    "in it. pwm is the command that they had at the sample.",
     "flow_W and F_disturbance_Bo_B are known in simulation only.",
 )
 
 
+_RATED = (
+    "X_WB",
+    "V_WB_B",
+    "covariance",
+    "X_WB_cheat",
+    "V_WB_B_cheat",
+    "F_disturbance_cheat",
+    "flow_cheat",
+)
+
+
 def log_periods(scenario: Scenario) -> dict[str, float]:
-    """How often each port of station and controller is logged (s).
+    """How often each port of station and controller is logged (s)."""
+    return dict.fromkeys(_RATED, 1 / scenario.log.rate)
 
-    Estimates are logged twice as often as the filter makes them: the log's time and the filter's
-    differ by rounding, so that only a sample in the middle surely shows the one before it.
+
+def log_commands(scenario: Scenario) -> Callable[[DiagramBuilder, System, System], None]:
+    """Adds to a diagram what a recording has of the commands: those that act on the plant.
+
+    The plant moves on from t under the commands that were there before the updates of t. The wrench
+    is logged at the plant's own events, where Drake's order says just that.
     """
-    coarse: tuple[str, ...] = (
-        "pwm",
-        "X_WB_cheat",
-        "V_WB_B_cheat",
-        "F_disturbance_cheat",
-        "flow_cheat",
-    )
-    periods: dict[str, float] = dict.fromkeys(coarse, 1 / scenario.log.rate)
-    periods.update(dict.fromkeys(_ESTIMATES, _estimate_period(scenario) / 2))
-    periods["F_Bo_B"] = scenario.station.period
-    return periods
 
+    def extend(builder: DiagramBuilder, station: System, controller: System) -> None:
+        F, pwm = controller.GetOutputPort("F_Bo_B"), station.GetOutputPort("pwm")
+        LogVectorOutput(F, builder, scenario.station.period).set_name("log_F_acting")
+        add_log(builder, pwm, "pwm_acting", 1 / scenario.log.rate, early=True)
 
-def _estimate_period(scenario: Scenario) -> float:
-    return 1 / scenario.station.sensing.ekf.output_rate
-
-
-def with_present(
-    signals: Mapping[str, Signal], diagram: Diagram, root: Context
-) -> dict[str, Signal]:
-    """The signals with what the filter says at the context's time as a last sample."""
-    station = diagram.GetSubsystemByName("station")
-    context = station.GetMyContextFromRoot(root)
-    found = dict(signals)
-    for name in _ESTIMATES:
-        time, value = signals[name]
-        present = np.asarray(station.GetOutputPort(name).Eval(context))
-        found[name] = Signal(
-            np.append(time, root.get_time()), np.concatenate([value, present[None]])
-        )
-    return found
+    return extend
 
 
 class PlanTap:
@@ -145,26 +138,20 @@ class PlanTap:
 
 
 def collect(scenario: Scenario, signals: Mapping[str, Signal], tap: PlanTap, end: float) -> RunLog:
-    """One log of all signals (`with_present`) from 0 to `end` (s).
-
-    What the filter says of t comes with the updates of t, after which the truth of t has gone.
-    """
-    dt, period = 1 / scenario.log.rate, _estimate_period(scenario)
+    """One log of all signals from 0 to `end` (s)."""
+    dt = 1 / scenario.log.rate
     n = min(round(end / dt) + 1, len(signals["X_WB_cheat"].time))
     finite = np.all(np.isfinite(signals["X_WB_cheat"].value[:n]), axis=1)
     n = n if finite.all() else max(1, int(np.argmin(finite)))
     grid = dt * np.arange(n)
-    newest = period * np.floor(grid / period + 1e-6)
-    times = signals["X_WB"].time
-    told = np.minimum(np.searchsorted(times, newest + period / 4), times.size - 1)
-    variance = signals["covariance"].value[told][:, :: ERRORS + 1]
+    variance = signals["covariance"].value[:n, :: ERRORS + 1]
     variables = {
         "X_WB": signals["X_WB_cheat"].value[:n],
         "V_WB_B": signals["V_WB_B_cheat"].value[:n],
-        "F_Bo_B": mean_over(signals["F_Bo_B"], grid, dt),
-        "pwm": signals["pwm"].value[:n],
-        "X_WB_estimate": signals["X_WB"].value[told],
-        "V_WB_B_estimate": signals["V_WB_B"].value[told],
+        "F_Bo_B": mean_over(signals["F_acting"], grid, dt),
+        "pwm": signals["pwm_acting"].value[:n],
+        "X_WB_estimate": signals["X_WB"].value[:n],
+        "V_WB_B_estimate": signals["V_WB_B"].value[:n],
         "error_std": np.sqrt(np.maximum(variance, 0)),
         "F_disturbance_Bo_B": signals["F_disturbance_cheat"].value[:n],
         "flow_W": signals["flow_cheat"].value[:n],

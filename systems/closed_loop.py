@@ -6,11 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 from pydrake.common import RandomGenerator
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
-from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
+from pydrake.systems.primitives import VectorLogSink
 
 from .controllers import Controller
-from .station import make_station
+from .network import Port, flatten, holders
+from .signal_log import SignalLog, add_log
+from .station import CHEATS, make_station
 from .station_config import StationConfig
 
 LOG_PERIODS: Mapping[str, float] = {
@@ -53,6 +55,10 @@ def build_diagram(
 ) -> Diagram:
     """Close the loop: subsystems `station`, `controller`, and a log `log_<port>` of each port.
 
+    A row of the logs is one instant, whichever ports they are of (`systems.signal_log`): what the
+    updates of t make stands at t, and beside it the truth of t. The truth is what a system shows
+    that holds the state behind one of the station's ports `CHEATS`.
+
     `extend(builder, station, controller)` may add more, a visualiser say, before the diagram is
     built. The diagram has no input ports; its randomness comes from sources inside (`seeded`).
 
@@ -66,9 +72,13 @@ def build_diagram(
     for name in ("X_WB", "V_WB_B"):
         builder.Connect(plant.GetOutputPort(name), control.GetInputPort(name))
     builder.Connect(control.GetOutputPort("F_Bo_B"), plant.GetInputPort("F_Bo_B"))
-    for name, port in _ports(plant, control).items():
-        if name in log_periods:
-            LogVectorOutput(port, builder, log_periods[name]).set_name(f"log_{name}")
+    truth = _truth(plant, control)
+    for system in (plant, control):
+        for i in range(system.num_output_ports()):
+            port = system.get_output_port(i)
+            if port.get_name() in log_periods:
+                name, early = port.get_name(), (system, i) in truth
+                add_log(builder, port, name, log_periods[name], early)
     if extend is not None:
         extend(builder, plant, control)
     diagram = builder.Build()
@@ -82,17 +92,45 @@ def seeded(diagram: Diagram, context: Context, seed: int) -> None:
 
 
 def logged(diagram: Diagram, context: Context) -> dict[str, Signal]:
-    """All logs of a closed loop by the port's name."""
+    """All logs of a closed loop by the port's name, as far as all of them have come.
+
+    After `AdvanceTo(t)` the updates of t are still to come, and with them its row. A log of Drake's
+    that `extend` has added under a name `log_…` comes as Drake took it.
+    """
+    found: dict[str, Any] = {
+        system.get_name().removeprefix("log_"): system
+        for system in diagram.GetSystems()
+        if isinstance(system, SignalLog | VectorLogSink) and system.get_name().startswith("log_")
+    }
+    periods = {name: log.period for name, log in found.items() if isinstance(log, SignalLog)}
+    times = {name: found[name].FindLog(context).sample_times() for name in periods}
+    ends = [t[-1] + periods[name] if t.size else 0.0 for name, t in times.items()]
+    end = min(ends, default=0.0) - min(periods.values(), default=0.0) / 2
     signals = {}
-    for system in diagram.GetSystems():
-        if isinstance(system, VectorLogSink) and system.get_name().startswith("log_"):
-            log = system.FindLog(context)
-            signals[system.get_name().removeprefix("log_")] = Signal(
-                log.sample_times().copy(), log.data().T.copy()
-            )
+    for name, log in found.items():
+        rows = log.FindLog(context)
+        n = np.searchsorted(times[name], end) if name in times else None
+        signals[name] = Signal(rows.sample_times()[:n].copy(), rows.data()[:, :n].T.copy())
     return signals
 
 
-def _ports(*systems: System) -> dict[str, OutputPort]:
-    ports = [s.get_output_port(i) for s in systems for i in range(s.num_output_ports())]
-    return {port.get_name(): port for port in ports}
+def _truth(station: System, controller: System) -> set[Port]:
+    """The output ports of both that show the state of a system behind one of `CHEATS`."""
+    wires: dict[Port, Port] = {}
+    flat = {system: flatten(system, wires) for system in (station, controller)}
+    for source, reader in ((station, controller), (controller, station)):
+        for i in range(source.num_output_ports()):
+            name = source.get_output_port(i).get_name()
+            if reader.HasInputPort(name):
+                for port in flat[reader].feeds[int(reader.GetInputPort(name).get_index())]:
+                    wires[port] = flat[source].shown[i]
+    behind = {
+        (system, i): holders(port, wires)
+        for system in (station, controller)
+        for i, port in enumerate(flat[system].shown)
+    }
+    true = set()
+    for name in CHEATS:
+        if station.HasOutputPort(name):
+            true |= behind[station, int(station.GetOutputPort(name).get_index())]
+    return {port for port, found in behind.items() if found & true}

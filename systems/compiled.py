@@ -33,7 +33,7 @@ class CompiledSimulator:
     """
 
     def __init__(self, diagram: Diagram, log_periods: Mapping[str, float] | None = None):
-        """`log_periods` (s) of the logs by their systems' names.
+        """`log_periods` (s) of Drake's own logs by their systems' names; a `SignalLog` has its own.
 
         Raises:
             NotPureError: the diagram holds what only Drake can step.
@@ -42,7 +42,7 @@ class CompiledSimulator:
         self._context = self._drake.get_mutable_context()
         self._network = network = Network.of(diagram, log_periods or {})
         self._drawn: list[Port] = [(source, 0) for source, _ in network.noise]
-        self._columns, self._logged = places(port for _, port, _ in network.logs)
+        self._columns, self._logged = places(log.port for log in network.logs)
         self._schedule = _Schedule(self._network)
         self._noise: list[_Noise] = []
         self._state: Float[np.ndarray, " n"] | None = None
@@ -102,13 +102,11 @@ class CompiledSimulator:
             system.GetMyMutableContextFromRoot(self._context).SetDiscreteState(group, state[part])
 
     def _log(self, block: "_Block", seen: Float[np.ndarray, "steps size"]) -> None:
-        for (sink, _, _), part, rows in zip(
-            self._network.logs, self._columns, block.logged, strict=True
-        ):
-            if rows:
-                log = sink.FindMutableLog(self._context)
-                for row in rows:
-                    log.AddData(block.times[row], seen[row, part])
+        for log, part, steps in zip(self._network.logs, self._columns, block.logged, strict=True):
+            if steps:
+                rows = log.system.FindMutableLog(self._context)
+                for step in steps:
+                    rows.AddData(block.times[step], seen[step, part])
 
     def _check(self, state: Float[np.ndarray, " n"], end: float) -> None:
         for (system, group), part in self._network.groups:
@@ -156,7 +154,7 @@ class CompiledSimulator:
 
             def look() -> Array:
                 own = ports()
-                return jnp.concatenate([own.value(port) for _, port, _ in network.logs])
+                return jnp.concatenate([own.value(log.port) for log in network.logs])
 
             if logged:
                 row = jax.lax.cond(due[-1] >= 0, look, lambda: jnp.zeros(logged))
@@ -195,14 +193,19 @@ class _Schedule:
         events = (event for leaf in network.leaves for event in leaf.pure.events)
         self.periods = sorted({event.period for event in events})
         self.width = len(self.periods) + 1
-        self._log_periods = [period for _, _, period in network.logs]
+        self._logs = network.logs
 
     def start(self, now: float) -> None:
         """Begin at a time whose logs are taken already."""
         self._ticks = [_first(period, now) for period in self.periods]
-        self._log_ticks = [_first(p, now) for p in self._log_periods]
+        self._log_ticks = [_first(log.period, now, log.offset) for log in self._logs]
         self._log_ticks = [
-            k + (k * p == now) for k, p in zip(self._log_ticks, self._log_periods, strict=True)
+            k + (at == now) for k, at in zip(self._log_ticks, self._log_times(), strict=True)
+        ]
+
+    def _log_times(self) -> list[float]:
+        return [
+            log.offset + k * log.period for k, log in zip(self._log_ticks, self._logs, strict=True)
         ]
 
     def blocks(self, boundary: float) -> Iterator[_Block]:
@@ -210,7 +213,7 @@ class _Schedule:
         block = self._empty()
         while True:
             times = [k * p for k, p in zip(self._ticks, self.periods, strict=True)]
-            log_times = [k * p for k, p in zip(self._log_ticks, self._log_periods, strict=True)]
+            log_times = self._log_times()
             step = min(times, default=np.inf)
             t = min(step, min(log_times, default=np.inf))
             if t > boundary or (t == boundary and t not in log_times):
@@ -236,13 +239,13 @@ class _Schedule:
 
     def _empty(self) -> _Block:
         ticks = np.full((_STEPS, self.width), -1.0)
-        return _Block(0, np.zeros(_STEPS), ticks, [[] for _ in self._log_periods])
+        return _Block(0, np.zeros(_STEPS), ticks, [[] for _ in self._logs])
 
 
-def _first(period: float, now: float) -> int:
+def _first(period: float, now: float, offset: float = 0.0) -> int:
     """Number of the first period that begins at or after a time."""
-    k = int(np.ceil(now / period))
-    return k if k * period >= now else k + 1
+    k = max(0, int(np.ceil((now - offset) / period)))
+    return k if offset + k * period >= now else k + 1
 
 
 class _Noise:

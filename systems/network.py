@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import jax
 from jaxtyping import Array
@@ -11,6 +12,7 @@ from pydrake.systems.framework import Diagram, InputPortIndex, OutputPortIndex, 
 from pydrake.systems.primitives import ConstantVectorSource, RandomSource, VectorLogSink
 
 from .pure import Event, HasPure, Pure, State
+from .signal_log import SignalLog
 
 Port = tuple[System, int]
 """A system's port by its number."""
@@ -32,6 +34,15 @@ class Leaf:
     sizes: tuple[int, ...]
 
 
+class Log(NamedTuple):
+    """A log, the output port that it logs, and when: at `offset` and every `period` after (s)."""
+
+    system: VectorLogSink | SignalLog
+    port: Port
+    period: float
+    offset: float
+
+
 @dataclass(frozen=True, eq=False)
 class Network:
     """A diagram's systems without the diagrams that group them, and what feeds what.
@@ -41,18 +52,18 @@ class Network:
         wires: the output port that feeds an input port.
         constants: output ports whose values never change.
         noise: sources of random numbers, with the period (s) at which they draw.
-        logs: log, the output port that it logs, and its period (s).
+        logs: what is logged.
     """
 
     leaves: tuple[Leaf, ...]
     wires: Mapping[Port, Port]
     constants: tuple[Port, ...]
     noise: tuple[tuple[RandomSource, float], ...]
-    logs: tuple[tuple[VectorLogSink, Port, float], ...]
+    logs: tuple[Log, ...]
 
     @staticmethod
     def of(diagram: Diagram, log_periods: Mapping[str, float]) -> "Network":
-        """The network of a diagram without inputs; `log_periods` (s) by the logs' names.
+        """The network of a diagram without inputs; `log_periods` (s) of Drake's logs by name.
 
         Raises:
             NotPureError: a system is none of these, or a source draws at another period than that
@@ -60,7 +71,7 @@ class Network:
         """
         wires: dict[Port, Port] = {}
         leaves, constants, logs, sources = [], [], [], []
-        for system in _flatten(diagram, wires):
+        for system in flatten(diagram, wires).leaves:
             if isinstance(system, HasPure):
                 context = system.CreateDefaultContext()
                 count = context.num_discrete_state_groups()
@@ -68,11 +79,13 @@ class Network:
                 leaves.append(Leaf(system, system.pure(), tuple(sizes)))
             elif isinstance(system, ConstantVectorSource):
                 constants.append((system, 0))
+            elif isinstance(system, SignalLog):
+                logs.append(Log(system, wires[system, 0], system.period, system.offset))
             elif isinstance(system, VectorLogSink):
                 name = system.get_name()
                 if name not in log_periods:
                     raise NotPureError(f"the period of {name} is not given")
-                logs.append((system, wires[system, 0], log_periods[name]))
+                logs.append(Log(system, wires[system, 0], log_periods[name], 0.0))
             elif isinstance(system, RandomSource):
                 sources.append(system)
             else:
@@ -160,33 +173,58 @@ class _Inputs(Mapping[str, Array]):
         return len(self._from)
 
 
-def _flatten(diagram: Diagram, wires: dict[Port, Port]) -> list[System]:
-    """All systems in a diagram that are no diagrams; adds to `wires` what feeds them."""
+class Flat(NamedTuple):
+    """A system's leaves: those that are no diagrams.
 
-    def walk(system: System) -> tuple[list[System], list[list[Port]], list[Port]]:
-        """The systems inside, the ports that each input feeds, the port behind each output."""
-        if not isinstance(system, Diagram):
-            feeds = [[(system, i)] for i in range(system.num_input_ports())]
-            return [system], feeds, [(system, i) for i in range(system.num_output_ports())]
-        inner = {part: walk(part) for part in system.GetSystems()}
-        for (reader, i), (source, j) in system.connection_map().items():
-            for port in inner[reader][1][int(i)]:
-                wires[port] = inner[source][2][int(j)]
-        feeds = [
-            [
-                port
-                for part, i in system.GetInputPortLocators(InputPortIndex(k))
-                for port in inner[part][1][int(i)]
-            ]
-            for k in range(system.num_input_ports())
+    Attributes:
+        leaves: all of them.
+        feeds: the leaves' input ports behind each input port.
+        shown: the leaf's output port behind each output port.
+    """
+
+    leaves: list[System]
+    feeds: list[list[Port]]
+    shown: list[Port]
+
+
+def flatten(system: System, wires: dict[Port, Port]) -> Flat:
+    """The leaves of a system; adds to `wires` what feeds what among them."""
+    if not isinstance(system, Diagram):
+        feeds = [[(system, i)] for i in range(system.num_input_ports())]
+        return Flat([system], feeds, [(system, i) for i in range(system.num_output_ports())])
+    inner = {part: flatten(part, wires) for part in system.GetSystems()}
+    for (reader, i), (source, j) in system.connection_map().items():
+        for port in inner[reader].feeds[int(i)]:
+            wires[port] = inner[source].shown[int(j)]
+    feeds = [
+        [
+            port
+            for part, i in system.GetInputPortLocators(InputPortIndex(k))
+            for port in inner[part].feeds[int(i)]
         ]
-        shown = []
-        for k in range(system.num_output_ports()):
-            part, i = system.get_output_port_locator(OutputPortIndex(k))
-            shown.append(inner[part][2][int(i)])
-        return [leaf for part in inner.values() for leaf in part[0]], feeds, shown
+        for k in range(system.num_input_ports())
+    ]
+    shown = []
+    for k in range(system.num_output_ports()):
+        part, i = system.get_output_port_locator(OutputPortIndex(k))
+        shown.append(inner[part].shown[int(i)])
+    return Flat([leaf for part in inner.values() for leaf in part.leaves], feeds, shown)
 
-    return walk(diagram)[0]
+
+def holders(port: Port, wires: Mapping[Port, Port]) -> set[System]:
+    """The leaves whose state a leaf's output port shows, through others that keep no state."""
+    system, index = port
+    if (
+        system.num_continuous_states()
+        or system.num_discrete_state_groups()
+        or system.num_abstract_states()
+    ):
+        return {system}
+    found: set[System] = set()
+    for i in range(system.num_input_ports()):
+        if (system, i) in wires and system.HasDirectFeedthrough(i, index):
+            found |= holders(wires[system, i], wires)
+    return found
 
 
 def _noise(

@@ -47,6 +47,7 @@ def arguments() -> dict[str, dict]:
         "DisturbanceObserver": {"observer": MomentumObserver(dynamics)},
         "Reference": {"path": HoldPose()},
         "PidController": {"vehicle": VEHICLE},
+        "SignalLog": {"size": 7, "period": 0.05},
     }
 
 

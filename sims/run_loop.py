@@ -98,8 +98,8 @@ def simulate_seeds(
 ) -> Iterator[Run]:
     """Fly a scenario with one seed after the other: the runs of `simulate`, one diagram for all.
 
-    With a planner, building and compiling takes longer than many a flight. After Ctrl-C the run at
-    hand is the last.
+    Building, tracing and compiling takes longer than many a flight. After Ctrl-C the run at hand is
+    the last.
 
     Raises:
         UserError: as `simulate`, when the first run is asked for.
@@ -112,18 +112,27 @@ def simulate_seeds(
         log_periods=log_periods(scenario),
         extend=log_commands(scenario),
     )
-    warm = False
+    simulator = None
     for seed in seeds:
-        run = _one(diagram, scenario.with_changes(seed=seed), warm, tell, engine)
-        warm = True
+        warm = simulator is not None
+        if simulator is None:
+            simulator = _simulator(diagram, scenario, engine)
+        else:
+            simulator.reset_context(diagram.CreateDefaultContext())
+        run = _one(diagram, simulator, scenario.with_changes(seed=seed), warm, tell)
         yield run
         if run.outcome.reason == "interrupted":
             return
 
 
-def _one(diagram: Diagram, scenario: Scenario, warm: bool, tell: Progress, engine: Engine) -> Run:
-    """Fly a diagram once, in a context of its own; `warm` says that its programs are compiled."""
-    simulator = _simulator(diagram, scenario, engine)
+def _one(
+    diagram: Diagram,
+    simulator: Simulator | CompiledSimulator,
+    scenario: Scenario,
+    warm: bool,
+    tell: Progress,
+) -> Run:
+    """Fly a diagram once, in a fresh context; `warm` says that its programs are compiled."""
     context = simulator.get_mutable_context()
     seeded(diagram, context, scenario.seed)
     vehicle = scenario.station.load_vehicle()

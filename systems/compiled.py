@@ -51,6 +51,12 @@ class CompiledSimulator:
         """The diagram's context as of the end of the last `AdvanceTo`."""
         return self._context
 
+    def reset_context(self, context: Context) -> None:
+        """Go on in another context of the diagram; what is compiled stays."""
+        self._drake.reset_context(context)
+        self._context = self._drake.get_mutable_context()
+        self._state = None
+
     def compile(self) -> None:
         """Compile the loop now rather than at the first step."""
         self._loop.flat(*(np.zeros(size) for size in self._sizes))

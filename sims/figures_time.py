@@ -2,23 +2,27 @@
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..systems.mppi import FIGURES
+from .estimate import HEALTH, estimate_error
 from .figures import (
     ESTIMATE,
     FLOWN,
     GOAL,
     LIMIT,
     OBSTACLE,
+    PLANNED,
     WATER,
     at_least,
+    common_legend,
     legend,
     lines,
     panels,
     styled,
 )
-from .metrics import estimate_error, tracking_error
+from .metrics import tracking_error
 from .run_log import RunLog
 
 _XYZ = ("x", "y", "z")
@@ -50,7 +54,10 @@ def tracking_figure(log: RunLog) -> Figure | None:
 
 @styled
 def estimate_figure(log: RunLog) -> Figure | None:
-    """The filter's error with the ± 3σ it claims; None without estimates."""
+    """The filter's error with the ± 3σ it claims; None without estimates.
+
+    A strip at the foot of each panel has the colour of the filter's health, if that was logged.
+    """
     known = estimate_error(log)
     if known is None:
         return None
@@ -67,11 +74,34 @@ def estimate_figure(log: RunLog) -> Figure | None:
             ax.fill_between(log.time, -band, band, color=ESTIMATE, alpha=0.16, lw=0, label="± 3σ")
             ax.plot(log.time, scale[c] * error[:, c], color=ESTIMATE, lw=1, label="error")
             ax.set_title(f"{name}, {label}")
+            if "health" in log:
+                _health_strip(ax, log)
         axes[i, 0].set_ylabel(units[i])
     for ax in axes[-1]:
         ax.set_xlabel(_TIME)
-    legend(axes[0, 2])
+    common_legend(figure, axes[0, 2])
     return figure
+
+
+_HEALTH = (GOAL, PLANNED, LIMIT)  # good, degraded, lost
+
+
+def _health_strip(ax: Axes, log: RunLog) -> None:
+    """A strip along the axis of time, coloured by the filter's health."""
+    state = np.clip(np.nan_to_num(log["health"][:, 0], nan=2.0), 0, 2)
+    begins = np.flatnonzero(np.diff(state, prepend=-1))
+    ends = np.append(begins[1:], state.size)
+    for number, (name, color) in enumerate(zip(HEALTH, _HEALTH, strict=True)):
+        spans = [
+            (log.time[a], (b - a) * log.dt)
+            for a, b in zip(begins, ends, strict=True)
+            if state[a] == number
+        ]
+        if spans:
+            ax.broken_barh(
+                spans, (0, 0.04), color=color, lw=0, label=name,
+                transform=ax.get_xaxis_transform(),
+            )  # fmt: skip
 
 
 @styled

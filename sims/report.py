@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..training.provenance import revision
+from .estimate import BLOCKS
 from .figures_path import Scene, path_figure, samples_figure
 from .figures_time import (
     disturbance_figure,
@@ -32,9 +33,14 @@ _NAMES = {
     "position_within_3_sigma": "position within 3σ",
     "attitude_within_3_sigma": "attitude within 3σ",
     "velocity_within_3_sigma": "velocity within 3σ",
-    "position_nees": "position, mean of (error/σ)²",
-    "attitude_nees": "attitude, mean of (error/σ)²",
-    "velocity_nees": "velocity, mean of (error/σ)²",
+    "position_nees": "NEES of the position, mean over the run",
+    "attitude_nees": "NEES of the attitude, mean over the run",
+    "velocity_nees": "NEES of the velocity, mean over the run",
+    "nees_low": "NEES: 2.5 % of single moments lie below",
+    "nees_high": "NEES: 2.5 % of single moments lie above",
+    "health_good": "estimator good",
+    "health_degraded": "estimator degraded",
+    "health_lost": "estimator lost",
     "planner_median_ms": "one call of the planner, median (ms)",
     "planner_p95_ms": "one call of the planner, 95 % below (ms)",
 }
@@ -86,7 +92,8 @@ def run_page(
     page.section("Numbers")
     for group, block in values.items():
         if isinstance(block, dict) and block:
-            rows = [(_NAMES.get(k, _words(k)), v) for k, v in block.items() if k != "words"]
+            told = {k: v for k, v in block.items() if k not in ("words", "health")}
+            rows = [(_NAMES.get(k, _words(k)), v) for k, v in told.items()]
             page.table(rows, caption=group.capitalize(), width="half")
     if scenario_text:
         page.section("Scenario").details("The whole scenario, defaults written out", scenario_text)
@@ -131,8 +138,26 @@ def _errors_section(page: Page, log: RunLog, values: dict[str, Any]) -> None:
         text = "How far the estimate was from the truth, and how far it thought it could be."
         if within is not None:
             text += f" {100 * within:.0f} % of the position errors lie within 3σ."
+        text += _consistency(values["estimate"])
         page.section("Estimate", text)
         page.figure(estimate, "Truth minus estimate in B, and three standard deviations.")
+
+
+def _consistency(estimate: dict[str, Any]) -> str:
+    """Sentences on the filter's covariance and health."""
+    told = [(name, estimate.get(f"{name}_nees")) for name in BLOCKS]
+    text = ""
+    if all(value is not None for _, value in told):
+        listed = ", ".join(f"{name} {value:.2g}" for name, value in told)
+        text = (
+            " NEES, the squared error by the claimed covariance, is 3 on average if that is "
+            f"right: {listed} over this run. A single moment lies between "
+            f"{estimate['nees_low']:.2g} and {estimate['nees_high']:.2g} with 95 %; errors of one "
+            "run correlate in time, so its mean is worth few such moments."
+        )
+    if "health" in estimate:
+        text += f" Estimator health: {estimate['health']}."
+    return text
 
 
 def _tiles(values: dict[str, Any]) -> list[tuple[str, str, str]]:

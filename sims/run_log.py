@@ -3,7 +3,12 @@
 Besides the variables of every recording (`docs/recording.md`) a run's log holds, over its time:
 
 - `X_WB_estimate`, `V_WB_B_estimate`: the filter's estimates; `error_std` (18): standard deviations
-  it claims, in the order of `systems.filtering.error_state`;
+  it claims, in the order of `systems.filtering.error_state`; `error_covariance` (27): covariances
+  that it claims of δp, δθ and δv, each 3 × 3 by rows;
+- `nis`, `rejected` (3): normalised innovation squared of the last reading of `FUSED`, and how many
+  were rejected in a row;
+- `health` (5), if the filter has such a port: 0 good, 1 degraded, 2 lost, then 1 where it trusts
+  imu, dvl, depth and compass;
 - `X_WB_plan`, `V_WB_B_plan`: the plan at that time; `plan_valid`: 1 where there was one;
 - `F_disturbance_Bo_B` (N, N·m), `flow_W` (velocity m/s, acceleration m/s²): what the water did;
 
@@ -21,6 +26,9 @@ from jaxtyping import Float
 
 from ..models.recording import Recording
 from ..models.recording_build import Trajectory
+
+FUSED = ("dvl", "depth", "compass")
+"""Sensors whose readings the filter fuses, in the order of `nis` and `rejected`."""
 
 
 @dataclass(frozen=True)

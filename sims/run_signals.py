@@ -11,9 +11,10 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import LogVectorOutput
 
 from ..systems.closed_loop import Signal
-from ..systems.filtering.error_state import ERRORS
+from ..systems.filtering.delayed import STATUS
+from ..systems.filtering.error_state import ERRORS, POSITION, ROTATION, VELOCITY
 from ..systems.signal_log import add_log
-from .run_log import Plans, RunLog
+from .run_log import FUSED, Plans, RunLog
 from .scenario import Scenario
 
 _PLAN_STEP = 0.2  # s between the states of a plan that are kept
@@ -29,6 +30,8 @@ _RATED = (
     "X_WB",
     "V_WB_B",
     "covariance",
+    "status",
+    "health",
     "X_WB_cheat",
     "V_WB_B_cheat",
     "F_disturbance_cheat",
@@ -144,7 +147,9 @@ def collect(scenario: Scenario, signals: Mapping[str, Signal], tap: PlanTap, end
     finite = np.all(np.isfinite(signals["X_WB_cheat"].value[:n]), axis=1)
     n = n if finite.all() else max(1, int(np.argmin(finite)))
     grid = dt * np.arange(n)
-    variance = signals["covariance"].value[:n, :: ERRORS + 1]
+    P = signals["covariance"].value[:n].reshape(-1, ERRORS, ERRORS)
+    blocks = [P[:, part, part].reshape(-1, 9) for part in (POSITION, ROTATION, VELOCITY)]
+    status = signals["status"].value[:n]
     variables = {
         "X_WB": signals["X_WB_cheat"].value[:n],
         "V_WB_B": signals["V_WB_B_cheat"].value[:n],
@@ -152,10 +157,15 @@ def collect(scenario: Scenario, signals: Mapping[str, Signal], tap: PlanTap, end
         "pwm": signals["pwm_acting"].value[:n],
         "X_WB_estimate": signals["X_WB"].value[:n],
         "V_WB_B_estimate": signals["V_WB_B"].value[:n],
-        "error_std": np.sqrt(np.maximum(variance, 0)),
+        "error_std": np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0)),
+        "error_covariance": np.concatenate(blocks, axis=1),
+        "nis": status[:, [STATUS.index(f"nis_{name}") for name in FUSED]],
+        "rejected": status[:, [STATUS.index(f"rejected_{name}") for name in FUSED]],
         "F_disturbance_Bo_B": signals["F_disturbance_cheat"].value[:n],
         "flow_W": signals["flow_cheat"].value[:n],
     }
+    if "health" in signals:
+        variables["health"] = signals["health"].value[:n]
     return RunLog.create(
         scenario.name,
         dt,

@@ -9,7 +9,8 @@ from run_example import ESTIMATE_ERROR, GOAL, example_log
 
 from spinndrift.models.vehicle import load_vehicle
 from spinndrift.sims.criteria import FollowPath, Outcome, ReachGoal
-from spinndrift.sims.metrics import clearance, estimate_error, metrics, tracking_error
+from spinndrift.sims.estimate import average_bound, estimate_error, mahalanobis
+from spinndrift.sims.metrics import clearance, metrics, tracking_error
 from spinndrift.sims.run_log import RunLog
 from spinndrift.systems.obstacles import Pylon
 
@@ -64,11 +65,40 @@ def test_share_within_three_sigma_of_gaussian_errors():
     std = np.full((n, 18), 0.05)
     estimate = log["X_WB"].copy()
     estimate[:, 4:] += 0.05 * rng.normal(size=(n, 3))
-    log = _changed(log, X_WB_estimate=estimate, error_std=std)
+    covariance = np.tile(0.05**2 * np.eye(3).ravel(), (n, 3))
+    log = _changed(log, X_WB_estimate=estimate, error_std=std, error_covariance=covariance)
     found = metrics(log, REACHED, ReachGoal(), VEHICLE)["estimate"]
-    # 12003 Gaussians: 99.73 % ± 0.05 %, mean square 1 ± 0.013
+    # 12003 Gaussians: 99.73 % ± 0.05 %, mean of 4001 sums of three squares 3 ± 0.04
     assert found["position_within_3_sigma"] == pytest.approx(0.9973, abs=0.002)
-    assert found["position_nees"] == pytest.approx(1.0, abs=0.05)
+    assert found["position_nees"] == pytest.approx(3.0, abs=0.16)
+
+
+def test_nees_of_a_block_counts_how_its_axes_correlate():
+    """δ = L z has δᵀ (L Lᵀ)⁻¹ δ = zᵀz, whatever the block's units; singular blocks have none."""
+    rng = np.random.default_rng(1)
+    L, z = (
+        rng.normal(size=(5, 3, 3, 3)) * [[[[1e-3]], [[1.0]], [[1e3]]]],
+        rng.normal(size=(5, 3, 3)),
+    )
+    delta = np.einsum("nbij,nbj->nbi", L, z).reshape(5, 9)
+    P = np.einsum("nbij,nbkj->nbik", L, L).reshape(5, 27)
+    P[3, :9], delta[4, 5] = 0.0, np.nan
+    expected = np.sum(z**2, axis=2)
+    expected[3, 0] = expected[4, 1] = np.nan
+    np.testing.assert_allclose(mahalanobis(delta, P), expected, rtol=1e-6)
+
+
+def test_bounds_of_an_average_are_those_of_chi_square():
+    """Tables: χ²(3) is 0.2158 and 9.3484, χ²(150) is 117.985 and 185.800 at 2.5 and 97.5 %."""
+    np.testing.assert_allclose(average_bound(3), (0.2158, 9.3484), atol=5e-5)
+    np.testing.assert_allclose(average_bound(3, 50), (117.985 / 50, 185.8 / 50), atol=1e-4)
+
+
+def test_health_is_told_by_its_time_and_by_who_is_not_trusted():
+    log = example_log()
+    found = metrics(log, REACHED, ReachGoal(), VEHICLE)["estimate"]
+    assert found["health"] == "good 75 %, degraded (dvl) 25 %"
+    assert (found["health_lost"], found["health_good"]) == (0, pytest.approx(301 / 401))
 
 
 def test_estimate_error_is_the_filters():

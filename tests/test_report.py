@@ -39,6 +39,8 @@ def test_report_of_a_crossing():
     for title in ("Path", "Planning", "Tracking", "Estimate", "Commands", "Disturbances"):
         assert f"<h2>{title}</h2>" in html
     assert "seed: 3" in html
+    assert "NEES, the squared error by the claimed covariance, is 3 on average" in html
+    assert "Estimator health: good 75 %, degraded (dvl) 25 %." in html
     assert 'href="meshcat.html"' in html
     assert html.count("<img ") == html.count('src="data:image/') == 9
     assert len(html) < 5e6

@@ -71,6 +71,11 @@ def test_log_holds_what_happened(crossing):
     assert log.time.size == n
     assert log["error_std"].shape == (n, 18)
     assert log["error_std"].min() >= 0
+    blocks = log["error_covariance"].reshape(n, 3, 3, 3)
+    variances = np.diagonal(blocks, axis1=2, axis2=3).reshape(n, 9)
+    np.testing.assert_allclose(np.sqrt(variances), log["error_std"][:, :9], rtol=1e-12)
+    assert log["nis"].shape == log["rejected"].shape == (n, 3)
+    assert log["nis"][-1].min() > 0
     assert log["pwm"].shape == (n, 8)
     plans = log.plans
     assert plans is not None

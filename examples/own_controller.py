@@ -3,7 +3,8 @@
 Run it: `python examples/own_controller.py`. It holds a pose in a current of a harbour and prints
 how far it strayed. In a scenario file the same controller is
 
-    controller: !Own {system: examples/own_controller.py:PidController, parameters: {x: 1.0}}
+    controller: !Own {system: examples/own_controller.py:PidController, parameters: {yaw: 0.5}}
+    success: !ReachGoal {goal: [1.0, 0.0, -1.5]}
 """
 
 import jax
@@ -34,11 +35,21 @@ class PidController(LeafSystem):
     """
 
     def __init__(
-        self, vehicle: Vehicle, x: float = 0.0, y: float = 0.0, z: float = -1.5, yaw: float = 0.0
+        self,
+        vehicle: Vehicle,
+        goal: np.ndarray | None = None,
+        x: float = 0.0,
+        y: float = 0.0,
+        z: float = -1.5,
+        yaw: float = 0.0,
     ):
-        """Metres and radians; `vehicle` is the station's and gives the gains their size."""
+        """Metres and radians; without a `goal` it holds x, y, z.
+
+        The station's `vehicle`, which gives the gains their size, and the run's `goal` are handed
+        to arguments of these names; `obstacles` and `station` would be as well.
+        """
         super().__init__()
-        self.goal, self.yaw = np.array([x, y, z]), yaw
+        self.goal, self.yaw = np.array([x, y, z]) if goal is None else goal, yaw
         mass = vehicle.mass + np.array(vehicle.added_mass[:3])
         inertia = vehicle.inertia[2] + vehicle.added_mass[5]
         self.P, self.I, self.D = 2.0 * mass, 0.5 * mass, 2.5 * mass

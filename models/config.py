@@ -2,7 +2,8 @@
 
 A configuration is a dataclass: its annotations are the schema, its defaults the defaults.
 Understood are dataclasses within one another, bool, int, float, str, Path, Literal, Optional, list,
-tuple, dict, NumPy arrays (`Float[np.ndarray, "3"]` also checks the shape) and unions. Where one of
+tuple, dict, NumPy arrays (`Float[np.ndarray, "3"]` also checks the shape), unions, and Any for what
+YAML itself knows: numbers, text, lists and mappings. Where one of
 several dataclasses may stand, the file names it by a tag, as Drake's typed YAML does:
 
     disturbances:
@@ -158,6 +159,19 @@ def _path(value: Any, _: Any) -> Path:
     return Path(value)
 
 
+def _any(value: Any, _: Any) -> Any:
+    match value:
+        case bool() | int() | str() | None:
+            return value
+        case float():
+            return _float(value, float)
+        case list():
+            return [_any(item, Any) for item in value]
+        case dict() if all(isinstance(key, str) for key in value):
+            return {key: _any(item, Any) for key, item in value.items()}
+    raise _fault(value, "numbers, text, lists, or mappings whose keys are text")
+
+
 def _literal(value: Any, cls: Any) -> Any:
     for choice in get_args(cls):
         if type(value) is type(choice) and value == choice:
@@ -308,6 +322,7 @@ def _converter() -> Converter:
         converter.register_structure_hook(cls, hook)
     converter.register_structure_hook_func(lambda t: get_origin(t) is Literal, _literal)
     converter.register_structure_hook_func(_is_array, _array)
+    converter.register_structure_hook_func(lambda t: t is Any, _any)
     for predicate, factory in (
         (lambda t: get_origin(t) is list, _list),
         (lambda t: get_origin(t) is tuple, _tuple),

@@ -161,8 +161,9 @@ def _estimate(log: RunLog) -> dict[str, Any]:
     }
     squares = nees(log)
     for i, name in enumerate(BLOCKS):
-        found[f"{name}_within_3_sigma"] = float(inside[:, 3 * i : 3 * i + 3].mean())
-        own = squares[:, i]
+        part, own = slice(3 * i, 3 * i + 3), squares[:, i]
+        claimed = bool(np.isfinite(std[:, part]).all())  # a filter of one's own may not say
+        found[f"{name}_within_3_sigma"] = float(inside[:, part].mean()) if claimed else math.nan
         found[f"{name}_nees"] = float(np.nanmean(own)) if np.isfinite(own).any() else math.nan
     low, high = average_bound(3)
     found |= {"nees_low": low, "nees_high": high}

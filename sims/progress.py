@@ -3,7 +3,7 @@
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Protocol, runtime_checkable
 
@@ -32,6 +32,12 @@ _SHOW_AFTER = 2.0  # s
 def console() -> Console:
     """The console for progress and summaries: standard error, so that output can be piped."""
     return Console(file=sys.stderr, highlight=False)
+
+
+def tell_code(scenario: str, code: Iterable[str]) -> None:
+    """Say whose code a scenario is about to run: a file from elsewhere may name any."""
+    for part in code:
+        console().print(f"{scenario} runs the code of {part}", markup=False, soft_wrap=True)
 
 
 @contextmanager

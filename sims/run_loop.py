@@ -11,15 +11,15 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Diagram
+from pydrake.systems.framework import Context, Diagram
 
 from ..models.errors import UserError
 from ..systems.closed_loop import build_diagram, logged, seeded
 from ..systems.compiled import CompiledSimulator
 from ..systems.network import NotPureError
-from .criteria import Monitor, Outcome
+from .criteria import FollowPath, Monitor, Outcome
 from .run_log import RunLog
-from .run_signals import PlanTap, collect, log_commands, log_periods
+from .run_signals import PlanTap, collect, log_commands, log_periods, plan_source
 from .scenario import Scenario
 
 Progress = Callable[[float, str], None]
@@ -84,7 +84,8 @@ def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engin
     until then is returned. A second one, or one before the flight, interrupts at once.
 
     Raises:
-        UserError: the scenario names what can't be read, its controller lacks a port, or the
+        UserError: the scenario names what can't be read, its controller lacks a port, tells no
+            plan though `FollowPath` judges by it or puts out no finite wrench at t = 0, or the
             engine is to be `compiled` and can't.
     """
     return next(simulate_seeds(scenario, [scenario.seed], progress, engine))
@@ -111,7 +112,9 @@ def simulate_seeds(
         scenario.controller,
         log_periods=log_periods(scenario),
         extend=log_commands(scenario),
+        goal=scenario.goal,
     )
+    _check_plan(diagram, scenario)
     simulator = None
     for seed in seeds:
         warm = simulator is not None
@@ -123,6 +126,36 @@ def simulate_seeds(
         yield run
         if run.outcome.reason == "interrupted":
             return
+
+
+def _check_plan(diagram: Diagram, scenario: Scenario) -> None:
+    if isinstance(scenario.success, FollowPath) and plan_source(diagram) is None:
+        controller = type(diagram.GetSubsystemByName("controller")).__name__
+        raise UserError(
+            f"success: !FollowPath judges how a plan is followed, and the controller {controller} "
+            "tells none: give it an output port `plan` with the attribute `layout` "
+            "(systems.plan.PlanLayout), or the scenario success: !ReachGoal {goal: [x, y, z]}"
+        )
+
+
+def _check_start(
+    diagram: Diagram, context: Context, period: float, error: FloatingPointError
+) -> None:
+    """Blame what was not finite from the start on: there is no flight to tell of.
+
+    What a controller puts out at t = 0 acts at once or a `period` of the plant (s) later.
+    """
+    signals = logged(diagram, context)
+    acting = signals["F_acting"]
+    bad = acting.time[~np.isfinite(acting.value).all(axis=1)]
+    if bad.size and bad[0] < 1.5 * period:
+        controller = type(diagram.GetSubsystemByName("controller")).__name__
+        raise UserError(
+            f"controller {controller}: its F_Bo_B is not finite at t = 0 s; put out a finite "
+            "wrench from the start on"
+        ) from error
+    if not signals["X_WB_cheat"].time.size:
+        raise UserError(f"the run ended in its first step: {error}") from error
 
 
 def _one(
@@ -218,6 +251,7 @@ def _fly(
     except FloatingPointError as error:  # it names what was not finite
         log = sinks[0].FindLog(context)
         last = log.sample_times()[np.isfinite(log.data()).all(axis=0)][-1]
+        _check_start(diagram, context, scenario.station.period, error)
         outcome = outcome or Outcome("not finite", round(float(last), 9), str(error))
     return outcome
 

@@ -13,6 +13,7 @@ from pydrake.systems.primitives import LogVectorOutput
 from ..systems.closed_loop import Signal
 from ..systems.filtering.delayed import STATUS
 from ..systems.filtering.error_state import ERRORS, POSITION, ROTATION, VELOCITY
+from ..systems.plan import PlanLayout
 from ..systems.signal_log import add_log
 from .run_log import FUSED, Plans, RunLog
 from .scenario import Scenario
@@ -59,26 +60,35 @@ def log_commands(scenario: Scenario) -> Callable[[DiagramBuilder, System, System
     return extend
 
 
+def plan_source(diagram: Diagram) -> Any:
+    """The system whose port `plan` a closed loop's controller follows, None if it tells of none.
+
+    It is the controller or its subsystem `source`, and has the plan's `PlanLayout` as `layout`.
+    """
+    source: Any = diagram.GetSubsystemByName("controller")
+    if isinstance(source, Diagram) and source.HasSubsystemNamed("source"):
+        source = source.GetSubsystemByName("source")
+    layout: Any = getattr(source, "layout", None)
+    if not isinstance(layout, PlanLayout) or not source.HasOutputPort("plan"):
+        return None
+    return source if source.GetOutputPort("plan").size() == layout.size else None
+
+
 class PlanTap:
     """Keeps every plan that a controller makes, and what its planner sampled for it.
 
-    A controller whose diagram has a subsystem `source` with a `layout` makes plans; any other has
-    none, and nothing is kept.
+    Of a controller that makes none (`plan_source`) nothing is kept.
     """
 
     def __init__(self, diagram: Diagram, root: Context, samples: bool = True):
-        controller = diagram.GetSubsystemByName("controller")
-        self.source: Any = None
+        self.source = source = plan_source(diagram)
         self.kept: list[dict[str, np.ndarray]] = []
-        if isinstance(controller, Diagram) and controller.HasSubsystemNamed("source"):
-            source = controller.GetSubsystemByName("source")
-            if hasattr(source, "layout") and source.HasOutputPort("plan"):
-                self.source = source
-                self._context = source.GetMyContextFromRoot(root)
-                names = ("plan", "samples", "figures") if samples else ("plan", "figures")
-                self._ports: dict[str, Any] = {
-                    name: source.GetOutputPort(name) for name in names if source.HasOutputPort(name)
-                }
+        if source is not None:
+            self._context = source.GetMyContextFromRoot(root)
+            names = ["plan"]
+            if hasattr(source, "planner"):
+                names += ["samples", "figures"] if samples else ["figures"]
+            self._ports: dict[str, Any] = {name: source.GetOutputPort(name) for name in names}
 
     @property
     def period(self) -> float | None:

@@ -13,6 +13,7 @@ from ..models.checks import check_numbers, require
 from ..models.errors import UserError
 from ..models.yaml_text import Tagged, emit, parse
 from ..systems.controllers import ControllerKind, MppiImpedance
+from ..systems.own import OwnSystem
 from ..systems.station_config import StationConfig
 from .criteria import FollowPath, ReachGoal, Safety
 
@@ -90,6 +91,12 @@ class Scenario:
             return np.array(self.success.goal)
         goal = getattr(self.controller, "goal", None)
         return None if goal is None else np.array(goal.position)
+
+    @property
+    def code(self) -> tuple[str, ...]:
+        """The code of one's own that runs with it: files or modules, with the class in them."""
+        parts = (self.controller, self.station.sensing.filter)
+        return tuple(part.code for part in parts if isinstance(part, OwnSystem))
 
     def with_changes(
         self, seed: int | None = None, duration: float | None = None, model: Path | None = None

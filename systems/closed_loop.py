@@ -9,10 +9,10 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import VectorLogSink
 
-from .controllers import Controller
+from .controllers import Controller, Goal
 from .network import Port, flatten, holders
 from .signal_log import SignalLog, add_log
-from .station import CHEATS, make_station
+from .station import CHEATS, check_stand_in, make_station
 from .station_config import StationConfig
 
 LOG_PERIODS: Mapping[str, float] = {
@@ -52,6 +52,8 @@ def build_diagram(
     hardware: bool = False,
     log_periods: Mapping[str, float] = LOG_PERIODS,
     extend: Callable[[DiagramBuilder, System, System], Any] | None = None,
+    goal: Goal = None,
+    stand_in: System | None = None,
 ) -> Diagram:
     """Close the loop: subsystems `station`, `controller`, and a log `log_<port>` of each port.
 
@@ -62,13 +64,22 @@ def build_diagram(
     `extend(builder, station, controller)` may add more, a visualiser say, before the diagram is
     built. The diagram has no input ports; its randomness comes from sources inside (`seeded`).
 
+    `goal` (m, W) is for a controller that is told it (`Own`). With `stand_in` that system is the
+    station: a vehicle's driver, a recording played back, another simulator. It takes `F_Bo_B` and
+    has the outputs `X_WB` and `V_WB_B`; what else it has of `station_ports` is logged as well. The
+    configuration `station` still says for which vehicle and among which obstacles to control.
+
     Raises:
-        UserError: a configuration names what can't be read, or the controller lacks a port.
+        UserError: a configuration names what can't be read, or controller or stand-in lack a port.
         NotImplementedError: hardware is asked for.
     """
     builder = DiagramBuilder()
-    plant = builder.AddNamedSystem("station", make_station(station, hardware))
-    control = controller.add_to(builder, station)
+    if stand_in is None:
+        plant = builder.AddNamedSystem("station", make_station(station, hardware))
+    else:
+        check_stand_in(stand_in)
+        plant = builder.AddNamedSystem("station", stand_in)
+    control = controller.add_to(builder, station, goal)
     for name in ("X_WB", "V_WB_B"):
         builder.Connect(plant.GetOutputPort(name), control.GetInputPort(name))
     builder.Connect(control.GetOutputPort("F_Bo_B"), plant.GetInputPort("F_Bo_B"))

@@ -5,24 +5,19 @@ and the output port `F_Bo_B` (6), the wrench it wants.
 """
 
 import abc
-import importlib
-import importlib.util
-import inspect
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 
 from ..models.checkpoint import load_model
 from ..models.checks import Vector6, check_numbers, require
 from ..models.dynamics import Dynamics
 from ..models.effects.extended import Extended, core
-from ..models.errors import UserError
 from ..models.spinn import Spinn
 from ..models.vehicle import load_vehicle
 from .disturbance_observer import DisturbanceObserver, MomentumObserver
@@ -31,6 +26,7 @@ from .mppi import Mppi
 from .mppi_config import MppiConfig
 from .mppi_core import MppiPlanner
 from .obstacles import Cylinders, SphereHull
+from .own import OwnSystem, check_ports, port_sizes
 from .paths import FigureEight, HoldPose, PoseConfig, Waypoints
 from .plan import PlanLayout
 from .reference import Reference
@@ -45,29 +41,28 @@ OUTPUTS = {"F_Bo_B": 6}
 """Output ports of every controller and their sizes; it may have more."""
 
 
+Goal = Float[np.ndarray, "3"] | None
+"""Where a run is to end (m, W), if anywhere."""
+
+
 class Controller(abc.ABC):
     """A kind of controller."""
 
     @abc.abstractmethod
-    def build(self, station: StationConfig) -> System:
-        """The system; it may read vehicle, obstacles and rates of the station it is made for."""
+    def build(self, station: StationConfig, goal: Goal = None) -> System:
+        """The system; it may read vehicle, obstacles and rates of the station it is made for.
 
-    def add_to(self, builder: DiagramBuilder, station: StationConfig) -> System:
+        `goal` is that of the run, for a controller that has none of its own.
+        """
+
+    def add_to(self, builder: DiagramBuilder, station: StationConfig, goal: Goal = None) -> System:
         """Add the system to a diagram under the name `controller`.
 
         Raises:
             UserError: it lacks a port, or a port has another size.
         """
-        system = self.build(station)
-        inputs = {port.get_name(): port.size() for port in _input_ports(system)}
-        outputs = {port.get_name(): port.size() for port in _output_ports(system)}
-        for kind, wanted, has in (("input", INPUTS, inputs), ("output", OUTPUTS, outputs)):
-            for name, size in wanted.items():
-                if has.get(name) != size:
-                    raise UserError(
-                        f"controller {type(system).__name__} needs the {kind} port `{name}` of "
-                        f"size {size}; it has {has or 'none'}"
-                    )
+        system = self.build(station, goal)
+        check_ports("controller", system, (INPUTS, OUTPUTS))
         return builder.AddNamedSystem("controller", system)
 
 
@@ -160,8 +155,8 @@ class Tracking:
         if noise_period is not None:
             add_noise(builder, source, "noise", noise_period)
         builder.ExportOutput(impedance.GetOutputPort("F_Bo_B"), "F_Bo_B")
-        for port in _output_ports(source):
-            builder.ExportOutput(port, port.get_name())
+        for name in port_sizes(source)[1]:
+            builder.ExportOutput(source.GetOutputPort(name), name)
         return builder.Build()
 
 
@@ -206,7 +201,8 @@ class MppiImpedance(Controller):
         vehicle = load_vehicle(self.vehicle or station.vehicle)
         return vehicle.dynamics(np.array(self.diffusion)), {}
 
-    def build(self, station: StationConfig) -> Diagram:
+    def build(self, station: StationConfig, goal: Goal = None) -> Diagram:
+        del goal  # it has its own
         vehicle = station.load_vehicle()
         model, metadata = self._model(station)
         c = self.planner.with_substeps_of(metadata)
@@ -237,82 +233,34 @@ class TrackReference(Controller):
     feedforward: bool = True
     tracking: Tracking = field(default_factory=Tracking)
 
-    def build(self, station: StationConfig) -> Diagram:
+    def build(self, station: StationConfig, goal: Goal = None) -> Diagram:
+        del goal
         model = station.load_vehicle().dynamics()
         reference = Reference(self.path, model if self.feedforward else None)
         return self.tracking.build(station, reference, reference.layout, model)
 
 
 @dataclass(frozen=True)
-class Own(Controller):
+class Own(OwnSystem, Controller):
     """A controller of one's own.
 
-    Attributes:
-        system: `path/to/file.py:ClassName` or `package.module:ClassName` of a Drake system.
-        parameters: keyword arguments of its constructor. If that has an argument `vehicle` and
-            none is given here, it gets the station's `Vehicle`.
+    Its constructor is given, if it has arguments of these names and `parameters` has none: the
+    station's `vehicle` (a `Vehicle`), its `obstacles` (a tuple of `Pylon`), the `goal` (position in
+    W, m) if the run has one, and all of the `station`'s configuration. With an input port `health`
+    it is told how good the estimate is. With an output port `plan` and an attribute `layout`, the
+    plan's `PlanLayout`, its plans are logged and judged.
     """
 
-    system: str
-    parameters: dict[str, bool | int | float | str | list[float]] = field(default_factory=dict)
-
-    def build(self, station: StationConfig) -> System:
-        where, _, name = self.system.rpartition(":")
-        if not where or not name:
-            raise UserError(
-                f"Own.system is `{self.system}`: write path/to/file.py:ClassName, or "
-                "package.module:ClassName"
-            )
-        found = getattr(_module(where), name, None)
-        if not (inspect.isclass(found) and issubclass(found, System)):
-            raise UserError(f"Own.system: {where} has no Drake system called `{name}`")
-        arguments: dict = dict(self.parameters)
-        signature = inspect.signature(found)
-        if "vehicle" in signature.parameters:
-            arguments.setdefault("vehicle", station.load_vehicle())
-        try:
-            signature.bind(**arguments)
-        except TypeError as error:
-            raise UserError(
-                f"Own.parameters do not fit {name}{signature}: {error}; give what it takes"
-            ) from error
-        return found(**arguments)
+    def build(self, station: StationConfig, goal: Goal = None) -> System:
+        return self.make(
+            {
+                "vehicle": station.load_vehicle,
+                "obstacles": lambda: station.obstacles,
+                "goal": lambda: None if goal is None else np.array(goal, float),
+                "station": lambda: station,
+            }
+        )
 
 
 ControllerKind = MppiImpedance | TrackReference | Own
 """The kinds that a scenario can name by a tag."""
-
-
-def _module(where: str) -> ModuleType:
-    """The module of a dotted name, or of a file, which is run at most once."""
-    path = Path(where).resolve()
-    if path.suffix != ".py":
-        try:
-            return importlib.import_module(where)
-        except ModuleNotFoundError as error:
-            raise UserError(
-                f"Own.system: there is no module `{where}`; a file's name ends in .py"
-            ) from error
-    if not path.is_file():
-        raise UserError(f"Own.system: there is no file {where}; check the path")
-    name = f"own_controller_{path.stem}_{abs(hash(str(path))):x}"
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[name] = module
-        try:
-            spec.loader.exec_module(module)
-        except BaseException:
-            del sys.modules[name]
-            raise
-    return sys.modules[name]
-
-
-def _input_ports(system: System) -> list:
-    return [system.get_input_port(i) for i in range(system.num_input_ports())]
-
-
-def _output_ports(system: System) -> list:
-    return [system.get_output_port(i) for i in range(system.num_output_ports())]

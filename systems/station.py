@@ -1,5 +1,6 @@
 """The station: everything between a controller's wrench and the state it is told."""
 
+import numpy as np
 from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import ConstantVectorSource, RandomSource
@@ -8,6 +9,7 @@ from .allocation import ThrustAllocation
 from .disturbance_source import DisturbanceSource
 from .ekf import Ekf
 from .learned_plant import LearnedPlant
+from .own import check_ports
 from .sensor_suite import SensorSuite
 from .station_config import StationConfig
 
@@ -35,6 +37,9 @@ CHEATS = {
 }
 """Output ports that only a simulation has: the truth."""
 
+_NEEDED = {"X_WB": 7, "V_WB_B": 6}
+_TOLD = {"covariance": 324, "status": 10}
+_READ = {"imu": 6, "dvl": 7, "depth": 3, "compass": 3}
 _NEVER = 1e9  # period (s) of noise that is drawn once
 _WATER = 2  # periods of the plant between steps of the water, whose waves take seconds
 
@@ -44,22 +49,37 @@ def station_ports(hardware: bool = False) -> tuple[dict[str, int], dict[str, int
     return dict(INPUTS), OUTPUTS | ({} if hardware else CHEATS)
 
 
-def make_station(config: StationConfig, hardware: bool = False) -> Diagram:
+def make_station(
+    config: StationConfig, hardware: bool = False, estimator: System | None = None
+) -> Diagram:
     """A diagram with `station_ports(hardware)`.
 
     In simulation: allocation, plant with thrusters, disturbances, sensors and filter, as subsystems
     `allocation`, `plant`, `disturbances`, `sensors` and `ekf`. All noise comes from random sources
-    inside, which `SetRandomContext` seeds.
+    inside, which `SetRandomContext` seeds. With `estimator` that system is the filter, whatever the
+    configuration says; which ports it may have is told by `systems.own.OwnFilter`.
 
     Raises:
         NotImplementedError: hardware is asked for.
-        UserError: a part of the configuration names what can't be read.
+        UserError: a part of the configuration names what can't be read, or the estimator lacks a
+            port.
     """
     if hardware:
         raise NotImplementedError(
             "this version has no link to a vehicle; build the station with hardware=False"
         )
-    return _simulated(config)
+    return _simulated(config, estimator)
+
+
+def check_stand_in(system: System) -> None:
+    """Check that a system can stand in for a station.
+
+    Raises:
+        UserError: it lacks `F_Bo_B`, `X_WB` or `V_WB_B`, or a port has another size than a
+            station's.
+    """
+    known = {name: size for name, size in (OUTPUTS | CHEATS).items() if name != "pwm"}
+    check_ports("station", system, (INPUTS, _NEEDED), ({}, known))
 
 
 def add_noise(builder: DiagramBuilder, system: System, name: str, period: float) -> None:
@@ -72,7 +92,7 @@ def add_noise(builder: DiagramBuilder, system: System, name: str, period: float)
     builder.Connect(source.get_output_port(), port)
 
 
-def _simulated(config: StationConfig) -> Diagram:
+def _simulated(config: StationConfig, estimator: System | None) -> Diagram:
     thrusters = config.load_vehicle().thrusters()
     X0, V0 = config.initial_state()
     s = config.sensing
@@ -84,7 +104,9 @@ def _simulated(config: StationConfig) -> Diagram:
     plant = add("plant", body)
     water = add("disturbances", DisturbanceSource(config.disturbance(), water_period))
     sensors = add("sensors", SensorSuite(s.imu, s.dvl, s.depth, s.compass, s.faults))
-    ekf = add("ekf", Ekf(s.imu, s.dvl, s.depth, s.compass, s.ekf, X0, V0))
+    ekf = add("ekf", estimator or _filter(config))
+    commands = {"pwm": allocation.GetOutputPort("pwm").size()}
+    check_ports("filter", ekf, ({}, _NEEDED), (_READ | commands, _TOLD))
 
     def connect(source, output: str, target, name: str | None = None) -> None:
         builder.Connect(source.GetOutputPort(output), target.GetInputPort(name or output))
@@ -96,8 +118,10 @@ def _simulated(config: StationConfig) -> Diagram:
         connect(plant, f"X_WB{seen}", reader, "X_WB")
         connect(plant, f"V_WB_B{seen}", reader, "V_WB_B")
     connect(plant, "A_WB_B", sensors)
-    for reading in ("imu", "dvl", "depth", "compass"):
-        connect(sensors, reading, ekf)
+    for source, names in ((sensors, _READ), (allocation, ("pwm",))):
+        for name in names:
+            if ekf.HasInputPort(name):
+                connect(source, name, ekf)
     nominal = float(thrusters.nominal_voltage)
     volts = nominal if config.voltage is None else config.voltage
     battery = add("battery", ConstantVectorSource([volts]))
@@ -107,17 +131,23 @@ def _simulated(config: StationConfig) -> Diagram:
     add_noise(builder, water, "noise", water_period)
     add_noise(builder, sensors, "noise", 1 / s.imu.rate)
     for system in (water, sensors, ekf):
-        add_noise(builder, system, "initial_noise", _NEVER)
+        if system.HasInputPort("initial_noise"):
+            add_noise(builder, system, "initial_noise", _NEVER)
     if sensors.HasInputPort("fault_noise"):  # the last source: it leaves the others their seeds
         add_noise(builder, sensors, "fault_noise", 1 / s.imu.rate)
 
     builder.ExportInput(allocation.GetInputPort("F_Bo_B"), "F_Bo_B")
-    for name in ("X_WB", "V_WB_B", "covariance"):
+    for name in ("X_WB", "V_WB_B"):
         builder.ExportOutput(ekf.GetOutputPort(name), name)
-    for name in ("imu", "dvl", "depth", "compass"):
+    for name in _READ:
         builder.ExportOutput(sensors.GetOutputPort(name), name)
     builder.ExportOutput(allocation.GetOutputPort("pwm"), "pwm")
-    builder.ExportOutput(ekf.GetOutputPort("status"), "status")
+    for name, size in _TOLD.items():
+        if ekf.HasOutputPort(name):
+            builder.ExportOutput(ekf.GetOutputPort(name), name)
+        else:
+            untold = add(f"no_{name}", ConstantVectorSource(np.full(size, np.nan)))
+            builder.ExportOutput(untold.get_output_port(), name)
     builder.ExportOutput(plant.GetOutputPort("X_WB"), "X_WB_cheat")
     builder.ExportOutput(plant.GetOutputPort("V_WB_B"), "V_WB_B_cheat")
     builder.ExportOutput(water.GetOutputPort("F_disturbance_Bo_B"), "F_disturbance_cheat")
@@ -125,3 +155,22 @@ def _simulated(config: StationConfig) -> Diagram:
     station = builder.Build()
     station.set_name("station")
     return station
+
+
+def _filter(config: StationConfig) -> System:
+    """The filter that a configuration asks for."""
+    s, (X0, V0) = config.sensing, config.initial_state()
+    if s.filter is None:
+        return Ekf(s.imu, s.dvl, s.depth, s.compass, s.ekf, X0, V0)
+    return s.filter.make(
+        {
+            "vehicle": config.load_vehicle,
+            "imu": lambda: s.imu,
+            "dvl": lambda: s.dvl,
+            "depth": lambda: s.depth,
+            "compass": lambda: s.compass,
+            "X0_WB": lambda: X0,
+            "V0_WB_B": lambda: V0,
+            "station": lambda: config,
+        }
+    )

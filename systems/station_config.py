@@ -17,6 +17,7 @@ from ..models.spinn import Spinn
 from ..models.vehicle import Vehicle, load_vehicle
 from .filtering.delayed import EkfConfig
 from .obstacles import Pylon
+from .own import OwnFilter
 from .paths import PoseConfig
 
 
@@ -26,6 +27,7 @@ class Sensing:
 
     Attributes:
         faults: of what the sensors show (`docs/sensor-faults.md`); the filter isn't told.
+        filter: of one's own, in the place of the one that `ekf` configures.
     """
 
     imu: Imu = field(default_factory=Imu)
@@ -34,6 +36,7 @@ class Sensing:
     compass: Compass = field(default_factory=Compass)
     ekf: EkfConfig = field(default_factory=EkfConfig)
     faults: tuple[SensorFault, ...] = ()
+    filter: OwnFilter | None = None
 
 
 @dataclass(frozen=True)

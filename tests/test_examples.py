@@ -3,7 +3,7 @@
 import re
 import runpy
 
-from helpers import ROOT
+from helpers import ROOT, load_example
 
 
 def test_own_controller_holds_station_in_the_harbour(capsys):
@@ -13,3 +13,10 @@ def test_own_controller_holds_station_in_the_harbour(capsys):
     assert found, out
     assert float(found[1]) < 0.5
     assert float(found[2]) < 0.3
+
+
+def test_own_filter_steers_a_figure(capsys):
+    """Without a filter's smoothing: a DVL of a few mm/s drifts by cm in half a figure."""
+    off = load_example("own_filter").main(8.0)
+    assert "after 8 s the estimate is" in capsys.readouterr().out
+    assert 0 < off < 0.3

@@ -13,6 +13,7 @@ from pydrake.systems.framework import LeafSystem
 
 from helpers import ROOT, module_files
 from spinndrift.models.disturbances import Combined
+from spinndrift.models.sensors import Imu
 from spinndrift.models.vehicle import load_vehicle
 from spinndrift.systems.disturbance_observer import MomentumObserver
 from spinndrift.systems.impedance import ImpedanceLaw
@@ -47,6 +48,7 @@ def arguments() -> dict[str, dict]:
         "DisturbanceObserver": {"observer": MomentumObserver(dynamics)},
         "Reference": {"path": HoldPose()},
         "PidController": {"vehicle": VEHICLE},
+        "DeadReckoning": {"imu": Imu(), "X0_WB": np.eye(7)[0]},
         "SignalLog": {"size": 7, "period": 0.05},
     }
 

@@ -150,26 +150,78 @@ def test_collision_ends_the_run():
     assert run.log.time.size == 1
 
 
+BAD = """
+import numpy as np
+from pydrake.systems.framework import LeafSystem
+from spinndrift.systems.plan import PlanLayout
+
+class Bad(LeafSystem):
+    def __init__(self, start: float = -1.0, plan: bool = False):
+        super().__init__()
+        self.start = start
+        self.DeclareVectorInputPort("X_WB", 7)
+        self.DeclareVectorInputPort("V_WB_B", 6)
+        self.DeclareVectorOutputPort("F_Bo_B", 6, self.calc)
+        if plan:
+            self.layout = PlanLayout(1, 1.0)
+            self.DeclareStateOutputPort("plan", self.DeclareDiscreteState(self.layout.size))
+
+    def calc(self, context, output):
+        output.SetFromVector(np.full(6, np.nan if context.get_time() > self.start else 0.0))
+
+class BadInUpdate(Bad):
+    def __init__(self):
+        super().__init__(1.0)
+        self.DeclarePeriodicDiscreteUpdateEvent(0.1, 0.0, self.update)
+        self.F = self.DeclareDiscreteState(6)
+
+    def update(self, context, state):
+        state.set_value(self.F, [np.nan] * 6)
+
+    def calc(self, context, output):
+        output.SetFromVector(context.get_discrete_state(self.F).value())
+"""
+REACH = "success: !ReachGoal {goal: [9, 0, -1.5]}"
+
+
+def _bad(folder, name="Bad", more="", success=REACH):
+    (folder / "bad.py").write_text(BAD)
+    own = f"{{system: '{folder}/bad.py:{name}', parameters: {{{more}}}}}"
+    return overridden(HOLD, f"controller: !Own {own}\n{success}")
+
+
 def test_a_controller_of_nan_ends_the_run(tmp_path):
-    (tmp_path / "bad.py").write_text(
-        "import numpy as np\n"
-        "from pydrake.systems.framework import LeafSystem\n"
-        "class Bad(LeafSystem):\n"
-        "    def __init__(self):\n"
-        "        super().__init__()\n"
-        "        self.DeclareVectorInputPort('X_WB', 7)\n"
-        "        self.DeclareVectorInputPort('V_WB_B', 6)\n"
-        "        self.DeclareVectorOutputPort('F_Bo_B', 6, self.calc)\n"
-        "    def calc(self, context, output):\n"
-        "        late = context.get_time() > 0.22\n"
-        "        output.SetFromVector(np.full(6, np.nan if late else 0.0))\n"
-    )
-    run = simulate(overridden(HOLD, f"controller: !Own {{system: '{tmp_path}/bad.py:Bad'}}"))
+    run = simulate(_bad(tmp_path, more="start: 0.22"))
     assert run.outcome.reason == "not finite"
     assert "not finite" in run.outcome.sentence
     assert run.log.time[-1] == pytest.approx(0.2)
     assert np.isfinite(run.log["F_Bo_B"]).all()
     assert run.log.plans is None
+
+
+@pytest.mark.parametrize("name", ["Bad", "BadInUpdate"])
+def test_nan_from_the_start_is_no_flight(tmp_path, name):
+    with pytest.raises(UserError, match=rf"^controller {name}: its F_Bo_B is not finite at t = 0"):
+        simulate(_bad(tmp_path, name))
+
+
+def test_a_plan_that_is_judged_has_to_be_told(tmp_path):
+    follow = "success: !FollowPath {}"
+    with pytest.raises(UserError, match=r"FollowPath judges .* the controller Bad tells none"):
+        simulate(_bad(tmp_path, success=follow))
+    run = simulate(_bad(tmp_path, more="start: 0.22, plan: true", success=follow))
+    assert run.outcome.reason == "not finite"
+    assert not run.log["plan_valid"].any()
+
+
+def test_whose_code_runs_is_said_before(tmp_path, capsys):
+    scenario = tmp_path / "mine.yaml"
+    scenario.write_text(config.dump(_bad(tmp_path, "Missing")))
+    with pytest.raises(SystemExit):
+        main(["run", str(scenario), "--quiet", "--out", str(tmp_path / "out")])
+    said, refused = capsys.readouterr().err.splitlines()
+    assert said == f"{scenario} runs the code of {tmp_path}/bad.py:Missing"
+    assert "no Drake system called `Missing`" in refused
 
 
 def test_commands_are_averaged_over_the_steps_of_the_log():

@@ -1,5 +1,6 @@
 """The station, the controllers that plug into it, and the closed loop."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import MonteCarloSimulation, Simulator
-from pydrake.systems.framework import System
+from pydrake.systems.framework import LeafSystem, System
 
 from helpers import ROOT
 from spinndrift.models.config import dump, loads
@@ -181,7 +182,113 @@ def test_a_controller_of_ones_own_plugs_in_with_its_parameters():
     np.testing.assert_allclose(own.P, 2 * (mass.mass + np.array(mass.added_mass[:3])))
 
 
-def test_wrong_controllers_are_refused_with_a_remedy(tmp_path):
+WITHIN = """
+import numpy as np
+from pydrake.systems.framework import LeafSystem
+
+class Told(LeafSystem):
+    def __init__(self, vehicle, obstacles, goal, station, nested=None):
+        super().__init__()
+        self.told = vehicle, obstacles, goal, station, nested
+        self.DeclareVectorInputPort("X_WB", 7)
+        self.DeclareVectorInputPort("V_WB_B", 6)
+        self.DeclareVectorOutputPort("F_Bo_B", 6, lambda context, output: None)
+
+class Fails(LeafSystem):
+    def __init__(self):
+        raise RuntimeError("no link")
+
+class Still(LeafSystem):
+    def __init__(self, X0_WB, dvl, size=6):
+        super().__init__()
+        self.rate, X, V = dvl.rate, self.DeclareDiscreteState(7), self.DeclareDiscreteState(size)
+        self.start = X0_WB
+        self.DeclareVectorInputPort("depth", 3)
+        self.DeclareVectorInputPort("pwm", 8)
+        self.DeclareStateOutputPort("X_WB", X)
+        self.DeclareStateOutputPort("V_WB_B", V)
+        self.DeclarePeriodicDiscreteUpdateEvent(0.05, 0.0, self.update)
+
+    def update(self, context, state):
+        X = np.array(self.start)
+        X[6] = -self.GetInputPort("depth").Eval(context)[0]
+        X[4] = self.GetInputPort("pwm").Eval(context)[0]
+        state.set_value(0, X)
+"""
+
+
+@pytest.fixture(name="own", scope="module")
+def _own(tmp_path_factory):
+    path = tmp_path_factory.mktemp("own") / "within.py"
+    path.write_text(WITHIN)
+    return path
+
+
+def test_a_controller_of_ones_own_is_told_its_task(own):
+    nested = {"gains": {"P": [1.0, 2.0], "on": True}, "modes": [{"name": "a"}, None]}
+    text = dump(Own(f"{own}:Told", {"nested": nested}))
+    controller = loads(Own, text)
+    assert controller.parameters == {"nested": nested}
+    station = StationConfig(obstacles=(Pylon(1.0, 2.0),))
+    diagram = build_diagram(station, controller, goal=np.array([1.0, 0.0, -2.0]))
+    built: Any = diagram.GetSubsystemByName("controller")
+    told = built.told
+    np.testing.assert_array_equal(told[2], [1.0, 0.0, -2.0])
+    assert told[:2] == (station.load_vehicle(), station.obstacles)
+    assert told[3:] == (station, nested)
+    with pytest.raises(UserError, match="Told takes `goal`, of which there is none here"):
+        build_diagram(station, controller)
+    with pytest.raises(UserError, match=r"parameters.*finite"):
+        loads(Own, "{system: a.py:A, parameters: {a: [{b: .nan}]}}")
+
+
+def test_a_filter_of_ones_own_takes_the_place_of_the_stations(own):
+    text = f"sensing: {{filter: !OwnFilter {{system: '{own}:Still'}}}}"
+    station = loads(StationConfig, text)
+    assert loads(StationConfig, dump(station)) == station
+    own_filter = station.sensing.filter
+    assert own_filter is not None
+    logs = run(station, HOLD, 0.3)
+    X = logs["X_WB"].value
+    assert np.ptp(X[1:, 6]) > 0  # the depth sensor's noise
+    np.testing.assert_allclose(X[1:, 6], -1.5, atol=0.3)
+    assert X[-1, 4] > 1000  # µs
+    assert np.isnan(logs["covariance"].value).all()
+    # the same system, given by hand
+    made = make_station(StationConfig(), estimator=own_filter.make(
+        {"X0_WB": lambda: np.eye(7)[0], "dvl": lambda: station.sensing.dvl}
+    ))  # fmt: skip
+    assert ports(made) == station_ports()
+    wide = replace(own_filter, parameters={"size": 5})
+    with pytest.raises(UserError, match="filter Still needs the output port `V_WB_B` of size 6"):
+        make_station(StationConfig(sensing=Sensing(filter=wide)))
+
+
+class Playback(LeafSystem):
+    """A station that shows a motion it was given, whatever it is told to do."""
+
+    def __init__(self, size: int = 7):
+        super().__init__()
+        self.DeclareVectorInputPort("F_Bo_B", 6)
+        nothing = {self.nothing_ticket()}
+        for name, width in (("X_WB", size), ("V_WB_B", 6)):
+            show = lambda context, out, n=width: out.SetFromVector(np.eye(n)[0])  # noqa: E731
+            self.DeclareVectorOutputPort(name, width, show, nothing)
+
+
+def test_another_system_can_stand_in_for_the_station():
+    diagram = build_diagram(StationConfig(), HOLD, stand_in=Playback())
+    logs = fly(diagram, 0.3, 0)
+    assert set(logs) == {"X_WB", "V_WB_B", "F_Bo_B", "F_bias_Bo_W", "plan"}
+    np.testing.assert_array_equal(logs["X_WB"].value, np.tile(np.eye(7)[0], (6, 1)))
+    assert logs["F_Bo_B"].value[-1, 2] < -5  # down to the pose that is to be held
+    with pytest.raises(UserError, match="station Playback needs the output port `X_WB` of size 7"):
+        build_diagram(StationConfig(), HOLD, stand_in=Playback(6))
+    built = build_diagram(StationConfig(), HOLD, stand_in=make_station(StationConfig()))
+    assert built.HasSubsystemNamed("station")
+
+
+def test_wrong_controllers_are_refused_with_a_remedy(tmp_path, own):
     (tmp_path / "wrong.py").write_text(
         "from pydrake.systems.primitives import PassThrough\n"
         "class Wrong(PassThrough):\n"
@@ -194,6 +301,7 @@ def test_wrong_controllers_are_refused_with_a_remedy(tmp_path):
         "nowhere.py:A": "no file",
         "no_such_module:A": "no module",
         f"{tmp_path / 'wrong.py'}:number": "no Drake system",
+        f"{own}:Fails": r"Fails failed with RuntimeError: no link \(.*within.py, line 15\)",
         f"{tmp_path / 'wrong.py'}:Wrong": "`X_WB` of size 7",
     }
     for system, message in cases.items():

@@ -30,7 +30,7 @@ class Demo:
         from ...training.config import TrainingConfig
         from ..cores import share_cores
         from ..demo import EMBEDDED, demo
-        from ..progress import console
+        from ..progress import console, tell_code
         from ..scenario import load_scenario
 
         share_cores()
@@ -38,4 +38,6 @@ class Demo:
         if self.steps is not None:
             config = replace(config, steps=self.steps)
         source = EMBEDDED if self.log is None else self.log
-        console().print(demo(source, self.out, load_scenario(self.scenario), config, self.vehicle))
+        scenario = load_scenario(self.scenario)
+        tell_code(self.scenario, scenario.code)
+        console().print(demo(source, self.out, scenario, config, self.vehicle))

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from ..progress import console, progress_bar
+from ..progress import console, progress_bar, tell_code
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,9 @@ class Run:
     Recording of all that happened), metrics.json, and scenario.yaml with every default written out,
     which can be changed and run again. The same scenario and seed give the same run. After Ctrl-C
     the folder holds what was flown until then.
+
+    A scenario with !Own or !OwnFilter runs the Python code that it names, which is said before:
+    look at that code first if the file comes from elsewhere.
     """
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
@@ -48,6 +51,7 @@ class Run:
         from ..scenario import load_scenario
 
         scenario = load_scenario(self.scenario, self.scenario_text)
+        tell_code(self.scenario, scenario.code)
         scenario = scenario.with_changes(self.seed, self.duration, self.model)
         out = free_folder("runs", scenario) if self.out is None else self.out
         check_free(out)

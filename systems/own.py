@@ -1,0 +1,167 @@
+"""Code of one's own in a diagram: Drake systems that a configuration names by file and class."""
+
+import importlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from traceback import extract_tb
+from types import ModuleType
+from typing import Any
+
+from pydrake.systems.framework import InputPort, OutputPort, System
+
+from ..models.errors import UserError
+
+Offered = Mapping[str, Callable[[], Any]]
+"""What a constructor is given if it has an argument of that name, each as a function that makes
+it; one that makes None has nothing to give."""
+
+
+@dataclass(frozen=True)
+class OwnSystem:
+    """A system of one's own.
+
+    Attributes:
+        system: `path/to/file.py:ClassName` or `package.module:ClassName` of a Drake system.
+        parameters: keyword arguments of its constructor: numbers, text, lists and mappings.
+    """
+
+    system: str
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def code(self) -> str:
+        """The file (or module) whose code runs, and the class in it."""
+        where, _, name = self.system.rpartition(":")
+        return f"{Path(where).resolve() if where.endswith('.py') else where}:{name}"
+
+    def make(self, offered: Offered) -> System:
+        """Run the code and build the system; `parameters` count before what is offered.
+
+        Raises:
+            UserError: there is no such file, module or class, it fails, or it takes other
+                parameters.
+        """
+        kind = type(self).__name__
+        where, _, name = self.system.rpartition(":")
+        if not where or not name:
+            raise UserError(
+                f"{kind}.system is `{self.system}`: write path/to/file.py:ClassName, or "
+                "package.module:ClassName"
+            )
+        with _blamed(f"{kind}.system: {where}"):
+            found = getattr(_module(kind, where), name, None)
+        if not (inspect.isclass(found) and issubclass(found, System)):
+            raise UserError(f"{kind}.system: {where} has no Drake system called `{name}`")
+        signature = inspect.signature(found)
+        arguments, nothing = dict(self.parameters), []
+        for word in offered.keys() & signature.parameters.keys() - arguments.keys():
+            value = offered[word]()
+            if value is not None:
+                arguments[word] = value
+            elif signature.parameters[word].default is inspect.Parameter.empty:
+                nothing.append(word)
+        if nothing:
+            raise UserError(
+                f"{kind}.system: {name} takes `{'`, `'.join(sorted(nothing))}`, of which there is "
+                "none here; give it in `parameters`, or a goal by success: !ReachGoal "
+                "{goal: [x, y, z]}"
+            )
+        try:
+            signature.bind(**arguments)
+        except TypeError as error:
+            raise UserError(
+                f"{kind}.parameters do not fit {name}{signature}: {error}; give what it takes"
+            ) from error
+        with _blamed(f"{kind}.system: {name}"):
+            return found(**arguments)
+
+
+@dataclass(frozen=True)
+class OwnFilter(OwnSystem):
+    """A state estimator of one's own in the place of the station's.
+
+    It has the outputs `X_WB` and `V_WB_B`, and any of the station's `covariance`, `status` and
+    `health`; where it lacks one, the station shows NaN there (health: good). It is connected to
+    those of `imu`, `dvl`, `depth`, `compass` (`systems.sensor_suite`), `pwm` and `initial_noise`
+    that are among its inputs. Its constructor is given, if it has arguments of these names, the
+    station's `vehicle`, its sensors' configurations `imu`, `dvl`, `depth`, `compass`, the start
+    `X0_WB` and `V0_WB_B`, and all of the `station`'s configuration.
+    """
+
+
+def port_sizes(system: System) -> tuple[dict[str, int], dict[str, int]]:
+    """Names and sizes of a system's input ports and of its output ports."""
+    inputs: list[InputPort] = [system.get_input_port(i) for i in range(system.num_input_ports())]
+    outputs: list[OutputPort] = [
+        system.get_output_port(i) for i in range(system.num_output_ports())
+    ]
+    return {p.get_name(): p.size() for p in inputs}, {p.get_name(): p.size() for p in outputs}
+
+
+def check_ports(
+    who: str,
+    system: System,
+    needs: tuple[Mapping[str, int], Mapping[str, int]],
+    may_have: tuple[Mapping[str, int], Mapping[str, int]] = ({}, {}),
+) -> None:
+    """Check that a system has the input and output ports it needs, and others in their sizes.
+
+    Raises:
+        UserError: it lacks a port, or a port has another size.
+    """
+    for kind, has, wanted, other in zip(
+        ("input", "output"), port_sizes(system), needs, may_have, strict=True
+    ):
+        for name, size in {**other, **wanted}.items():
+            if has.get(name, None if name in wanted else size) != size:
+                raise UserError(
+                    f"{who} {type(system).__name__} needs the {kind} port `{name}` of size {size}; "
+                    f"it has {has or 'none'}"
+                )
+
+
+@contextmanager
+def _blamed(where: str) -> Iterator[None]:
+    """Turn what foreign code raises into a sentence that names the place."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        last = extract_tb(error.__traceback__)[-1]
+        raise UserError(
+            f"{where} failed with {type(error).__name__}: {error} ({last.filename}, line "
+            f"{last.lineno}); correct the code or its parameters"
+        ) from error
+
+
+def _module(kind: str, where: str) -> ModuleType:
+    """The module of a dotted name, or of a file, which is run at most once."""
+    path = Path(where).resolve()
+    if path.suffix != ".py":
+        try:
+            return importlib.import_module(where)
+        except ModuleNotFoundError as error:
+            raise UserError(
+                f"{kind}.system: there is no module `{where}`; a file's name ends in .py"
+            ) from error
+    if not path.is_file():
+        raise UserError(f"{kind}.system: there is no file {where}; check the path")
+    name = f"own_system_{path.stem}_{abs(hash(str(path))):x}"
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(name, path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[name] = module
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[name]
+            raise
+    return sys.modules[name]

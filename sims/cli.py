@@ -15,8 +15,8 @@ _DESCRIPTION = """Learned stochastic dynamics and control for underwater vehicle
 
 The usual order: `import` a log (or `generate` one), `train` a model on it, `evaluate` the model on
 data it has not seen, `run` a mission with it. `diagnose` names what a simulation gets wrong,
-`check` measures how well on cases whose answer is known, `study` compares the methods of training
-on simulated data, `demo` goes the whole way from a log that comes along to a dive.
+`check` measures diagnoses and the estimator where the answer is known, `study` compares the methods
+of training on simulated data, `demo` goes the whole way from a log that comes along to a dive.
 `spinndrift COMMAND --help` explains each."""
 
 

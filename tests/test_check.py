@@ -19,8 +19,9 @@ from spinndrift.models.vehicle import load_vehicle
 from spinndrift.sims.check import run as running
 from spinndrift.sims.check.cases import Case, HiddenCause, Truth, find_cases, read_oracle
 from spinndrift.sims.check.judging import Judgement, compare, gain_of
-from spinndrift.sims.check.pages import BEGIN, END, write_page
+from spinndrift.sims.check.pages import write_page
 from spinndrift.sims.check.tables import interval, share, tables
+from spinndrift.sims.marked_page import BEGIN, END
 from spinndrift.training.diagnosis import result
 
 VEHICLE = load_vehicle("bluerov2_heavy")

@@ -1,26 +1,17 @@
-"""What a check found, as a page of the documentation; what people wrote there stays."""
+"""What a check found, as a page of the documentation."""
 
 import platform
 from collections.abc import Sequence
 from pathlib import Path
 
-from ...models.files import atomic_path
+from ..marked_page import write_measured
 from .cases import Case
 from .tables import Row, tables
 
-BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
-
 
 def write_page(path: Path, rows: Sequence[Row], cases: Sequence[Case]) -> None:
-    """Write the tables between two marks of a page; without the marks, a page of tables alone."""
-    with atomic_path(path) as partial:
-        old = path.read_text(encoding="utf-8") if path.exists() else f"{BEGIN}\n{END}\n"
-        if BEGIN not in old or END not in old:
-            old = f"{BEGIN}\n{END}\n"
-        before, after = old.split(BEGIN)[0], old.split(END)[1]
-        partial.write_text(
-            f"{before}{BEGIN}\n\n{_text(rows, cases)}\n{END}{after}", encoding="utf-8"
-        )
+    """Write the tables into the measured part of a page."""
+    write_measured(path, _text(rows, cases))
 
 
 def _text(rows: Sequence[Row], cases: Sequence[Case]) -> str:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 import scipy.stats
+from rich.console import Console
+from rich.table import Table as Grid
 
 from .cases import USUAL
 from .judging import CLOSE
@@ -31,6 +33,15 @@ class Table:
             *(f"| {' | '.join(row)} |" for row in self.rows),
         ]
         return f"{self.caption}\n\n" + "\n".join(lines) + "\n"
+
+
+def print_tables(shown: Console, tables: Sequence[Table]) -> None:
+    """Print tables on a terminal."""
+    for table in tables:
+        grid = Grid(*table.header, title=table.caption, title_justify="left")
+        for row in table.rows:
+            grid.add_row(*row)
+        shown.print(grid)
 
 
 def interval(hits: int, total: int, level: float = 0.95) -> tuple[float, float]:

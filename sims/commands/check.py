@@ -1,25 +1,24 @@
-"""`spinndrift check`: a command's promises, on cases whose answer is known."""
+"""`spinndrift check`: promises of this package, on cases whose answer is known."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, subcommand
 
 from ...models.errors import UserError
 from ..progress import console, progress_bar
+from .check_estimator import CheckEstimator
 
 
 @dataclass(frozen=True)
-class Check:
+class CheckDiagnosis:
     """Diagnose cases of hidden effects, judge what was said by the sealed answers, tell the result.
 
     A case is a folder with CSV data and the answer; docs/blind-cases.md describes the form. Each is
     judged once: the same command goes on where it was interrupted.
     """
 
-    name: Annotated[Positional[Literal["diagnosis"]], arg(metavar="diagnosis")] = "diagnosis"
-    """What to check."""
     cases: Path = Path("runs/blind")
     """Folder of cases, such as `make blind` writes."""
     only: tuple[str, ...] = ()
@@ -38,13 +37,11 @@ class Check:
 
     def run(self) -> None:
         """Diagnose, judge, tell."""
-        from rich.table import Table as Shown
-
         from ...models.checks import require_rate
         from ..check.cases import find_cases
         from ..check.pages import write_page
         from ..check.run import run_cases
-        from ..check.tables import tables
+        from ..check.tables import print_tables, tables
 
         if self.docs is not None and self.docs.suffix != ".md":
             raise UserError(f"--docs {self.docs}: end the name in .md")
@@ -53,11 +50,7 @@ class Check:
         with progress_bar(f"{len(cases)} cases") as update:
             rows, failed = run_cases(cases, self.out, self.alpha, update, self.rivals, self.workers)
         shown = console()
-        for table in tables(rows):
-            grid = Shown(*table.header, title=table.caption, title_justify="left")
-            for row in table.rows:
-                grid.add_row(*row)
-            shown.print(grid)
+        print_tables(shown, tables(rows))
         write_page(self.out / "diagnosis.md", rows, cases)
         if self.docs is not None:
             write_page(self.docs, rows, cases)
@@ -68,3 +61,23 @@ class Check:
             raise UserError(
                 f"{len(failed)} cases were given up (see above); the same command tries them again"
             )
+
+
+@dataclass(frozen=True)
+class Check:
+    """Measure what this package promises, on cases whose answer is known."""
+
+    what: Annotated[
+        Annotated[CheckDiagnosis, subcommand("diagnosis", prefix_name=False)]
+        | Annotated[CheckEstimator, subcommand("estimator", prefix_name=False)],
+        OmitArgPrefixes,
+    ]
+
+    @property
+    def out(self) -> Path:
+        """Folder for what was found."""
+        return self.what.out
+
+    def run(self) -> None:
+        """Measure, judge, tell."""
+        self.what.run()

@@ -1,0 +1,102 @@
+"""`spinndrift check estimator`: is the filter's covariance right, also when sensors fail?"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ...models.errors import UserError
+from ..progress import console, progress_bar
+
+if TYPE_CHECKING:
+    from ..estimator_check.settings import Setting
+
+
+@dataclass(frozen=True)
+class CheckEstimator:
+    """Fly many seeds of several waters, plants and starts, and of every fault of the sensors.
+
+    The first tables compare errors and innovations with the covariance that the filter claims (NEES
+    and NIS with their bounds), the last one tells what it makes of failing sensors. Each setting is
+    flown once: the same command goes on where it was interrupted. docs/estimator.md explains the
+    tables.
+    """
+
+    only: tuple[str, ...] = ()
+    """Patterns of the names of settings to fly (`calm waves 'dvl_*'`); by default all."""
+    runs: int = 60
+    """Runs of each setting with healthy sensors."""
+    seconds: float = 60.0
+    """Time of each of these runs."""
+    fault_runs: int = 50
+    """Runs of each fault."""
+    fault_seconds: float = 30.0
+    """Time of each of these runs; the fault begins after a third of it."""
+    model: Path | None = None
+    """Learned model (.spinn) to fly as the plant; by default the demo's, which is trained first."""
+    workers: int = 0
+    """Worker processes on this machine; 0 flies all settings in this one."""
+    out: Path = Path("runs/estimator")
+    """Folder for what was found in each setting."""
+    docs: Path | None = None
+    """Markdown file to write the tables into, such as docs/estimator.md."""
+
+    def run(self) -> None:
+        """Fly, judge, tell."""
+        from ..check.tables import print_tables
+        from ..estimator_check.pages import page_text
+        from ..estimator_check.run import run_settings
+        from ..estimator_check.tables import tables
+        from ..marked_page import write_measured
+
+        self._check_options()
+        settings = self._settings()
+        runs = {"consistency": self.runs, "faults": self.fault_runs}
+        with progress_bar(f"{len(settings)} settings") as update:
+            results, failed = run_settings(settings, self.out, runs, update, self.workers)
+        shown = console()
+        print_tables(shown, tables(results))
+        pages = [self.out / "estimator.md", *([self.docs] if self.docs is not None else [])]
+        for page in pages:
+            write_measured(page, page_text(results))
+        shown.print(f"wrote {pages[-1]}")
+        for one in failed:
+            shown.print(f"{one.task} was given up: {one.reason}")
+        if failed:
+            raise UserError(
+                f"{len(failed)} settings were given up (see above); the same command tries them "
+                "again"
+            )
+
+    def _check_options(self) -> None:
+        if self.docs is not None and self.docs.suffix != ".md":
+            raise UserError(f"--docs {self.docs}: end the name in .md")
+        for name, count in (("--runs", self.runs), ("--fault-runs", self.fault_runs)):
+            if count < 1:
+                raise UserError(f"{name} {count}: give at least 1")
+        for name, time in (("--seconds", self.seconds), ("--fault-seconds", self.fault_seconds)):
+            if not 1 <= time < float("inf"):
+                raise UserError(f"{name} {time:g}: give a time of at least 1 s")
+        if self.workers < 0:
+            raise UserError(f"--workers {self.workers}: give 0 or more")
+
+    def _settings(self) -> list["Setting"]:
+        """What is to be flown; the model is trained first if one is needed and none is named."""
+        from ..cores import share_cores
+        from ..estimator_check.model import demo_model
+        from ..estimator_check.settings import (
+            LEARNED,
+            chosen,
+            consistency_settings,
+            fault_settings,
+        )
+
+        names = chosen(self.only)
+        share_cores()
+        model = self.model
+        if model is None and LEARNED in names:
+            with progress_bar("training the demo's model") as update:
+                model = demo_model(self.out / "model", update)
+        return [
+            *consistency_settings(names, self.seconds, model),
+            *fault_settings(names, self.fault_seconds),
+        ]

@@ -1,0 +1,24 @@
+"""The learned model that the check flies if none is named: the demo's."""
+
+from pathlib import Path
+
+from ...models.vehicle import load_vehicle
+from ...systems.mavlink.logs import load_data
+from ...training.config import TrainingConfig
+from ..demo import EMBEDDED
+from ..learning import learn
+from ..progress import Update
+
+
+def demo_model(folder: Path, progress: Update) -> Path:
+    """The path of the model, which is trained in `folder` unless it is there.
+
+    Raises:
+        UserError: the folder holds another training.
+    """
+    path = folder / "model.spinn"
+    if not (folder / "evaluation.json").exists():  # written last
+        recording = load_data(EMBEDDED)
+        vehicle = load_vehicle(recording.vehicle or "bluerov2_heavy")
+        learn(recording, vehicle, TrainingConfig(), folder, resume=True, progress=progress)
+    return path

@@ -1,0 +1,131 @@
+"""All settings, one after the other or spread over processes; what is done stays done."""
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ...models import config
+from ...models.errors import UserError
+from ...models.files import atomic_path
+from ...training.provenance import revision
+from ..compile_cache import give_back_programs, keep_compiled
+from ..fanout import Failed, run_here, run_on_cluster
+from ..progress import Update
+from ..run_loop import Engine, simulate_seeds
+from .scores import Scores, score, stacked
+from .settings import Setting
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of a setting: scores of all its runs, and the revision that flew them."""
+
+    setting: Setting
+    scores: Scores
+    revision: str
+
+
+@dataclass(frozen=True)
+class FlySetting:
+    """Flies a setting with the seeds 0, 1, …; its scores are on disk in the end, or nothing is.
+
+    Attributes:
+        out: folder; the file is `<table>/<name>.npz`.
+        runs: of each setting, by its table.
+        engine: as `sims.run_loop.simulate` has it.
+    """
+
+    out: str
+    runs: dict[str, int]
+    engine: Engine = "auto"
+
+    def path(self, setting: Setting) -> Path:
+        """The file of a setting."""
+        return Path(self.out) / setting.table / f"{setting.name}.npz"
+
+    def __call__(
+        self, setting: Setting, progress: Update = lambda fraction, remark="", /: None
+    ) -> None:
+        """Fly and score; one program for all seeds."""
+        jax.config.update("jax_enable_x64", True)  # a cluster's worker has no start of its own
+        jax.config.update("jax_cpu_enable_async_dispatch", False)
+        keep_compiled()
+        give_back_programs()
+        count, found = self.runs[setting.table], []
+
+        def report(fraction: float, remark: str) -> None:
+            # zero would say that all begins anew
+            progress(max(1e-6, (len(found) + fraction) / count), f"{setting}: {remark}")
+
+        for run in simulate_seeds(setting.scenario, range(count), report, self.engine):
+            if run.outcome.reason == "interrupted":
+                raise KeyboardInterrupt
+            found.append(score(run, setting.scenario.duration / 3))
+        made = self._made(setting) | {"revision": revision() or ""}
+        with atomic_path(self.path(setting)) as partial, partial.open("wb") as file:
+            arrays: dict[str, Any] = {"made": np.array(json.dumps(made)), **stacked(found)}
+            np.savez_compressed(file, **arrays)
+
+    def result(self, setting: Setting) -> Result | None:
+        """What is on disk.
+
+        Raises:
+            UserError: the file is of other settings, or no such file.
+        """
+        at = self.path(setting)
+        if not at.exists():
+            return None
+        try:
+            with np.load(at, allow_pickle=False) as file:
+                scores = {name: file[name] for name in file.files}
+            made = json.loads(str(scores.pop("made")))
+            flown = made.pop("revision")
+        except (OSError, ValueError, KeyError, EOFError, AttributeError) as error:
+            raise UserError(f"{at}: is no result of a check; remove it to fly it again") from error
+        if made != self._made(setting):
+            raise UserError(
+                f"{at}: was flown with other settings (runs, time, model or defaults); name "
+                "another --out, or remove it"
+            )
+        return Result(setting, scores, flown)
+
+    def _made(self, setting: Setting) -> dict[str, Any]:
+        model = setting.scenario.station.model
+        return {
+            "scenario": config.dump(setting.scenario),
+            "runs": self.runs[setting.table],
+            "model": "" if model is None else hashlib.sha256(model.read_bytes()).hexdigest(),
+        }
+
+
+def run_settings(
+    settings: Sequence[Setting],
+    out: str | os.PathLike[str],
+    runs: dict[str, int],
+    progress: Update,
+    workers: int = 0,
+    engine: Engine = "auto",
+) -> tuple[list[Result], list[Failed]]:
+    """Fly the settings that are not on disk yet; all results, and who raised.
+
+    In this process one by one, or with `workers` in as many processes of this machine.
+
+    Raises:
+        UserError: what is on disk is of other settings.
+    """
+    work = FlySetting(str(Path(out).absolute()), runs, engine)
+    left = [setting for setting in settings if work.result(setting) is None]
+    failed = []
+    if left and workers == 0:
+        failed = run_here(work, left, progress)
+    elif left:
+        failed = run_on_cluster(work, left, progress, workers=workers)
+    progress(1.0, "")
+    return [found for one in settings if (found := work.result(one)) is not None], failed

@@ -1,0 +1,153 @@
+"""What was found of the estimator, as tables."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..check.tables import Table
+from ..estimate import BLOCKS, HEALTH, TRUSTED, average_bound
+from ..run_log import FUSED
+from .run import Result
+from .scores import FREEDOM, Average, average_nees, average_nis, within_three_sigma
+
+PROMISED = 0.95
+"""Share of runs whose error at the end lies within three claimed standard deviations."""
+
+
+def tables(results: Sequence[Result]) -> list[Table]:
+    """All tables for which there are results."""
+    healthy = [r for r in results if r.setting.table == "consistency"]
+    faulty = [r for r in results if r.setting.table == "faults"]
+    found = []
+    if healthy:
+        found += [_nees(healthy), _nis(healthy)]
+    if faulty:
+        found.append(_faults(faulty))
+    return found
+
+
+def _nees(results: Sequence[Result]) -> Table:
+    count, seconds = _size(results)
+    low, high = average_bound(3, count)
+    averages = [[average_nees(r.scores, i) for i in range(3)] for r in results]
+    good = sum(all(a.values.size and a.holds(a.values[-1]) for a in row) for row in averages)
+    caption = (
+        f"NEES, average of {count} runs of {seconds:g} s: at the end, least to largest over time, "
+        f"share of times inside. 3 is right; 95 % bounds are {low:.2f} to {high:.2f}, what lies "
+        f"outside is bold. {good} of {len(results)} settings end with all three inside."
+    )
+    header = ("setting", *BLOCKS, "not finite")
+    rows = []
+    for result, row in zip(results, averages, strict=True):
+        cells = [_average(a, a.values[-1] if a.values.size else math.nan) for a in row]
+        rows.append((result.setting.words, *cells, _lost(result)))
+    return Table(caption, header, rows)
+
+
+def _nis(results: Sequence[Result]) -> Table:
+    count, _ = _size(results)
+    bounds = [(name, *average_bound(FREEDOM[name], count)) for name in FUSED]
+    told = ", ".join(f"{name} {low:.2f} to {high:.2f}" for name, low, high in bounds)
+    caption = (
+        "NIS of readings that were fused, average over runs and time, its range over time and the "
+        f"share of times inside its bounds ({told}); readings that were rejected; position error "
+        "at the end as a share of the path."
+    )
+    header = ("setting", *(f"NIS {name}" for name in FUSED), *(f"gated {n}" for n in FUSED))
+    rows = []
+    for result in results:
+        scores = result.scores
+        averages = [average_nis(scores, name) for name in FUSED]
+        taken, gated = scores["taken"].sum(axis=0), scores["gated"].sum(axis=0)
+        shares = [f"{100 * g / max(t + g, 1):.2g} %" for t, g in zip(taken, gated, strict=True)]
+        drift = np.linalg.norm(scores["error"][:, :3], axis=1) / np.maximum(scores["length"], 1e-9)
+        cells = [_average(a, a.mean) for a in averages]
+        rows.append((result.setting.words, *cells, *shares, _percent(_rms(drift))))
+    return Table(caption, (*header, "drift, RMS"), rows)
+
+
+def _faults(results: Sequence[Result]) -> Table:
+    count, seconds = _size(results)
+    shares = [within_three_sigma(r.scores).mean(axis=0) for r in results]
+    kept = sum(bool((share >= PROMISED).all()) for share in shares)
+    caption = (
+        f"Faults from {seconds / 3:g} s on, {count} runs of {seconds:g} s each. Errors at the end: "
+        "95 % of runs lie below the first number, the second is the worst, the third the median of "
+        "what is claimed (root of the covariance's trace). Within 3σ: share of runs whose error "
+        "lies in the ellipsoid of the claimed covariance that holds 99.73 %, as ± 3σ of one axis; "
+        f"at least {_percent(PROMISED)} are promised of position, attitude and velocity each, "
+        f"fewer are bold. {kept} of {len(results)} rows keep it."
+    )
+    header = (
+        "fault", "position (m)", "attitude (°)", "velocity (m/s)", "within 3σ", "not finite",
+        "health",
+    )  # fmt: skip
+    rows = []
+    for result, share in zip(results, shares, strict=True):
+        errors = [_errors(result, i, unit) for i, unit in enumerate((1.0, 180 / np.pi, 1.0))]
+        within = ", ".join(_marked(f"{100 * s:.0f}", s >= PROMISED) for s in share.tolist())
+        rows.append((result.setting.words, *errors, f"{within} %", _lost(result), _health(result)))
+    return Table(caption, header, rows)
+
+
+def _size(results: Sequence[Result]) -> tuple[int, float]:
+    return len(results[0].scores["finite"]), results[0].setting.scenario.duration
+
+
+def _average(average: Average, value: float) -> str:
+    if not average.values.size:
+        return "–"
+    ends = f"{_short(average.values.min())} to {_short(average.values.max())}"
+    return f"{_marked(_short(value), average.holds(value))} ({ends}), {100 * average.share:.0f} %"
+
+
+def _errors(result: Result, block: int, unit: float) -> str:
+    own = slice(3 * block, 3 * block + 3)
+    norms = unit * np.linalg.norm(result.scores["error"][:, own], axis=1)
+    norms = np.nan_to_num(norms, nan=np.inf)
+    P = result.scores["covariance"].reshape(-1, 3, 3, 3)[:, block]
+    claimed = unit * np.sqrt(np.maximum(np.trace(P, axis1=1, axis2=2), 0))
+    below = np.percentile(norms, 95, method="higher")
+    return f"{_short(below)}, {_short(norms.max())}, claimed {_short(np.median(claimed))}"
+
+
+def _health(result: Result) -> str:
+    """`degraded 100 % (dvl 100 %); at the end good 96 %, degraded 4 %`."""
+    if "health_after" not in result.scores:
+        return "–"
+    found = result.scores["health_after"]
+    doubted = zip(TRUSTED, found[:, 1:5].mean(axis=0), strict=True)
+    names = ", ".join(f"{name} {100 * share:.0f} %" for name, share in doubted if share > 0)
+    named = f" ({names})" if names else ""
+    return f"{_states(found[:, 0])}{named}; at the end {_states(found[:, -1])}"
+
+
+def _states(states: np.ndarray) -> str:
+    """Share of runs in each state."""
+    shares = [(name, 100 * np.mean(states == i)) for i, name in enumerate(HEALTH)]
+    return ", ".join(f"{name} {share:.0f} %" for name, share in shares if share > 0)
+
+
+def _lost(result: Result) -> str:
+    """Runs in which something was not finite."""
+    lost = int((result.scores["finite"] < 0.5).sum())
+    return _marked(str(lost), lost == 0)
+
+
+def _marked(text: str, good: bool) -> str:
+    return text if good else f"**{text}**"
+
+
+def _short(value: float) -> str:
+    if not math.isfinite(value):
+        return "∞" if value > 0 else "–"
+    return f"{value:.2g}" if abs(value) < 100 else f"{value:.0f}"
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.2g} %" if math.isfinite(value) else "–"
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -25,6 +25,7 @@ LOG_PERIODS: Mapping[str, float] = {
     "compass": 0.1,
     "pwm": 0.05,
     "status": 0.2,
+    "health": 0.05,
     "X_WB_cheat": 0.05,
     "V_WB_B_cheat": 0.05,
     "F_disturbance_cheat": 0.05,

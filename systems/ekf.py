@@ -11,11 +11,13 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from ..models import se3
 from ..models.sensors import Compass, DepthSensor, Dvl, Imu
-from .filtering.delayed import SLOT, STATUS, DelayedFilter, EkfConfig, FilterState, Readings
+from .filtering.delayed import HEALTH, SLOT, STATUS, DelayedFilter, EkfConfig, FilterState, Readings
 from .filtering.error_state import ERRORS
 from .jit import VectorFunction, value_or_zeros
 from .learned_plant import check_state
 from .pure import Event, Inputs, Pure, State, shown
+
+_WAITING = 6  # state group of the samples that wait, after the filter's own and the outputs'
 
 
 class Ekf(LeafSystem):
@@ -28,7 +30,7 @@ class Ekf(LeafSystem):
     that wait. The error's order and frame are those of
     `systems.filtering.error_state`: `covariance` is the 18 × 18 matrix by rows, whose first six
     rows and columns belong to [δp, δθ] in body axes. Horizontal position is dead reckoning: its
-    variance grows. `status` has the components `STATUS`.
+    variance grows. `status` has the components `STATUS`, `health` those of `HEALTH`.
 
     The estimate starts at the given pose and twist. With `initial_noise` connected (a simulation)
     it starts with an error drawn from `config`'s standard deviations: δp, δθ, δv.
@@ -47,6 +49,7 @@ class Ekf(LeafSystem):
         - V_WB_B
         - covariance
         - status
+        - health
 
     """
 
@@ -88,6 +91,7 @@ class Ekf(LeafSystem):
         start, unravel = ravel_pytree(core.init(jnp.asarray(X0), jnp.asarray(V0)))
         n = start.size
         outputs = {"X_WB": 7, "V_WB_B": 6, "covariance": ERRORS**2, "status": len(STATUS)}
+        outputs["health"] = len(HEALTH)
         self._ratio, self._period = round(ratio), core.period
         self._samples = core.samples_at_once(self._ratio)
         self._filter = self.DeclareDiscreteState(BasicVector(np.asarray(start).tolist()))
@@ -105,10 +109,11 @@ class Ekf(LeafSystem):
             state = core.init(X, V)
             return ravel_pytree(state)[0], *show(state, jnp.zeros((), w.dtype))
 
-        def show(state: FilterState, t: Array) -> tuple[Array, Array, Array, Array]:
+        def show(state: FilterState, t: Array) -> tuple[Array, ...]:
             # The newest sample is one period old.
             X, V, P = core.present(state, jnp.minimum(t, core.period))
-            return X, V, P.reshape(-1), core.status(state, jnp.round(t / core.period) - 1)
+            k = jnp.round(t / core.period) - 1
+            return X, V, P.reshape(-1), core.status(state, k), core.health(state, P, k)
 
         def take_in(flat: Array, *given: Array) -> tuple[Array, Array, Array]:
             *samples, dvl, depth, compass, last = given
@@ -150,7 +155,7 @@ class Ekf(LeafSystem):
 
         def step(state: State, given: list[Array], last: Array) -> Array:
             """The filter's state after the samples that wait and the one that is shown."""
-            flat, at, slots = take_in(state[0], state[5], *given, last[None])
+            flat, at, slots = take_in(state[0], state[_WAITING], *given, last[None])
 
             def fuse_and_move(carry: tuple[Array, Array]) -> tuple[Array, Array]:
                 flat, at = carry
@@ -168,17 +173,17 @@ class Ekf(LeafSystem):
             tick = jnp.round(t / self._period)
             phase = jnp.mod(tick, n)
             slot = (jnp.maximum(phase, 1) - 1).astype(int)
-            kept = jax.lax.dynamic_update_slice(state[5], given[0], (6 * slot,))
-            waiting = jnp.where(phase > 0, kept, state[5]) if n > 1 else state[5]
+            kept = jax.lax.dynamic_update_slice(state[_WAITING], given[0], (6 * slot,))
+            waiting = jnp.where(phase > 0, kept, state[_WAITING]) if n > 1 else state[_WAITING]
             flat = jax.lax.cond(phase > 0, lambda: state[0], lambda: step(state, given, tick - 1))
             told = jax.lax.cond(
                 jnp.mod(tick, self._ratio) == 0,
                 lambda: tuple(show(unravel(flat), t)),
-                lambda: tuple(state[1:5]),
+                lambda: tuple(state[1:_WAITING]),
             )
             return dict(enumerate([flat, *told, waiting]))
 
-        names = ("X_WB", "V_WB_B", "covariance", "status")
+        names = ("X_WB", "V_WB_B", "covariance", "status", "health")
         outputs = {name: shown(i) for i, name in enumerate(names, 1)}
         return Pure((Event(self._period, update),), outputs)
 
@@ -194,14 +199,14 @@ class Ekf(LeafSystem):
         phase = tick % self._samples
         imu = value_or_zeros(self._readings[0], context)
         if phase:
-            waiting = discrete_state.get_mutable_value(5)
+            waiting = discrete_state.get_mutable_value(_WAITING)
             waiting[6 * phase - 6 : 6 * phase] = imu
             return
         last = tick - 1.0  # what is shown was sampled one period ago
         held = context.get_discrete_state()
         readings = [value_or_zeros(port, context) for port in self._readings[1:]]
         state, at, slots = self._take_in(
-            held.value(0), held.value(5), imu, *readings, np.array([last])
+            held.value(0), held.value(_WAITING), imu, *readings, np.array([last])
         )
         n, i = self._samples, int(at[0])
         while i < n:

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from pydrake.common import RandomDistribution
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
 
 from ..models.sensors import Compass, DepthSensor, Dvl, Imu, Sensor, SensorFault
 from ..models.sensors.faults import FaultySensor
-from .jit import VectorFunction, value_or_zeros
+from .jit import VectorFunction, value_or_none, value_or_zeros
 from .pure import Event, Inputs, Pure, State
 from .pure import shown as shown_group
 
@@ -34,7 +34,8 @@ class SensorSuite(LeafSystem):
 
     A reading is new when its time is. At initialisation `initial_noise` draws the sensors' biases,
     offsets and scale errors. All four sensors take their unit Gaussians from `noise`, which should
-    be drawn anew every IMU period. Unconnected inputs count as zero.
+    be drawn anew every IMU period. Unconnected inputs count as zero, an unconnected pose as the
+    identity.
 
     Faults (`models.sensors.faults`) act on what is shown; the sensors' own states and noise are
     those without them. Faults that take chance have an input of their own, `fault_noise`, drawn as
@@ -147,12 +148,13 @@ class SensorSuite(LeafSystem):
     def pure(self) -> Pure:
         """Each sensor's measurement as a pure function."""
         base = self._parts[0].rate
+        inputs_at_rest = self._inputs_at_rest
 
         def event(part: _Part) -> Event:
             def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
                 X, V, A, *draws = (
-                    inputs.get(port.get_name(), jnp.zeros(port.size()))
-                    for port in (self._X, self._V, self._A, *self._draws)
+                    inputs[port.get_name()] if port.get_name() in inputs else jnp.asarray(still)
+                    for port, still in inputs_at_rest
                 )
                 w = _joined(draws)
                 own = [state[index] for index in part.reads]
@@ -166,9 +168,16 @@ class SensorSuite(LeafSystem):
         noise = tuple(port.get_name() for port in self._draws)
         return Pure(tuple(event(part) for part in self._parts), outputs, noise)
 
+    @property
+    def _inputs_at_rest(self) -> list[tuple[InputPort, np.ndarray]]:
+        """The inputs that events read, with what an unconnected one counts as."""
+        ports = (self._X, self._V, self._A, *self._draws)
+        pose = np.eye(7)[0]
+        return [(port, pose if port is self._X else np.zeros(port.size())) for port in ports]
+
     def _declare(self, parts: list["_Part"]) -> None:
         """Declare events at the first part's rate; the others take part in every so many."""
-        ports = (self._X, self._V, self._A, *self._draws)
+        inputs_at_rest = self._inputs_at_rest
         drawn = [port.size() for port in self._draws]
         period = 1 / parts[0].rate
         every = [round(parts[0].rate / part.rate) for part in parts]
@@ -202,7 +211,8 @@ class SensorSuite(LeafSystem):
             function, reads, writes = call_at(round(t / period) % cycle)
             state = context.get_discrete_state()
             parts = [np.array([t])]
-            parts += [value_or_zeros(port, context) for port in ports]
+            given = [(value_or_none(port, context), still) for port, still in inputs_at_rest]
+            parts += [still if value is None else value for value, still in given]
             parts += [state.value(index) for index in reads]
             for index, value in zip(writes, function(*parts), strict=True):
                 discrete_state.set_value(index, value)

@@ -26,6 +26,7 @@ OUTPUTS = {
     "compass": 3,
     "pwm": 8,
     "status": 10,
+    "health": 5,
 }
 """Output ports and their sizes, in simulation and on hardware: estimates, readings, commands."""
 
@@ -38,7 +39,7 @@ CHEATS = {
 """Output ports that only a simulation has: the truth."""
 
 _NEEDED = {"X_WB": 7, "V_WB_B": 6}
-_TOLD = {"covariance": 324, "status": 10}
+_TOLD = {"covariance": 324, "status": 10, "health": 5}
 _READ = {"imu": 6, "dvl": 7, "depth": 3, "compass": 3}
 _NEVER = 1e9  # period (s) of noise that is drawn once
 _WATER = 2  # periods of the plant between steps of the water, whose waves take seconds
@@ -146,7 +147,8 @@ def _simulated(config: StationConfig, estimator: System | None) -> Diagram:
         if ekf.HasOutputPort(name):
             builder.ExportOutput(ekf.GetOutputPort(name), name)
         else:
-            untold = add(f"no_{name}", ConstantVectorSource(np.full(size, np.nan)))
+            value = np.array([0.0, 1, 1, 1, 1]) if name == "health" else np.full(size, np.nan)
+            untold = add(f"no_{name}", ConstantVectorSource(value))
             builder.ExportOutput(untold.get_output_port(), name)
     builder.ExportOutput(plant.GetOutputPort("X_WB"), "X_WB_cheat")
     builder.ExportOutput(plant.GetOutputPort("V_WB_B"), "V_WB_B_cheat")

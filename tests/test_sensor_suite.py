@@ -62,7 +62,7 @@ def still(sensors: SensorSuite, time: float) -> dict[str, np.ndarray]:
 
 
 def test_without_noise_the_readings_are_the_expected_ones():
-    imu = Imu(position=(0.1, 0.2, -0.1), rpy=(0.1, 0.2, 0.3))
+    imu = Imu(position=(0.1, 0.2, -0.1), rpy=(0.1, 0.2, 0.3), integrating=False)
     dvl = Dvl(dropout_share=0.0, outlier_share=0.0)
     depth, compass = DepthSensor(), Compass()
     shown = still(SensorSuite(imu, dvl, depth, compass), 1.05)

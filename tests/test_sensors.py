@@ -135,6 +135,42 @@ class TestImu:
         z = Imu().expected(*still())
         np.testing.assert_allclose(z, [0, 0, 9.80665, 0, 0, 0], atol=1e-14)
 
+    def test_the_means_of_an_integrating_unit_add_up_to_what_happened(self):
+        """Turns and changes of velocity from its readings, whatever happened between them."""
+        imu = Imu(
+            **{
+                f"{kind}_{x}": 0.0
+                for kind in ("accelerometer", "gyroscope")
+                for x in ("bias", "walk")
+            },
+            **dict.fromkeys(("accelerometer_density", "gyroscope_density"), 0.0),
+            rate=20.0,
+            position=(0.12, -0.2, 0.07),
+            rpy=(0.3, -0.5, 1.1),
+        )
+        measure = jax.jit(lambda state, t: imu.measure(state, *motion(t), t, jnp.zeros(12)))
+        state, states = imu.initial(jnp.zeros(6)), []
+        for n in range(11):
+            state = measure(state, jnp.asarray(n / imu.rate))
+            states.append(state)
+        mount = imu.mount(jnp.dtype("float64"))
+
+        def sensor(t):
+            X, V, _ = motion_at(jnp.asarray(t))
+            v = V[:3] + jnp.cross(V[3:], mount[4:])
+            return se3.compose(X, mount), se3.rotate(X, v)
+
+        (X, v), end = sensor(0.0), sensor(10 / imu.rate)
+        np.testing.assert_allclose(imu.reading(states[0], 0.0), imu.expected(*motion_at(0.0)))
+        for state in states[1:]:
+            reading = imu.reading(state, 0.0)
+            turn = se3.exp(jnp.concatenate([jnp.zeros(3), reading[3:] / imu.rate]))
+            X = se3.compose(X, turn)
+            fall = jnp.array([0, 0, imu.gravity])
+            v = v + (se3.rotate(X, reading[:3]) - fall) / imu.rate
+        np.testing.assert_allclose(v, end[1], atol=1e-12)
+        np.testing.assert_allclose(se3.rotation_matrix(X), se3.rotation_matrix(end[0]), atol=1e-12)
+
     def test_noise_and_walk_have_their_densities(self):
         imu = Imu(
             accelerometer_bias=0.0, gyroscope_bias=0.0, accelerometer_walk=1e-2, gyroscope_walk=1e-3
@@ -151,7 +187,7 @@ class TestImu:
     def test_readings_saturate(self):
         imu = Imu(accelerometer_range=5.0, gyroscope_range=1.0)
         X, V, dV = still()
-        state = imu.measure(jnp.zeros(12), X, V.at[5].set(-3.0), dV, 0.0, jnp.zeros(12))
+        state = imu.measure(imu.initial(jnp.zeros(6)), X, V.at[5].set(-3.0), dV, 0.0, jnp.zeros(12))
         reading = imu.reading(state, 0.0)
         assert float(reading[2]) == 5.0
         assert float(reading[5]) == -1.0

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from .. import se3
 from ..checks import require
 from ..randomness import Scalar, column
-from .base import Sensor
+from .base import Sensor, velocity_at
 
 _DEGREE = math.pi / 180
 
@@ -18,9 +18,16 @@ _DEGREE = math.pi / 180
 class Imu(Sensor):
     """Accelerometers and gyroscopes with white noise, wandering biases and saturation.
 
-    Reading: specific force (m/s²), then angular rate (rad/s), in the sensor's axes. White noise of
-    one measurement has the deviation density · √(rate / 2), the biases walk by
-    walk · √(1 / rate). State: six biases in the reading's order, then the reading.
+    Reading: specific force (m/s²), then angular rate (rad/s), in the sensor's axes. A strapdown
+    unit integrates at some kHz between the samples that it gives out (Savage 1998, eq. 1 and 2), so
+    with `integrating` a reading is the mean since the reading before: the rate whose exponential
+    is the turn, the specific force whose integral is the change of velocity, in the axes at the
+    interval's end. Without it the rate is that of the sampling time and the force the one that
+    belongs to the given rate of change of the twist: what happens between samples is not seen.
+
+    White noise of one measurement has the deviation density · √(rate / 2), the biases walk by
+    walk · √(1 / rate). State: six biases in the reading's order, attitude (4) and velocity in W (3)
+    of the sensor at the measurement before, 1 once there was one, then the reading.
 
     Defaults are those of the ICM-20602 on a Navigator board (data sheet: 100 µg/√Hz, 4 mdps/√Hz;
     bench logs agree within a factor of two); the initial biases are what is left after a
@@ -36,6 +43,7 @@ class Imu(Sensor):
         accelerometer_range: readings saturate at ± this (m/s²).
         gyroscope_range: readings saturate at ± this (rad/s).
         gravity: (m/s²).
+        integrating: whether a reading is the mean since the one before.
     """
 
     rate: float = 100.0
@@ -48,6 +56,7 @@ class Imu(Sensor):
     accelerometer_range: float = 16 * 9.80665
     gyroscope_range: float = 2000 * _DEGREE
     gravity: float = 9.80665
+    integrating: bool = True
 
     def __post_init__(self) -> None:
         """Check signs."""
@@ -58,8 +67,8 @@ class Imu(Sensor):
 
     @property
     def state_size(self) -> int:
-        """Six biases and the reading."""
-        return 12
+        """Six biases, the last attitude and velocity, whether there are any, and the reading."""
+        return 20
 
     @property
     def noise_size(self) -> int:
@@ -91,34 +100,64 @@ class Imu(Sensor):
         f = f + se3.rotate_inverse(X_WB, column((0.0, 0.0, self.gravity), v))
         return jnp.concatenate([se3.rotate_inverse(X_BS, f), se3.rotate_inverse(X_BS, omega)])
 
+    def mean(
+        self,
+        before: Float[Array, "7 *batch"],
+        X_WB: Float[Array, "7 *batch"],
+        V_WB_B: Float[Array, "6 *batch"],
+    ) -> Float[Array, "6 *batch"]:
+        """Noise-free mean reading over 1/rate since the attitude and velocity in W of `before`."""
+        now = self._carried(X_WB, V_WB_B)
+        turn = se3.local(_pose(before[:4]), _pose(now[:4]))[3:]
+        force = (now[4:] - before[4:]) * self.rate + column((0.0, 0.0, self.gravity), now)
+        return jnp.concatenate([se3.rotate_inverse(_pose(now[:4]), force), turn * self.rate])
+
+    def _carried(
+        self, X_WB: Float[Array, "7 *batch"], V_WB_B: Float[Array, "6 *batch"]
+    ) -> Float[Array, "7 *batch"]:
+        """Attitude of the sensor's axes, then velocity of its origin, both in W."""
+        X_BS = self.mount(X_WB.dtype)
+        v_W = se3.rotate(X_WB, velocity_at(X_BS[4:], V_WB_B))
+        return jnp.concatenate([se3.compose(X_WB, X_BS)[:4], v_W])
+
     def noise_std(self) -> tuple[float, float]:
         """Standard deviation of one measurement's white noise: (m/s², rad/s)."""
         scale = math.sqrt(self.rate / 2)
         return self.accelerometer_density * scale, self.gyroscope_density * scale
 
-    def initial(self, w: Float[Array, "6 *batch"]) -> Float[Array, "12 *batch"]:
+    def initial(self, w: Float[Array, "6 *batch"]) -> Float[Array, "20 *batch"]:
         """Draw the initial biases."""
-        return jnp.concatenate(
-            [_six(self.accelerometer_bias, self.gyroscope_bias, w) * w, jnp.zeros_like(w)]
-        )
+        bias = _six(self.accelerometer_bias, self.gyroscope_bias, w) * w
+        return jnp.concatenate([bias, jnp.zeros((14, *w.shape[1:]), w.dtype)])
 
     def measure(
         self,
-        state: Float[Array, "12 *batch"],
+        state: Float[Array, "20 *batch"],
         X_WB: Float[Array, "7 *batch"],
         V_WB_B: Float[Array, "6 *batch"],
         dV_WB_B: Float[Array, "6 *batch"],
         t: Scalar,
         w: Float[Array, "12 *batch"],
-    ) -> Float[Array, "12 *batch"]:
+    ) -> Float[Array, "20 *batch"]:
         """Measure, then let the biases walk on."""
         del t
-        bias = state[:6]
-        z = self.expected(X_WB, V_WB_B, dV_WB_B) + bias + _six(*self.noise_std(), state) * w[:6]
+        bias, before, started = state[:6], state[6:13], state[13:14]
+        true = self.expected(X_WB, V_WB_B, dV_WB_B)
+        if self.integrating:
+            # a quaternion of zeros is no attitude: before the first measurement any will do
+            before = jnp.where(started > 0, before, self._carried(X_WB, V_WB_B))
+            true = jnp.where(started > 0, self.mean(before, X_WB, V_WB_B), true)
+        z = true + bias + _six(*self.noise_std(), state) * w[:6]
         limit = _six(self.accelerometer_range, self.gyroscope_range, state)
         step = 1 / math.sqrt(self.rate)
         walk = _six(self.accelerometer_walk * step, self.gyroscope_walk * step, state)
-        return jnp.concatenate([bias + walk * w[6:], jnp.clip(z, -limit, limit)])
+        parts = [bias + walk * w[6:], self._carried(X_WB, V_WB_B), jnp.ones_like(started)]
+        return jnp.concatenate([*parts, jnp.clip(z, -limit, limit)])
+
+
+def _pose(q: Float[Array, "4 *batch"]) -> Float[Array, "7 *batch"]:
+    """The pose of an attitude at the origin."""
+    return jnp.concatenate([q, jnp.zeros_like(q[:3])])
 
 
 def _six(accelerometer: float, gyroscope: float, like: Float[Array, "n *batch"]) -> Array:

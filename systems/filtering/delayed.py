@@ -26,11 +26,14 @@ from ...models.sensors.base import velocity_at
 from . import error_state, measurement
 from .error_state import Navigation
 
-SLOT = 15  # has sample, force 3, rate 3 | has dvl, v 3 | has depth, depth | has compass, yaw
-_DVL, _DEPTH, _COMPASS = 7, 11, 13
+SLOT = 18
+"""Has sample, force 3, mean rate 3 | has dvl, v 3 | has depth, depth | has compass, yaw | rate at
+the end 3."""
+_DVL, _DEPTH, _COMPASS, _RATE = 7, 11, 13, 15
 _FLAGS = np.array([_DVL, _DEPTH, _COMPASS])
 _FEW = 5  # samples whose mean force is held beyond the newest one
 _LONGEST = 0.1  # s that the covariance waits at most for a reading
+_REMEMBERED = 2.0  # s: time constant of the averages of how samples differ
 
 STATUS = (
     "time",
@@ -47,6 +50,9 @@ STATUS = (
 """Components of the status vector: time of the horizon (s), last NIS of each sensor, rejections in
 a row, and time since a reading was last accepted (s)."""
 
+HEALTH = ("state", "imu", "dvl", "depth", "compass")
+"""Components of the health vector: 0 good, 1 degraded, 2 lost; then 1 where a sensor is trusted."""
+
 
 @dataclass(frozen=True)
 class EkfConfig:
@@ -56,14 +62,19 @@ class EkfConfig:
         position_std: of the initial position in body axes (m).
         attitude_std: of the initial attitude about the body axes (rad).
         velocity_std: of the initial velocity in body axes (m/s).
-        imu_factor: the IMU's noise densities times this are the filter's, for what samples at
-            100 Hz leave out of a motion between them.
+        imu_factor: the IMU's noise densities times this are the filter's. It covers errors of
+            second order, of bias times attitude say: at 1 the NEES of all 18 errors after 3.5 s
+            without a DVL is 21.6 in place of 18, at 1.5 within its bounds
+            (`tests/test_filtering.py`).
         horizon: how long readings may take to arrive (s).
         gate: share of good readings that pass the chi-square gate.
         patience: after so many rejections in a row what the sensor measures counts as unknown, by
             the size of the residual, and its reading is taken: a filter that lost its way must not
             shut its sensors out for good.
         output_rate: estimates per second (Hz).
+        silence: a sensor without an accepted reading for so long is not trusted (s).
+        lost_velocity: the state is lost where velocity is known no better than this, 1 σ (m/s).
+        lost_attitude: the same of roll, pitch and yaw (rad).
     """
 
     position_std: Vector3 = (0.02, 0.02, 0.02)
@@ -74,13 +85,17 @@ class EkfConfig:
     gate: float = 0.999
     patience: int = 10
     output_rate: float = 20.0
+    silence: float = 3.0
+    lost_velocity: float = 0.5
+    lost_attitude: float = 0.5
 
     def __post_init__(self) -> None:
         """Check signs and ranges."""
         check_numbers(self)
         for field in ("position_std", "attitude_std", "velocity_std"):
             require(min(getattr(self, field)) >= 0, self, field, "give zero or more")
-        for field in ("imu_factor", "horizon", "output_rate"):
+        above_zero = ("imu_factor", "horizon", "output_rate", "silence")
+        for field in (*above_zero, "lost_velocity", "lost_attitude"):
             require(getattr(self, field) > 0, self, field, "give a number above zero")
         require(0 < self.gate < 1, self, "gate", "give a share between 0 and 1")
         require(self.patience >= 1, self, "patience", "give at least 1")
@@ -91,11 +106,17 @@ class FilterState(NamedTuple):
 
     nominal: Navigation
     P: Float[Array, "18 18"]
-    ring: Float[Array, "slots 15"]
+    ring: Float[Array, "slots 18"]
     since: Float[Array, "10"]
     """Since P's time: the time, sums of force · dt and rate · dt, and v_B at its beginning."""
     rate: Float[Array, "3"]
     """Newest angular rate (rad/s) in body axes, its bias still in it."""
+    rate_before: Float[Array, "3"]
+    """The one before."""
+    steps: Float[Array, "6 6"]
+    """Mean square of what a sample of [force, rate] differs from the one foreseen."""
+    bends: Float[Array, "6 6"]
+    """Mean square of the second differences of [force, rate]."""
     nis: Float[Array, "3"]
     rejected: Float[Array, "3"]
     accepted_at: Float[Array, "3"]
@@ -182,6 +203,9 @@ class DelayedFilter(eqx.Module):
             jnp.zeros((self.slots, SLOT), V_WB_B.dtype),
             jnp.concatenate([jnp.zeros(7, V_WB_B.dtype), V_WB_B[:3]]),
             V_WB_B[3:],
+            V_WB_B[3:],
+            jnp.zeros((6, 6), V_WB_B.dtype),
+            jnp.zeros((6, 6), V_WB_B.dtype),
             zero,
             zero,
             zero,
@@ -204,7 +228,7 @@ class DelayedFilter(eqx.Module):
         samples: Float[Array, "n 6"],
         readings: Readings,
         last: Float[Array, ""],
-    ) -> tuple[FilterState, Float[Array, "n 15"]]:
+    ) -> tuple[FilterState, Float[Array, "n 18"]]:
         """Put samples that end with number `last` into the ring; return the slots that leave it.
 
         `samples` are the IMU's, oldest first; of `readings` only the other sensors count. The slots
@@ -222,8 +246,11 @@ class DelayedFilter(eqx.Module):
             spin = velocity_at(r, jnp.concatenate([jnp.zeros_like(rate), rate]))
             force = force - se3.cross(rate, spin) - se3.cross((rate - before) / h, r)
         moves = (number[None, self.slots :] >= 1).astype(dtype)
-        new = [moves, force, (rate + before) / 2, jnp.zeros((8, n), dtype)]
+        mean = rate if self.imu.integrating else (rate + before) / 2
+        new = [moves, force, mean, jnp.zeros((SLOT - _DVL, n), dtype)]
         ring = jnp.concatenate([state.ring, jnp.concatenate(new).T])
+        following = jnp.concatenate([ring[1:, 4:_DVL], ring[-1:, 4:_DVL]])
+        state = self._compared(state, ring, rate)
 
         def place(old: Array, reading: Array) -> Array:
             """The columns with [1, value] in the slot of a valid reading's time."""
@@ -235,13 +262,36 @@ class DelayedFilter(eqx.Module):
             ring[:, :_DVL],
             place(ring[:, _DVL:_DEPTH], readings.dvl),
             place(ring[:, _DEPTH:_COMPASS], readings.depth),
-            place(ring[:, _COMPASS:], readings.compass),
+            place(ring[:, _COMPASS:_RATE], readings.compass),
+            (ring[:, 4:_DVL] + following) / 2,
         ]
         ring = jnp.concatenate(columns, axis=1)
-        return state._replace(ring=ring[n:], rate=rate[:, -1]), ring[:n]
+        return state._replace(ring=ring[n:]), ring[:n]
+
+    def _compared(
+        self, state: FilterState, ring: Float[Array, "m 18"], rate: Float[Array, "3 n"]
+    ) -> FilterState:
+        """Compare the n newest samples, at the end of `ring`, with those before them."""
+        n, m = rate.shape[1], ring.shape[0]
+        rates = jnp.concatenate([state.rate_before[None], state.rate[None], rate.T])
+        force = ring[m - n - _FEW :, 1:4]
+        has = ring[m - n - _FEW :, :1]
+        decay = jnp.exp(-jnp.asarray(self.period, ring.dtype) / _REMEMBERED)
+        steps, bends = state.steps, state.bends
+        for i in range(n):
+            # both need two samples before them
+            known = has[_FEW + i - 2, 0] * (1 - decay)
+            foreseen = _mean(force[i : i + _FEW], has[i : i + _FEW])
+            at, now = _FEW + i, i + 2
+            step = jnp.concatenate([force[at] - foreseen, rates[now] - rates[now - 1]])
+            bend = [force[at] - 2 * force[at - 1] + force[at - 2]]
+            bend = jnp.concatenate([*bend, rates[now] - 2 * rates[now - 1] + rates[now - 2]])
+            steps = steps + known * (step[:, None] * step[None] - steps)
+            bends = bends + known * (bend[:, None] * bend[None] - bends)
+        return state._replace(rate_before=rates[-2], rate=rates[-1], steps=steps, bends=bends)
 
     def move(
-        self, state: FilterState, slots: Float[Array, "n 15"], first: Float[Array, ""]
+        self, state: FilterState, slots: Float[Array, "n 18"], first: Float[Array, ""]
     ) -> tuple[FilterState, Float[Array, ""]]:
         """Move the nominal state from slot `first` on over the next one that needs `fuse`.
 
@@ -273,15 +323,15 @@ class DelayedFilter(eqx.Module):
         return state._replace(nominal=x, since=since), at
 
     def fuse(
-        self, state: FilterState, slot: Float[Array, "15"], k: Float[Array, ""]
+        self, state: FilterState, slot: Float[Array, "18"], k: Float[Array, ""]
     ) -> FilterState:
         """Bring P up to date and use the readings of the slot that left with sample number k."""
         x = state.nominal
         P = self._covariance(state, x, state.since[:7])
         found = (
-            measurement.dvl_innovation(self.dvl, x, slot[4:7], slot[_DVL + 1 : _DEPTH]),
+            measurement.dvl_innovation(self.dvl, x, slot[_RATE:], slot[_DVL + 1 : _DEPTH]),
             measurement.depth_innovation(self.depth, x, slot[_DEPTH + 1 : _COMPASS]),
-            measurement.compass_innovation(self.compass, x, slot[_COMPASS + 1 :]),
+            measurement.compass_innovation(self.compass, x, slot[_COMPASS + 1 : _RATE]),
         )
         used = jnp.stack([slot[flag] > 0 for flag in (_DVL, _DEPTH, _COMPASS)])
         # A filter that lost its way: what the sensor measures counts as unknown from here on.
@@ -314,7 +364,23 @@ class DelayedFilter(eqx.Module):
             before, after, gone[1:4] / some, gone[4:] / some, time, self._noisy_imu, self.compass
         )
         P = F @ state.P @ F.T + Q
+        if not self.imu.integrating:
+            P = P + time / self.period * self._between_samples(state)
         return (P + P.T) / 2
+
+    def _between_samples(self, state: FilterState) -> Float[Array, "18 18"]:
+        """What one sample of an IMU that does not integrate leaves open about its interval T.
+
+        Between two known values a Brownian rate of density σ² has an integral of variance
+        σ² T³ / 12, and second differences of variance 2 σ² T. Independent forces of variance s²,
+        whose second differences have 6 s², leave at most s² T² open of the change of velocity.
+        Of smooth motion second differences show next to nothing.
+        """
+        T = self.period
+        open_ = jnp.zeros_like(state.P)
+        turn, force = state.bends[3:, 3:], state.bends[:3, :3]
+        open_ = open_.at[error_state.ROTATION, error_state.ROTATION].set(turn * T**2 / 24)
+        return open_.at[error_state.VELOCITY, error_state.VELOCITY].set(force * T**2 / 6)
 
     def status(self, state: FilterState, k: Float[Array, ""]) -> Float[Array, "10"]:
         """The status vector after `step` number k; see `STATUS`."""
@@ -322,14 +388,27 @@ class DelayedFilter(eqx.Module):
         age = time - state.accepted_at
         return jnp.concatenate([time[None], state.nis, state.rejected, age])
 
+    def health(
+        self, state: FilterState, P: Float[Array, "18 18"], k: Float[Array, ""]
+    ) -> Float[Array, "5"]:
+        """The health vector after `step` number k, for the covariance P that is shown."""
+        c, variance = self.config, jnp.diag(P)
+        age = jnp.maximum(k - self.slots, 0) * self.period - state.accepted_at
+        trusted = (age <= c.silence) & (state.rejected < c.patience)
+        trusted = jnp.concatenate([jnp.ones(1, P.dtype), trusted.astype(P.dtype)])
+        lost = jnp.any(variance[error_state.VELOCITY] > c.lost_velocity**2)
+        lost = lost | jnp.any(variance[error_state.ROTATION] > c.lost_attitude**2)
+        state_ = jnp.where(lost, 2.0, jnp.where(jnp.all(trusted > 0), 0.0, 1.0))
+        return jnp.concatenate([state_[None].astype(P.dtype), trusted])
+
     def present(
         self, state: FilterState, ahead: float | Float[Array, ""]
     ) -> tuple[Float[Array, "7"], Float[Array, "6"], Float[Array, "18 18"]]:
         """Pose, twist and error covariance `ahead` seconds after the newest sample.
 
         The waiting samples are applied to the horizon's state; beyond the newest one its rate and
-        the mean force of the last few hold on. The covariance crosses the waiting time in one step;
-        it does not know what pushes the vehicle during `ahead`.
+        the mean force of the last few hold on. The covariance crosses the waiting time in one step,
+        and grows beyond it by how far samples have lately been from what was foreseen of them.
         """
         x, ring = state.nominal, state.ring
         time = ring[:, 0] * self.period
@@ -341,8 +420,24 @@ class DelayedFilter(eqx.Module):
         )
         P = self._covariance(state, now, state.since[:7] + jnp.sum(waiting, axis=0))
         rate = state.rate - x.gyro_bias
-        few = ring[-_FEW:, 0]
-        mean = jnp.sum(force[:, -_FEW:] * few[None], axis=1) / jnp.maximum(jnp.sum(few), 1)
+        mean = _mean(force[:, -_FEW:].T, ring[-_FEW:, :1])
         beyond = error_state.sample_increment(mean, rate, ahead * ring[-1, 0])
         now = error_state.apply(now, beyond, self.imu.gravity)
+        P = P + self._foreseen(state, now, ahead)
         return now.X_WB, jnp.concatenate([now.v_B, rate]), P
+
+    def _foreseen(
+        self, state: FilterState, now: Navigation, ahead: float | Float[Array, ""]
+    ) -> Float[Array, "18 18"]:
+        """Covariance of what the mean force and rate of `ahead` are off what was foreseen."""
+        a = ahead * jnp.eye(3, dtype=state.P.dtype)
+        J = jnp.zeros((error_state.ERRORS, 6), state.P.dtype)
+        J = J.at[error_state.POSITION, :3].set(ahead / 2 * a)
+        J = J.at[error_state.ROTATION, 3:].set(a).at[error_state.VELOCITY, :3].set(a)
+        J = J.at[error_state.VELOCITY, 3:].set(ahead * error_state.skew(now.v_B))
+        return J @ state.steps @ J.T
+
+
+def _mean(values: Float[Array, "n 3"], has: Float[Array, "n 1"]) -> Float[Array, "3"]:
+    """Mean of the rows that there are, zero if there are none."""
+    return jnp.sum(values * has, axis=0) / jnp.maximum(jnp.sum(has), 1)

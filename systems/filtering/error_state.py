@@ -185,6 +185,11 @@ def transition(
     N_a = jnp.concatenate([-(T / 2) * eye, zero, -eye, rest])
     s_g, s_a = imu.gyroscope_density**2 / 2, imu.accelerometer_density**2 / 2
     Q = s_g * T * (N_g @ N_g.T) + s_a * T * (N_a @ N_a.T)
+    # White noise over T is its mean and, independent of it, a first moment of variance T³ / 12: it
+    # moves the position of accelerations and the velocity of turns under gravity.
+    moment = T**3 / 12
+    Q = Q.at[POSITION, POSITION].add(s_a * moment * eye)
+    Q = Q.at[VELOCITY, VELOCITY].add(s_g * moment * (skew(g_B) @ skew(g_B).T))
     walk = jnp.concatenate(
         [
             jnp.zeros(9, force.dtype),

@@ -1,5 +1,6 @@
 """Measurement updates of an error-state filter: gate, gain, Joseph form."""
 
+import math
 from collections.abc import Callable, Sequence
 from itertools import accumulate
 from typing import NamedTuple
@@ -65,16 +66,29 @@ def depth_innovation(
 def compass_innovation(
     compass: Compass, nominal: Navigation, reading: Float[Array, "1"]
 ) -> Innovation:
-    """Yaw and the compass' wander; the residual is taken the short way round."""
-    expected, H = _along_pose(compass.expected, nominal.X_WB)
-    residual = wrap(reading - expected - nominal.sensors[2:3])
-    return Innovation(residual, _pose_row(H, 2), _noise(compass.noise, 1, residual))
+    """How far the bow points across the heading that the compass shows, its wander taken off.
+
+    The component of the bow across the true heading is zero at every attitude, and has a derivative
+    where yaw has none. Of a yaw error Δ it is cos θ sin Δ, so the residual is cos θ times that of
+    yaw; beyond 90° it grows no further. A reading's noise, cos θ times the compass', counts as the
+    compass' own: with the bow up a compass tells no more than that.
+    """
+    yaw = compass.expected(nominal.X_WB)
+    off = jnp.clip(wrap(reading - yaw - nominal.sensors[2:3]), -math.pi / 2, math.pi / 2)
+    shown = yaw + off
+    across = jnp.concatenate([-jnp.sin(shown), jnp.cos(shown), jnp.zeros_like(shown)])
+    bow = jnp.eye(3, dtype=yaw.dtype)[0]
+    h, H = _along_pose(lambda X: (across @ se3.rotate(X, bow))[None], nominal.X_WB)
+    level = jnp.linalg.norm(se3.rotate(nominal.X_WB, bow)[:2]) * jnp.cos(off[0])
+    return Innovation(-h, _pose_row(H, 2, level), _noise(compass.noise, 1, h))
 
 
-def _pose_row(H: Float[Array, "1 6"], sensor: int) -> Float[Array, "1 18"]:
-    """The row of a reading of the pose plus one sensor's slow error."""
+def _pose_row(
+    H: Float[Array, "1 6"], sensor: int, times: float | Float[Array, ""] = 1.0
+) -> Float[Array, "1 18"]:
+    """The row of a reading of the pose plus `times` one sensor's slow error."""
     row = jnp.zeros((1, ERRORS), H.dtype).at[:, POSE].set(H)
-    return row.at[:, SENSORS.start + sensor].set(1)
+    return row.at[:, SENSORS.start + sensor].set(times)
 
 
 def small_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:

@@ -7,10 +7,11 @@ numbers for spinning and progress; those here are estimates.
 """
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ..models.checks import Vector3, check_numbers, require
 from ..models.vehicle import Vehicle
@@ -19,7 +20,7 @@ from ..systems.obstacles import BoxHull, Cylinders, Pylon
 
 Reason = Literal[
     "goal", "collision", "spinning", "near goal", "no progress", "not finite", "duration",
-    "interrupted",
+    "interrupted", "no safe plan",
 ]  # fmt: skip
 
 
@@ -111,7 +112,7 @@ class Monitor:
         """`goal` (m, W) is what `ReachGoal` needs."""
         self.obstacles, self.success, self.goal = obstacles, success, goal
         self.safety = safety or Safety()
-        self._clearance = [clearance_function(vehicle, (pylon,)) for pylon in obstacles]
+        self._vehicle = vehicle
         self._spinning_since: float | None = None
         self._near = 0.0
         self._best, self._best_time = np.inf, 0.0
@@ -126,8 +127,8 @@ class Monitor:
             return Outcome("not finite", t, f"The state was no longer finite at {t:.1f} s.")
         step = 0.0 if self._before is None else t - self._before
         self._before = t
-        for pylon, clearance in zip(self.obstacles, self._clearance, strict=True):
-            if clearance(X_WB)[0][0] <= 0:
+        for pylon in self.obstacles:
+            if clearance(self._vehicle, X_WB, pylon) <= 0:
                 name = pylon.name or f"the pylon at ({pylon.x:g}, {pylon.y:g})"
                 return Outcome("collision", t, f"The vehicle hit {name} after {t:.1f} s.")
         rate = float(np.linalg.norm(V_WB_B[3:]))
@@ -168,7 +169,19 @@ class Monitor:
         return None
 
 
-def clearance_function(vehicle: Vehicle, obstacles: tuple[Pylon, ...]) -> VectorFunction:
-    """Distance (m) of the vehicle's box to the nearest of the obstacles, for one pose."""
-    hull, cylinders = BoxHull.create(vehicle.size), Cylinders.create(obstacles)
-    return VectorFunction(lambda X: hull.clearance(X, cylinders).reshape(1), [7], [1])
+def clearance(vehicle: Vehicle, X_WB: Float[np.ndarray, "7"], pylon: Pylon) -> float:
+    """Distance (m) of the vehicle's box to a pylon, negative where they meet."""
+    p = np.array([pylon.x, pylon.y, pylon.diameter / 2, pylon.bottom, pylon.top])
+    return float(_to_pylon(vehicle.size)(X_WB, p)[0][0])
+
+
+@cache
+def _to_pylon(size: tuple[float, float, float]) -> VectorFunction:
+    """The distance for one pose and one pylon: compiled once for all of them."""
+    hull = BoxHull.create(size)
+
+    def distance(X: Array, p: Array) -> Array:
+        cylinder = Cylinders(p[:2, None], p[2:3], p[3:4], p[4:])
+        return hull.clearance(X, cylinder).reshape(1)
+
+    return VectorFunction(distance, [7, 5], [1])

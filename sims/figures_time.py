@@ -11,6 +11,7 @@ from .figures import (
     ESTIMATE,
     FLOWN,
     GOAL,
+    INK,
     LIMIT,
     OBSTACLE,
     PLANNED,
@@ -207,7 +208,7 @@ def progress_figure(
 
 @styled
 def planner_figure(log: RunLog) -> Figure | None:
-    """How sure the planner was: cost, risk, clearance it expected."""
+    """How sure the planner was: cost, risk beside the risk allowed, clearance it expected."""
     plans = log.plans
     if plans is None or plans.figures is None or plans.time.size < 2:
         return None
@@ -224,4 +225,9 @@ def planner_figure(log: RunLog) -> Figure | None:
         ax.set_title(title)
         ax.set_xlabel(_TIME)
         ax.set_ylim(bottom=0 if not finite.any() or values[finite].min() >= 0 else None)
+    if plans.allowed is not None:
+        ax = axes[0, 1]
+        ax.axhline(100 * plans.allowed, color=INK, lw=1, ls="--", label="allowed")
+        ax.set_ylim(top=max(ax.get_ylim()[1], 120 * plans.allowed))
+        legend(ax)
     return figure

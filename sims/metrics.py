@@ -202,16 +202,22 @@ def _disturbance(log: RunLog) -> dict[str, Any]:
 
 
 def _planner(log: RunLog) -> dict[str, Any]:
-    plans = log.plans
-    if plans is None or plans.figures is None:
-        return {}
-    figures = {name: plans.figures[:, i] for i, name in enumerate(FIGURES)}
-    return {
-        "plans": int(plans.time.size),
-        "mean_collision_probability": float(figures["collision_probability"].mean()),
-        "max_collision_probability": float(figures["collision_probability"].max()),
-        "mean_effective_samples": float(figures["effective_samples"].mean()),
-    }
+    plans, found = log.plans, {}
+    if plans is not None and plans.figures is not None:
+        figures = {name: plans.figures[:, i] for i, name in enumerate(FIGURES)}
+        risk = figures["collision_probability"]
+        found = {
+            "plans": int(plans.time.size),
+            "mean_collision_probability": float(risk.mean()),
+            "max_collision_probability": float(risk.max()),
+            "mean_effective_samples": float(figures["effective_samples"].mean()),
+        }
+        if plans.allowed is not None:
+            found["allowed_collision_probability"] = plans.allowed
+            found["plans_beyond_allowed"] = int(np.count_nonzero(risk > plans.allowed))
+    if log.least_risk is not None:
+        found["least_risk_to_goal"] = log.least_risk
+    return found
 
 
 def _plain(value: Any) -> Any:

@@ -74,7 +74,7 @@ def run_page(
     outcome = values["outcome"]
     page = Page(title, description).verdict(outcome["words"], outcome["success"])
     page.tiles(_tiles(values))
-    _path_section(page, log, scene, clearance, replay)
+    _path_section(page, log, scene, clearance, replay, values)
     _errors_section(page, log, values)
     page.section("Commands", "The wrench that the controller asked for, and what it took.")
     page.figure(
@@ -101,7 +101,12 @@ def run_page(
 
 
 def _path_section(
-    page: Page, log: RunLog, scene: Scene, clearance: np.ndarray | None, replay: str
+    page: Page,
+    log: RunLog,
+    scene: Scene,
+    clearance: np.ndarray | None,
+    replay: str,
+    values: dict[str, Any],
 ) -> None:
     text = f"The whole run can be looked at from all sides in the [3-D replay]({replay})."
     page.section("Path", text if replay else "")
@@ -124,7 +129,25 @@ def _path_section(
         )
         planner = planner_figure(log)
         if planner is not None:
-            page.figure(planner, "The planner's own figures, call by call.")
+            page.figure(
+                planner, f"The planner's own figures, call by call.{_risk(values['planner'])}"
+            )
+
+
+def _risk(planner: dict[str, Any]) -> str:
+    """Whether the chance constraint was kept."""
+    allowed, beyond = (
+        planner.get(f"{name}") for name in ("allowed_collision_probability", "plans_beyond_allowed")
+    )
+    if allowed is None:
+        return " No collision risk is allowed for: the chance constraint is left out."
+    text = f" Dashed: the collision risk that the chance constraint allows, {100 * allowed:g} %."
+    if not beyond:
+        return f"{text} Every plan keeps to it."
+    return (
+        f"{text} It could not hold in {beyond} of {planner['plans']} plans: nothing that was tried "
+        f"kept to it, and the risk was up to {100 * planner['max_collision_probability']:.2g} %."
+    )
 
 
 def _errors_section(page: Page, log: RunLog, values: dict[str, Any]) -> None:

@@ -13,7 +13,8 @@ Besides the variables of every recording (`docs/recording.md`) a run's log holds
 - `F_disturbance_Bo_B` (N, N·m), `flow_W` (velocity m/s, acceleration m/s²): what the water did;
 
 and for every plan made (dim `plan`): `plan_time` (s), `plan_X_WB`, and of a sampling planner also
-`sample_p_WB`, `sample_weight` and `planner_figures`.
+`sample_p_WB`, `sample_weight` and `planner_figures`. Attributes: `allowed_risk` of the planner's
+chance constraint, and `least_risk`, that of the widest way to the goal.
 """
 
 import os
@@ -42,6 +43,7 @@ class Plans:
         p_WB: positions of sampled paths (m, W), at `dt`, 2 `dt`, … after `time`.
         weights: of the sampled paths.
         figures: the planner's own figures (`systems.mppi.FIGURES`).
+        allowed: probability of a collision that the planner's chance constraint allows.
     """
 
     time: Float[np.ndarray, " plans"]
@@ -50,6 +52,7 @@ class Plans:
     p_WB: Float[np.ndarray, "plans sampled 3 paths"] | None = None
     weights: Float[np.ndarray, "plans paths"] | None = None
     figures: Float[np.ndarray, "plans figures"] | None = None
+    allowed: float | None = None
 
     def at(self, t: float) -> int | None:
         """Index of the plan that was the newest at time t, None before the first."""
@@ -82,8 +85,12 @@ class RunLog:
         vehicle: str = "",
         source: str = "",
         notes: tuple[str, ...] = (),
+        least_risk: float | None = None,
     ) -> "RunLog":
-        """Build from arrays with time first; `variables` holds at least X_WB, V_WB_B, F_Bo_B."""
+        """Build from arrays with time first; `variables` holds at least X_WB, V_WB_B, F_Bo_B.
+
+        `least_risk` is the probability of a collision on the widest way to the goal.
+        """
         rest = dict(variables)
         X, V = rest.pop("X_WB"), rest.pop("V_WB_B")
         commands = {name: rest.pop(name) for name in ("F_Bo_B", "pwm") if name in rest}
@@ -94,10 +101,14 @@ class RunLog:
             source=source,
             notes=notes,
         )
-        if plans is None:
-            return cls(recording)
-        dataset = recording.dataset.assign(_plan_variables(plans))
-        dataset.attrs["plan_dt"] = float(plans.dt)
+        dataset = recording.dataset
+        if plans is not None:
+            dataset = dataset.assign(_plan_variables(plans))
+            dataset.attrs["plan_dt"] = float(plans.dt)
+            if plans.allowed is not None:
+                dataset.attrs["allowed_risk"] = float(plans.allowed)
+        if least_risk is not None:
+            dataset.attrs["least_risk"] = float(least_risk)
         return cls(Recording(dataset))
 
     def __contains__(self, name: str) -> bool:
@@ -118,6 +129,15 @@ class RunLog:
         return self.recording.dt
 
     @property
+    def least_risk(self) -> float | None:
+        """Probability of a collision on the widest way to the goal, if there is a goal."""
+        return self._attribute("least_risk")
+
+    def _attribute(self, name: str) -> float | None:
+        value = self.recording.dataset.attrs.get(name)
+        return None if value is None else float(value)
+
+    @property
     def plans(self) -> Plans | None:
         """The plans, if any were made."""
         data = self.recording.dataset
@@ -131,6 +151,7 @@ class RunLog:
             arrays["sample_p_WB"],
             arrays["sample_weight"],
             arrays["planner_figures"],
+            self._attribute("allowed_risk"),
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -17,10 +17,12 @@ from ..models.errors import UserError
 from ..systems.closed_loop import build_diagram, logged, seeded
 from ..systems.compiled import CompiledSimulator
 from ..systems.network import NotPureError
+from ..systems.passage import Passage
 from .criteria import FollowPath, Monitor, Outcome
 from .run_log import RunLog
 from .run_signals import PlanTap, collect, log_commands, log_periods, plan_source
 from .scenario import Scenario
+from .way import check_free, find_passage, holding, no_safe_plan
 
 Progress = Callable[[float, str], None]
 Engine = Literal["auto", "drake", "compiled"]
@@ -83,10 +85,13 @@ def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engin
     Ctrl-C ends the flight after the sample at hand with the outcome `interrupted`; what was flown
     until then is returned. A second one, or one before the flight, interrupts at once.
 
+    Where no way to the goal keeps to the allowed risk, a planner holds the vehicle's place, and the
+    outcome is `no safe plan`.
+
     Raises:
-        UserError: the scenario names what can't be read, its controller lacks a port, tells no
-            plan though `FollowPath` judges by it or puts out no finite wrench at t = 0, or the
-            engine is to be `compiled` and can't.
+        UserError: start or goal are in an obstacle, the scenario names what can't be read, its
+            controller lacks a port, tells no plan though `FollowPath` judges by it or puts out no
+            finite wrench at t = 0, or the engine is to be `compiled` and can't.
     """
     return next(simulate_seeds(scenario, [scenario.seed], progress, engine))
 
@@ -107,9 +112,12 @@ def simulate_seeds(
     """
     tell = progress or (lambda fraction, remark: None)
     tell(0.0, "building")
+    check_free(scenario)
+    passage = find_passage(scenario)
+    blocked = passage is not None and not passage.safe
     diagram = build_diagram(
         scenario.station,
-        scenario.controller,
+        holding(scenario) if blocked else scenario.controller,
         log_periods=log_periods(scenario),
         extend=log_commands(scenario),
         goal=scenario.goal,
@@ -122,7 +130,7 @@ def simulate_seeds(
             simulator = _simulator(diagram, scenario, engine)
         else:
             simulator.reset_context(diagram.CreateDefaultContext())
-        run = _one(diagram, simulator, scenario.with_changes(seed=seed), warm, tell)
+        run = _one(diagram, simulator, scenario.with_changes(seed=seed), warm, tell, passage)
         yield run
         if run.outcome.reason == "interrupted":
             return
@@ -164,6 +172,7 @@ def _one(
     scenario: Scenario,
     warm: bool,
     tell: Progress,
+    passage: Passage | None,
 ) -> Run:
     """Fly a diagram once, in a fresh context; `warm` says that its programs are compiled."""
     context = simulator.get_mutable_context()
@@ -183,7 +192,9 @@ def _one(
     timing.compilation = time.perf_counter() - started
     with _stop_on_interrupt() as stopped, _few_collections():
         outcome = _fly(scenario, diagram, simulator, monitor, tap, timing, tell, stopped)
-    log = collect(scenario, logged(diagram, context), tap, outcome.time)
+    if passage is not None and not passage.safe and outcome.reason in ("duration", "no progress"):
+        outcome = Outcome("no safe plan", outcome.time, no_safe_plan(scenario, passage))
+    log = collect(scenario, logged(diagram, context), tap, outcome.time, passage)
     return Run(scenario, log, outcome, timing)
 
 

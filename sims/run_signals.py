@@ -13,6 +13,7 @@ from pydrake.systems.primitives import LogVectorOutput
 from ..systems.closed_loop import Signal
 from ..systems.filtering.delayed import STATUS
 from ..systems.filtering.error_state import ERRORS, POSITION, ROTATION, VELOCITY
+from ..systems.passage import Passage
 from ..systems.plan import PlanLayout
 from ..systems.signal_log import add_log
 from .run_log import FUSED, Plans, RunLog
@@ -146,11 +147,18 @@ class PlanTap:
             extra["weights"] = np.stack([np.asarray(s.weights) for s in unpacked])
         if "figures" in calls[0]:
             extra["figures"] = np.stack([call["figures"] for call in calls])
+            extra["allowed"] = self.source.planner.config.collision_risk
         times = np.array([float(call["time"]) for call in calls])
         return Plans(times, stride * layout.dt, states, **extra)
 
 
-def collect(scenario: Scenario, signals: Mapping[str, Signal], tap: PlanTap, end: float) -> RunLog:
+def collect(
+    scenario: Scenario,
+    signals: Mapping[str, Signal],
+    tap: PlanTap,
+    end: float,
+    passage: Passage | None = None,
+) -> RunLog:
     """One log of all signals from 0 to `end` (s)."""
     dt = 1 / scenario.log.rate
     n = min(round(end / dt) + 1, len(signals["X_WB_cheat"].time))
@@ -184,6 +192,7 @@ def collect(scenario: Scenario, signals: Mapping[str, Signal], tap: PlanTap, end
         vehicle=scenario.station.vehicle,
         source=f"simulation of scenario {scenario.name}, seed {scenario.seed}",
         notes=_NOTES,
+        least_risk=None if passage is None else passage.risk,
     )
 
 

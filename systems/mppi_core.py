@@ -93,8 +93,11 @@ class MppiPlanner(eqx.Module):
     by, wrench sequences are sampled with smooth noise and cut to U. Every sequence meets the same
     `realisations` of the model's process noise (in pairs of opposite sign), so sequences are
     compared under equal luck. Costs become weights, the weighted mean sequence is cut to U, and of
-    mean, best sample and last plan the one of least cost is taken: a mean of passing left and of
-    passing right of a pylon is never flown. The plan's states are the model's drift under it.
+    mean, best sample, best sample that keeps the chance constraint and last plan one is taken: a
+    mean of passing left and of passing right of a pylon is never flown. It is the one of least cost
+    of those that keep the constraint, and if none does the one that violates it least: however far
+    the goal, no cost of being away from it buys a collision. The plan's states are the model's
+    drift under it.
 
     With `tracking` gains the noise paths are those of a vehicle that is held to the plan, as it
     will be: the two paths of a pair are drawn to their middle, which stands for the path without
@@ -240,7 +243,8 @@ class MppiPlanner(eqx.Module):
 
         mean = self._cut(jnp.sum(F * weights[None, None], axis=2))
         best = F[:, :, jnp.argmin(jnp.where(jnp.isfinite(cost), cost, jnp.inf))]
-        candidates = jnp.stack([mean, best, draw.nominal], axis=2)
+        safe = F[:, :, _first_choice(cost, self.violation(whole))]
+        candidates = jnp.stack([mean, best, draw.nominal, safe], axis=2)
         quiet = None if dW is None else jnp.concatenate([dW, jnp.zeros_like(dW[..., :1])], axis=3)
         tried = self._rollouts(
             X,
@@ -248,14 +252,14 @@ class MppiPlanner(eqx.Module):
             candidates,
             bias,
             quiet,
-            lambda X, V, F: (X[:, -3:], V[:, -3:], F[:, -3:]),
+            lambda X, V, F: (X[:, -4:], V[:, -4:], F[:, -4:]),
             draw.before,
         )
         if dW is not None:
             tried = Rolled(tried.cost[:-1], tried.clearance[:-1], tried.states)
         candidate_cost, probability = self.sequence_cost(candidates, tried, bias)
         candidate_cost = jnp.where(jnp.isfinite(candidate_cost), candidate_cost, jnp.inf)
-        chosen = jnp.argmin(candidate_cost)
+        chosen = _first_choice(candidate_cost, self.violation(tried))
         plan = candidates[:, :, chosen]
         Xs = jnp.concatenate([X[:, None], tried.states[0][:, :, chosen].T], axis=1)
         Vs = jnp.concatenate([V[:, None], tried.states[1][:, :, chosen].T], axis=1)
@@ -324,6 +328,14 @@ class MppiPlanner(eqx.Module):
         if c.collision_risk is not None:
             total = total + c.risk_weight * (excess + missing)
         return total, probability
+
+    def violation(self, rolled: Rolled) -> Float[Array, " n"]:
+        """How far sequences are from keeping the chance constraint; 0 for those that do."""
+        c, clearance = self.config, rolled.clearance
+        if c.collision_risk is None or self.cylinders.radius.shape[0] == 0:
+            return jnp.zeros_like(clearance[0])
+        _, excess, missing = chance_violation(clearance, c.collision_risk, c.clearance_std)
+        return excess + missing
 
     def _process_noise(self, key: Array) -> Float[Array, "horizon substeps 6 r"] | None:
         """Brownian increments (√s) for the realisations; None for a single one.
@@ -435,6 +447,14 @@ class MppiPlanner(eqx.Module):
         start = (X, V, jnp.zeros_like(V[0]), jnp.full_like(V[0], jnp.inf), memory)
         (_, _, cost, least, _), kept = jax.lax.scan(advance, start, (F, dW, last))
         return Rolled(cost.reshape(r, n), least.reshape(r, n), kept)
+
+
+def _first_choice(cost: Float[Array, " n"], violation: Float[Array, " n"]) -> Array:
+    """Index of the least cost of what violates nothing, else of the least violation."""
+    finite = jnp.isfinite(cost) & jnp.isfinite(violation)
+    kept = finite & (violation <= 0)
+    rest = jnp.where(finite, violation, jnp.inf)
+    return jnp.argmin(jnp.where(jnp.any(kept), jnp.where(kept, cost, jnp.inf), rest))
 
 
 def command_of_felt(

@@ -75,4 +75,4 @@ def _plans(duration: float) -> Plans:
     weights = rng.random((made.size, paths)) ** 4
     weights /= weights.sum(axis=1, keepdims=True)
     figures = np.stack([[100 / (1 + k), 0.01, 0.4, 12.0, 1.0, 1.0] for k in range(made.size)])
-    return Plans(made, 0.2, X, p.astype(np.float32), weights, figures)
+    return Plans(made, 0.2, X, p.astype(np.float32), weights, figures, allowed=0.05)

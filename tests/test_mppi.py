@@ -331,6 +331,17 @@ def test_a_start_inside_a_pylon_gives_finite_numbers_and_a_way_out():
     assert distance[-1] > distance[0] + 0.3
 
 
+def test_no_goal_is_so_far_that_a_collision_pays():
+    """Behind a wall, 300 m away: being nearer would save more than any penalty costs."""
+    wall = Pylon(11.5, 0.0, diameter=20.0, bottom=-50.0, top=50.0)
+    planner = among(1.5, pylons=[wall])
+    planner = eqx.tree_at(lambda p: p.X_WG, planner, at(300.0).astype(jnp.float32))
+    for moving in (NONE, NONE.at[0].set(0.3)):
+        _, plan = settle(planner, at(0.0), moving, 6)
+        assert float(plan.collision_probability) <= planner.config.collision_risk
+        assert np.min(np.hypot(plan.X_WB[4] - 11.5, plan.X_WB[5])) > 10.2  # half a hull outside
+
+
 def test_a_state_of_nan_is_no_plan_and_is_forgotten():
     planner = among()
     state, plan = settle(planner, at(np.nan), NONE, 1)

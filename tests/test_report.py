@@ -13,6 +13,7 @@ from spinndrift.sims.figures_path import Scene
 from spinndrift.sims.meshcat_replay import write_replay
 from spinndrift.sims.metrics import clearance, metrics
 from spinndrift.sims.report import run_page
+from spinndrift.systems.mppi import FIGURES
 from spinndrift.systems.obstacles import Pylon
 
 VEHICLE = load_vehicle("bluerov2_heavy")
@@ -38,6 +39,7 @@ def test_report_of_a_crossing():
     assert 'class="verdict good"' in html
     for title in ("Path", "Planning", "Tracking", "Estimate", "Commands", "Disturbances"):
         assert f"<h2>{title}</h2>" in html
+    assert "the chance constraint allows, 5 %. Every plan keeps to it." in html
     assert "seed: 3" in html
     assert "NEES, the squared error by the claimed covariance, is 3 on average" in html
     assert "Estimator health: good 75 %, degraded (dvl) 25 %." in html
@@ -54,6 +56,21 @@ def test_report_of_a_run_that_ended_at_once():
     html = run_page(log, values, Scene(VEHICLE.size), title="Short").html()
     assert 'class="verdict bad"' in html
     assert "<h2>Planning</h2>" not in html
+
+
+def test_a_chance_constraint_that_could_not_hold_is_told():
+    log = example_log(4.0)
+    log.recording.dataset["planner_figures"][3:5, FIGURES.index("collision_probability")] = 0.2
+    outcome = Outcome("no progress", 4.0, "The vehicle made no progress.")
+    values = metrics(log, outcome, ReachGoal(), VEHICLE, PYLONS, np.array(GOAL))
+    assert values["planner"]["plans_beyond_allowed"] == 2
+    html = run_page(log, values, SCENE, title="Crossing").html()
+    assert "It could not hold in 2 of 19 plans" in html
+    assert "the risk was up to 20 %" in html
+    drawn = figures_time.planner_figure(log)
+    assert drawn is not None
+    allowed = [line for line in drawn.axes[1].lines if line.get_label() == "allowed"]
+    assert [line.get_ydata()[0] for line in allowed] == [5.0]
 
 
 def test_figures_do_not_change_matplotlib():

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 
 import numpy as np
@@ -143,11 +144,55 @@ def test_interrupt_keeps_what_was_flown():
 
 
 def test_collision_ends_the_run():
-    pylon = "obstacles: [{x: 0.2, y: 0.0, name: the post}], start: {position: [0, 0, -1.5]}"
+    pylon = "obstacles: [{x: 0.5, y: 0.0, name: the post}], start_twist: [1, 0, 0, 0, 0, 0]"
     run = simulate(overridden(HOLD, f"station: {{{pylon}}}"))
     assert run.outcome.reason == "collision"
     assert "the post" in run.outcome.sentence
-    assert run.log.time.size == 1
+    assert 0.1 < run.outcome.time < 0.3
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "station: {obstacles: [{x: 0.2, y: 0.0, name: post}]}",
+            r"station.start: .* 0\.1\d m inside post, a certain collision",
+        ),
+        (
+            "{success: !ReachGoal {goal: [3, 0, -1.5]}, station: {obstacles: [{x: 3.1, y: 0.0}]}}",
+            r"success.goal: .* inside the pylon at \(3.1, 0\)",
+        ),
+        (
+            "{station: {obstacles: [{x: 4.5, y: -2.3, name: post}]}}",
+            r"controller.goal: .* inside post",
+        ),
+    ],
+)
+def test_no_run_starts_or_ends_in_an_obstacle(text, message):
+    crossing = "controller" in message
+    scenario = load_scenario("pylon_crossing_calm", text) if crossing else overridden(HOLD, text)
+    with pytest.raises(UserError, match=message):
+        simulate(scenario)
+
+
+def test_a_ringed_goal_is_said_and_the_vehicle_stays(crossing, tmp_path):
+    angles = 2 * np.pi * np.arange(12) / 12
+    pylons = ", ".join(
+        f"{{x: {4.5 + np.cos(a):.3f}, y: {-2 + np.sin(a):.3f}, diameter: 0.35}}" for a in angles
+    )
+    text = f"{{duration: 0.5, station: {{disturbance_set: still, obstacles: [{pylons}]}}}}"
+    base = config.dump(crossing.scenario)
+    run = simulate(overridden(base, text))
+    assert run.outcome.reason == "no safe plan"
+    found = re.search(r"every way .* risk of ([\d.]+) % or more, and 5 % is", run.outcome.sentence)
+    assert found, run.outcome.sentence
+    assert float(found[1]) > 90
+    assert np.linalg.norm(run.log["X_WB"][-1] - run.log["X_WB"][0]) < 0.02
+    values = write_run(run, tmp_path / "run", report=False)
+    assert values["planner"]["least_risk_to_goal"] == pytest.approx(float(found[1]) / 100, abs=1e-3)
+    assert values["planner"]["allowed_collision_probability"] == 0.05
+    assert values["outcome"]["words"] == run.outcome.sentence
+    assert not values["outcome"]["success"]
 
 
 BAD = """

@@ -1,0 +1,136 @@
+"""Whether there is a way to a goal that keeps clear of the obstacles, however it is planned.
+
+A planner that looks a few seconds ahead can't tell a goal that is ringed by pylons from one that
+lies behind a corner. This can, before the flight: it seeks the widest way on a grid.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import label
+from scipy.special import ndtr
+
+from .obstacles import Pylon
+
+_CELL = 0.04  # m
+_CELLS = 400_000
+_ABOUT = 1.0  # m of free water around everything that stands
+_REACH = 2.0  # m above and below start and goal that ways are sought
+_HALVINGS = 16
+_NEIGHBOURS = np.stack([np.diag([0, 1, 0]), np.ones((3, 3)), np.diag([0, 1, 0])])
+
+
+class Passage(NamedTuple):
+    """The widest way to a goal.
+
+    Attributes:
+        clearance: no way keeps more than this (m) from the obstacles all along.
+        std: standard deviation of the clearance that is reckoned with (m).
+        allowed: allowed probability of a collision.
+    """
+
+    clearance: float
+    std: float
+    allowed: float
+
+    @property
+    def risk(self) -> float:
+        """Probability of a collision on the widest way: on any other it is higher."""
+        if self.std > 0:
+            return float(ndtr(-self.clearance / self.std))
+        return float(self.clearance < 0)
+
+    @property
+    def safe(self) -> bool:
+        """Whether the allowed risk may be kept to."""
+        return self.risk <= self.allowed
+
+
+def widest_way(
+    start: Float[np.ndarray, "3"],
+    goal: Float[np.ndarray, "3"],
+    goal_radius: float,
+    pylons: Sequence[Pylon],
+    size: tuple[float, float, float],
+    bed: float = -np.inf,
+    enough: float = np.inf,
+) -> float:
+    """The clearance (m) that no way to within `goal_radius` of a goal exceeds; inf without pylons.
+
+    The vehicle counts as an upright cylinder that is as wide as the narrower side of its hull,
+    which fits into a level hull of any heading. Ways may rise to the surface and dive to `bed`
+    (z, m), no more than 2 m above or below both start and goal. The grid's cells are given the
+    clearance of the best point that they may have: the bound is never too low, and at most by the
+    diagonal of a cell (of 4 cm in a harbour, more in a wide field) too high. A start with less than
+    `enough` counts as being where it first could have that much: the way out is not judged.
+    """
+    if not pylons:
+        return np.inf
+    low_z = max(bed, min(start[2], goal[2]) - _REACH)
+    high_z = max(low_z + 1e-3, min(0.0, max(start[2], goal[2]) + _REACH))
+    ends = np.array([(p.bottom, p.top) for p in pylons])
+    levels = np.unique(np.clip([*ends.ravel(), low_z, high_z], low_z, high_z))
+    slabs = list(pairwise(levels))
+    x, y, radius = np.array([(p.x, p.y, p.diameter / 2) for p in pylons]).T
+    hull, about = min(size[:2]) / 2, _ABOUT + max(size[:2])
+    points = np.array([start[:2], goal[:2]])
+    low = np.minimum(points.min(axis=0), [(x - radius).min(), (y - radius).min()]) - about
+    high = np.maximum(points.max(axis=0), [(x + radius).max(), (y + radius).max()]) + about
+    cell = max(_CELL, float(np.sqrt(np.prod(high - low) * len(slabs) / _CELLS)))
+    xs, ys = (np.arange(a, b + cell, cell) for a, b in zip(low, high, strict=True))
+    X, Y = np.meshgrid(xs, ys, indexing="ij")
+
+    around = np.full((len(slabs), *X.shape), np.inf)
+    for i in range(len(pylons)):
+        beside = np.hypot(X - x[i], Y - y[i]) - radius[i] - hull + cell / np.sqrt(2)
+        for k, (bottom, top) in enumerate(slabs):
+            past = float(max(top - ends[i, 1], ends[i, 0] - bottom)) - size[2] / 2
+            if ends[i, 0] <= bottom and ends[i, 1] >= top:
+                past = -np.inf
+            around[k] = np.minimum(around[k], _signed(beside, past))
+
+    def near(point: np.ndarray, reach: float) -> np.ndarray:
+        """Cells that have a point within reach of one, and the cell that it is in."""
+        off = np.array([max(a - point[2], point[2] - b, 0.0) for a, b in slabs])[:, None, None]
+        flat = np.hypot(X - point[0], Y - point[1])[None]
+        inside = np.hypot(np.maximum(flat - cell / np.sqrt(2), 0), off) <= reach
+        return inside | (flat + off == (flat + off).min())
+
+    at_start = near(start, 0.0)
+    missing = enough - around[at_start].max()
+    if 0 < missing < np.inf:
+        at_start = near(start, missing)
+    at_goal = near(goal, goal_radius)
+
+    def passes(clearance: float) -> bool:
+        parts: Any = label(around >= clearance, structure=_NEIGHBOURS)
+        parts = parts[0]
+        return bool(np.intersect1d(parts[at_start & (parts > 0)], parts[at_goal]).size)
+
+    worst = -hull - float(radius.max())
+    best = min(around[at_start].max(), around[at_goal].max())
+    if passes(best):
+        return float(best)
+    for _ in range(_HALVINGS):
+        middle = (worst + best) / 2
+        worst, best = (middle, best) if passes(middle) else (worst, middle)
+    return best
+
+
+def upright_gap(
+    p_WB: Float[np.ndarray, "3"], pylon: Pylon, size: tuple[float, float, float]
+) -> float:
+    """Clearance (m) of the upright cylinder that `widest_way` takes for the hull."""
+    away = np.hypot(p_WB[0] - pylon.x, p_WB[1] - pylon.y)
+    beside = np.asarray(away - pylon.diameter / 2 - min(size[:2]) / 2)
+    past = float(max(p_WB[2] - pylon.top, pylon.bottom - p_WB[2])) - size[2] / 2
+    return float(_signed(beside, past))
+
+
+def _signed(beside: Float[np.ndarray, "*cells"], past: float) -> Float[np.ndarray, "*cells"]:
+    """Signed distance of two upright cylinders from their gaps beside and past each other."""
+    outside = np.hypot(np.maximum(beside, 0), max(past, 0.0))
+    return np.asarray(outside + np.minimum(np.maximum(beside, past), 0))

@@ -29,6 +29,7 @@ class PidController(LeafSystem):
         input_ports:
         - X_WB
         - V_WB_B
+        - health
         output_ports:
         - F_Bo_B
 
@@ -56,6 +57,7 @@ class PidController(LeafSystem):
         self.P_yaw, self.D_yaw = 3.0 * inertia, 3.0 * inertia
         self.DeclareVectorInputPort("X_WB", 7)
         self.DeclareVectorInputPort("V_WB_B", 6)
+        self.health = self.DeclareVectorInputPort("health", 5)
         integral = self.DeclareDiscreteState(3)
         command = self.DeclareDiscreteState(6)
         self.DeclareStateOutputPort("F_Bo_B", command)
@@ -63,7 +65,13 @@ class PidController(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self.update)
 
     def update(self, context, state):
-        """Everything that changes is in the context; ports are read by name."""
+        """Everything that changes is in the context; ports are read by name.
+
+        The first number of `health` is 2 while the estimate is lost: there is nothing to hold then.
+        """
+        if self.health.HasValue(context) and np.asarray(self.health.Eval(context))[0] >= 2:
+            state.set_value(self.command, np.zeros(6))
+            return
         X_WB = np.asarray(self.GetInputPort("X_WB").Eval(context))
         V_WB_B = np.asarray(self.GetInputPort("V_WB_B").Eval(context))
         w, i, j, k = X_WB[:4]

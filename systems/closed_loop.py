@@ -9,7 +9,7 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import VectorLogSink
 
-from .controllers import Controller, Goal
+from .controllers import INPUTS, TOLD, Controller, Goal
 from .network import Port, flatten, holders
 from .signal_log import SignalLog, add_log
 from .station import CHEATS, check_stand_in, make_station
@@ -81,8 +81,9 @@ def build_diagram(
         check_stand_in(stand_in)
         plant = builder.AddNamedSystem("station", stand_in)
     control = controller.add_to(builder, station, goal)
-    for name in ("X_WB", "V_WB_B"):
-        builder.Connect(plant.GetOutputPort(name), control.GetInputPort(name))
+    for name in INPUTS | TOLD:
+        if name in INPUTS or (plant.HasOutputPort(name) and control.HasInputPort(name)):
+            builder.Connect(plant.GetOutputPort(name), control.GetInputPort(name))
     builder.Connect(control.GetOutputPort("F_Bo_B"), plant.GetInputPort("F_Bo_B"))
     truth = _truth(plant, control)
     for system in (plant, control):

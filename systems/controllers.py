@@ -1,7 +1,9 @@
 """Controllers by kind: each is a dataclass for YAML that adds itself to a diagram.
 
 A controller is any system with the input ports `X_WB` (7) and `V_WB_B` (6), the estimated state,
-and the output port `F_Bo_B` (6), the wrench it wants.
+and the output port `F_Bo_B` (6), the wrench it wants. With an input port `health` (5) it is told
+how good the estimate is (`systems.filtering.delayed.HEALTH`); those here ask for no wrench while it
+is lost (`systems.health_gate`).
 """
 
 import abc
@@ -21,6 +23,8 @@ from ..models.effects.extended import Extended, core
 from ..models.spinn import Spinn
 from ..models.vehicle import load_vehicle
 from .disturbance_observer import DisturbanceObserver, MomentumObserver
+from .filtering.delayed import HEALTH
+from .health_gate import HealthGate
 from .impedance import Impedance, ImpedanceGains, ImpedanceLaw
 from .mppi import Mppi
 from .mppi_config import MppiConfig
@@ -36,6 +40,9 @@ from .wrench_limits import ThrusterLimits
 
 INPUTS = {"X_WB": 7, "V_WB_B": 6}
 """Input ports of every controller and their sizes."""
+
+TOLD = {"health": len(HEALTH)}
+"""Input ports that a controller may have besides, connected if the station has them."""
 
 OUTPUTS = {"F_Bo_B": 6}
 """Output ports of every controller and their sizes; it may have more."""
@@ -62,7 +69,7 @@ class Controller(abc.ABC):
             UserError: it lacks a port, or a port has another size.
         """
         system = self.build(station, goal)
-        check_ports("controller", system, (INPUTS, OUTPUTS))
+        check_ports("controller", system, (INPUTS, OUTPUTS), (TOLD, {}))
         return builder.AddNamedSystem("controller", system)
 
 
@@ -148,10 +155,12 @@ class Tracking:
             systems.append(observer)
         if source.HasInputPort("X_WB"):
             systems.append(source)
+        gate = builder.AddNamedSystem("gate", HealthGate())
+        for name in INPUTS | TOLD:
+            builder.ExportInput(gate.GetInputPort(name), name)
         for name in INPUTS:
-            builder.ExportInput(systems[0].GetInputPort(name), name)
-            for system in systems[1:]:
-                builder.ConnectInput(name, system.GetInputPort(name))
+            for system in systems:
+                builder.Connect(gate.GetOutputPort(name), system.GetInputPort(name))
         if noise_period is not None:
             add_noise(builder, source, "noise", noise_period)
         builder.ExportOutput(impedance.GetOutputPort("F_Bo_B"), "F_Bo_B")

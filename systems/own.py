@@ -86,7 +86,7 @@ class OwnFilter(OwnSystem):
     """A state estimator of one's own in the place of the station's.
 
     It has the outputs `X_WB` and `V_WB_B`, and any of the station's `covariance`, `status` and
-    `health`; where it lacks one, the station shows NaN there (health: good). It is connected to
+    `health`; where it lacks one, the station shows NaN there, and good health. It is connected to
     those of `imu`, `dvl`, `depth`, `compass` (`systems.sensor_suite`), `pwm` and `initial_noise`
     that are among its inputs. Its constructor is given, if it has arguments of these names, the
     station's `vehicle`, its sensors' configurations `imu`, `dvl`, `depth`, `compass`, the start

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import MonteCarloSimulation, Simulator
-from pydrake.systems.framework import LeafSystem, System
+from pydrake.systems.framework import BasicVector, LeafSystem, System
 
 from helpers import ROOT
 from spinndrift.models.config import dump, loads
@@ -20,9 +20,11 @@ from spinndrift.systems.closed_loop import build_diagram, logged, seeded
 from spinndrift.systems.compiled import CompiledSimulator
 from spinndrift.systems.controllers import MppiImpedance, Own, Tracking, TrackReference
 from spinndrift.systems.filtering.delayed import EkfConfig
+from spinndrift.systems.health_gate import HealthGate
 from spinndrift.systems.mppi_config import MppiConfig
 from spinndrift.systems.obstacles import BoxHull, Cylinders, Pylon
 from spinndrift.systems.paths import HoldPose, PoseConfig
+from spinndrift.systems.pure import Event, Pure, shown
 from spinndrift.systems.station import make_station, station_ports
 from spinndrift.systems.station_config import Sensing, StationConfig
 
@@ -194,6 +196,17 @@ class Told(LeafSystem):
         self.DeclareVectorInputPort("V_WB_B", 6)
         self.DeclareVectorOutputPort("F_Bo_B", 6, lambda context, output: None)
 
+class Asks(LeafSystem):
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorInputPort("X_WB", 7)
+        self.DeclareVectorInputPort("V_WB_B", 6)
+        self.DeclareVectorInputPort("health", 5)
+        self.DeclareVectorOutputPort("F_Bo_B", 6, self.show, {self.GetInputPort("health").ticket()})
+
+    def show(self, context, output):
+        output.SetFromVector([*self.GetInputPort("health").Eval(context), 0.0])
+
 class Fails(LeafSystem):
     def __init__(self):
         raise RuntimeError("no link")
@@ -288,6 +301,63 @@ def test_another_system_can_stand_in_for_the_station():
     assert built.HasSubsystemNamed("station")
 
 
+class Flickers(LeafSystem):
+    """A station 0.2 m off the pose to be held, whose estimate is lost from 0.2 s to 0.4 s."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorInputPort("F_Bo_B", 6)
+        for name, value in (("X_WB", [1, 0, 0, 0, -0.2, 0, -1.5]), ("V_WB_B", [0] * 6)):
+            vector = BasicVector([float(x) for x in value])
+            self.DeclareStateOutputPort(name, self.DeclareDiscreteState(vector))
+        self.DeclareStateOutputPort("health", self.DeclareDiscreteState(5))
+        self.DeclarePeriodicDiscreteUpdateEvent(0.1, 0.0, self._update)
+
+    def _update(self, context, state):
+        state.set_value(2, np.full(5, 2.0 * (0.15 < context.get_time() < 0.35)))
+
+    def pure(self) -> Pure:
+        def update(t, state, inputs):
+            return {2: jnp.where((t > 0.15) & (t < 0.35), jnp.full(5, 2.0), jnp.zeros(5))}
+
+        names = ("X_WB", "V_WB_B", "health")
+        return Pure((Event(0.1, update),), {name: shown(i) for i, name in enumerate(names)})
+
+
+@pytest.mark.parametrize("make", [Simulator, CompiledSimulator])
+def test_nothing_is_asked_for_while_the_estimate_is_lost(make):
+    diagram = build_diagram(StationConfig(), HOLD, stand_in=Flickers())
+    simulator = make(diagram)
+    simulator.AdvanceTo(1.0)
+    logs = logged(diagram, simulator.get_mutable_context())
+    t, F = logs["F_Bo_B"].time, logs["F_Bo_B"].value
+    lost = (t > 0.22) & (t < 0.39)
+    np.testing.assert_array_equal(F[lost], 0)
+    before, after = (F[:, 0][part] for part in ((t > 0.01) & (t < 0.19), t > 0.42))
+    assert min(before.min(), after.min()) > 5  # N, back to its place
+    assert np.isfinite(logs["F_bias_Bo_W"].value).all()
+
+
+def test_a_controller_of_ones_own_is_told_the_health_if_it_asks(own):
+    logs = fly(build_diagram(StationConfig(), Own(f"{own}:Asks"), stand_in=Flickers()), 0.6, 0)
+    np.testing.assert_array_equal(logs["F_Bo_B"].value[:, :5], logs["health"].value)
+    assert np.ptp(logs["health"].value) == 2
+    quiet = build_diagram(StationConfig(), Own(f"{own}:Asks"), stand_in=Playback())
+    assert not logged(quiet, quiet.CreateDefaultContext())["F_Bo_B"].value.size
+
+
+def test_a_gate_takes_what_is_not_finite_for_lost():
+    gate = HealthGate()
+    context = gate.CreateDefaultContext()
+    gate.GetInputPort("X_WB").FixValue(context, np.eye(7)[0])
+    gate.GetInputPort("V_WB_B").FixValue(context, np.ones(6))
+    read = lambda: gate.GetOutputPort("V_WB_B").Eval(context)  # noqa: E731
+    np.testing.assert_array_equal(read(), 1)
+    for state, passes in ((0.0, True), (1.0, True), (2.0, False), (np.nan, False)):
+        gate.GetInputPort("health").FixValue(context, [state, 0, 0, 0, 0])
+        assert np.isfinite(read()).all() == passes
+
+
 def test_wrong_controllers_are_refused_with_a_remedy(tmp_path, own):
     (tmp_path / "wrong.py").write_text(
         "from pydrake.systems.primitives import PassThrough\n"
@@ -301,7 +371,7 @@ def test_wrong_controllers_are_refused_with_a_remedy(tmp_path, own):
         "nowhere.py:A": "no file",
         "no_such_module:A": "no module",
         f"{tmp_path / 'wrong.py'}:number": "no Drake system",
-        f"{own}:Fails": r"Fails failed with RuntimeError: no link \(.*within.py, line 15\)",
+        f"{own}:Fails": r"Fails failed with RuntimeError: no link \(.*within.py, line 26\)",
         f"{tmp_path / 'wrong.py'}:Wrong": "`X_WB` of size 7",
     }
     for system, message in cases.items():

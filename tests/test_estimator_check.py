@@ -118,6 +118,7 @@ def test_every_setting_is_a_scenario_that_comes_back_from_its_file():
         assert again == setting.scenario
         for fault in setting.scenario.station.sensing.faults:
             assert (fault.start, setting.name.split("_")[0]) == (10.0, fault.sensor)
+    assert chosen(["depth_j*", "consistency"]) == [*names[:7], "depth_jump"]
     kinds = {f.fault for s in settings for f in s.scenario.station.sensing.faults}
     assert kinds >= {"nan", "infinite", "offset", "frozen", "latency", "dropout", "frozen_stamp"}
 
@@ -180,7 +181,7 @@ def test_the_command_flies_and_tells(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"only": ("sonar*",)}, r"--only sonar\*: fits none of calm, harbour"),
+        ({"only": ("sonar*",)}, r"--only sonar\*: fits none of consistency, faults, calm"),
         ({"runs": 0}, "--runs 0: give at least 1"),
         ({"fault_seconds": float("nan")}, "--fault-seconds nan: give a time"),
         ({"workers": -1}, "--workers -1"),

@@ -22,7 +22,8 @@ class CheckEstimator:
     """
 
     only: tuple[str, ...] = ()
-    """Patterns of the names of settings to fly (`calm waves 'dvl_*'`); by default all."""
+    """Patterns of the names of settings to fly (`calm 'dvl_*'`), or `consistency` or `faults` for
+    all of one kind; by default both."""
     runs: int = 60
     """Runs of each setting with healthy sensors."""
     seconds: float = 60.0

@@ -52,16 +52,23 @@ class Setting:
 
 
 def chosen(only: Sequence[str]) -> list[str]:
-    """Names of the settings that fit one of the patterns, all without a pattern.
+    """Names of the settings that fit a pattern, or whose table's name does; all without a pattern.
 
     Raises:
         UserError: a pattern fits none.
     """
-    names = [*_WATERS, *(name for name, _, _ in _faults(0.0))]
-    for pattern in only:
-        if not any(fnmatchcase(name, pattern) for name in names):
-            raise UserError(f"--only {pattern}: fits none of {', '.join(names)}")
-    return [n for n in names if not only or any(fnmatchcase(n, pattern) for pattern in only)]
+    table = dict.fromkeys(_WATERS, "consistency") | {name: "faults" for name, *_ in _faults(0.0)}
+
+    def fit(pattern: str) -> list[str]:
+        names = [n for n, t in table.items() if fnmatchcase(n, pattern) or t == pattern]
+        if not names:
+            raise UserError(
+                f"--only {pattern}: fits none of consistency, faults, {', '.join(table)}"
+            )
+        return names
+
+    found = {name for pattern in only or ("*",) for name in fit(pattern)}
+    return [name for name in table if name in found]
 
 
 def consistency_settings(names: Sequence[str], seconds: float, model: Path | None) -> list[Setting]:

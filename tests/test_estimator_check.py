@@ -99,6 +99,7 @@ def test_a_run_that_breaks_off_counts_as_not_finite():
     run = flown(2.0)
     found = score(run._replace(scenario=healthy(4.0).scenario))
     assert found["finite"] == 0
+    assert not within_three_sigma(stacked([found])).any()
     assert found["nees"].shape == (81, 3)
     assert np.isnan(found["nees"][41:]).all()
     bad = run.log["X_WB_estimate"].copy()

@@ -39,11 +39,13 @@ class FlySetting:
     Attributes:
         out: folder; the file is `<table>/<name>.npz`.
         runs: of each setting, by its table.
+        revision: of the sources.
         engine: as `sims.run_loop.simulate` has it.
     """
 
     out: str
     runs: dict[str, int]
+    revision: str = ""
     engine: Engine = "auto"
 
     def path(self, setting: Setting) -> Path:
@@ -68,7 +70,7 @@ class FlySetting:
             if run.outcome.reason == "interrupted":
                 raise KeyboardInterrupt
             found.append(score(run, setting.scenario.duration / 3))
-        made = self._made(setting) | {"revision": revision() or ""}
+        made = self._made(setting) | {"revision": self.revision}
         with atomic_path(self.path(setting)) as partial, partial.open("wb") as file:
             arrays: dict[str, Any] = {"made": np.array(json.dumps(made)), **stacked(found)}
             np.savez_compressed(file, **arrays)
@@ -120,7 +122,7 @@ def run_settings(
     Raises:
         UserError: what is on disk is of other settings.
     """
-    work = FlySetting(str(Path(out).absolute()), runs, engine)
+    work = FlySetting(str(Path(out).absolute()), runs, revision() or "", engine)
     left = [setting for setting in settings if work.result(setting) is None]
     failed = []
     if left and workers == 0:

@@ -25,8 +25,8 @@ def score(run: Run, start: float = 0.0) -> Scores:
     - `nees` (n, 3): of position, attitude, velocity;
     - `nis` (n, 3): of the readings of `FUSED` that were fused at that time, NaN where none was;
     - `taken`, `gated` (3): readings that were fused and that were rejected;
-    - `error` (9), `covariance` (27): at the end; `length`: of the path (m); `finite`: 1 if the
-      estimate was always finite and the run came to its end;
+    - `error` (9), `covariance` (27): at the end, NaN if the run broke off; `length`: of the path
+      (m); `finite`: 1 if the estimate was always finite and the run came to its end;
     - `health` (n, 5), where the filter tells it, and `health_after` (6): the worst state after
       `start` (s), 1 where a sensor was doubted after it, and the last state.
     """
@@ -38,16 +38,16 @@ def score(run: Run, start: float = 0.0) -> Scores:
     nis, rejected = log["nis"], log["rejected"]
     new = _changed(nis) | _changed(rejected)
     fused, gated = new & (rejected == 0) & np.isfinite(nis), new & (rejected > 0)
-    claimed = log["error_covariance"]
+    claimed, whole = log["error_covariance"], len(error) == n
     found = {
         "nees": _to_length(nees(log), n),
         "nis": _to_length(np.where(fused, nis, np.nan), n),
         "taken": fused.sum(axis=0),
         "gated": gated.sum(axis=0),
-        "error": error[-1],
-        "covariance": claimed[-1],
+        "error": error[-1] if whole else np.full(9, np.nan),
+        "covariance": claimed[-1] if whole else np.full(27, np.nan),
         "length": np.linalg.norm(steps, axis=1).sum(),
-        "finite": len(error) == n and np.isfinite(error).all() and np.isfinite(claimed).all(),
+        "finite": whole and np.isfinite(error).all() and np.isfinite(claimed).all(),
     }
     if "health" in log:
         after = log["health"][min(np.searchsorted(log.time, start), len(error) - 1) :]

@@ -313,12 +313,13 @@ def _few_collections() -> Iterator[None]:
 
 @contextmanager
 def _stop_on_interrupt() -> Iterator[threading.Event]:
-    """Turn the first Ctrl-C into an event; outside the main thread signals stay as they are."""
+    """Turn the first Ctrl-C into an event, in the main thread and unless the caller ignores it."""
     event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
+    former = signal.getsignal(signal.SIGINT)
+    main = threading.current_thread() is threading.main_thread()
+    if not main or former is signal.SIG_IGN:
         yield event
         return
-    former = signal.getsignal(signal.SIGINT)
 
     def stop(*_: object) -> None:
         event.set()

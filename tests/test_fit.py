@@ -160,6 +160,7 @@ def test_a_kill_costs_the_steps_since_the_checkpoint_alone(windows, tmp_path):
     np.testing.assert_array_equal(resumed.metrics["step"], np.arange(12))
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_ends_the_step_and_leaves_a_checkpoint(windows, tmp_path):
     before = signal.getsignal(signal.SIGINT)
     seen = []

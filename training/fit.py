@@ -369,12 +369,16 @@ def _validation_loss(
 
 @contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Note the first Ctrl-C only, so that it can't split a step; a second one interrupts."""
+    """Note the first Ctrl-C only, so that it can't split a step; a second one interrupts.
+
+    Where the caller has Ctrl-C ignored, as shells do for what runs in the background, it stays so.
+    """
     noted: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
+    previous = signal.getsignal(signal.SIGINT)
+    main = threading.current_thread() is threading.main_thread()
+    if not main or previous is signal.SIG_IGN:
         yield lambda: False
         return
-    previous = signal.getsignal(signal.SIGINT)
 
     def note(number: int, frame: Any) -> None:
         noted.append(number)

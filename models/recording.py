@@ -16,7 +16,7 @@ import xarray as xr
 from jaxtyping import Array
 
 from .errors import UserError
-from .files import atomic_path
+from .netcdf import save_netcdf
 from .recording_build import Trajectory, assemble, window
 from .recording_schema import (
     COMMANDS,
@@ -398,8 +398,7 @@ class Recording:
             for name, variable in self.dataset.data_vars.items()
             if variable.ndim >= 3
         }
-        with atomic_path(path) as partial:
-            self.dataset.to_netcdf(partial, engine="h5netcdf", encoding=encoding)
+        save_netcdf(self.dataset, path, encoding)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "Recording":
@@ -418,7 +417,7 @@ class Recording:
             raise UserError(
                 f"{path}: can't be read as NetCDF-4 ({error}); write it again with `save`"
             ) from error
-        if not str(dataset.attrs.get("format", "")).startswith(FORMAT.rsplit(" ", 1)[0]):
+        if not _is_recording(dataset):
             raise UserError(f"{path}: a NetCDF file, but no recording (see docs/recording.md)")
         if dataset.attrs["format"] != FORMAT:
             raise UserError(
@@ -429,11 +428,25 @@ class Recording:
         except ValueError as error:
             raise UserError(f"{path}: {error}") from error
 
+    @staticmethod
+    def is_one(path: Path) -> bool:
+        """Whether a file says that `save` wrote it, whatever else is wrong with it."""
+        try:
+            with xr.open_dataset(path, engine="h5netcdf") as opened:
+                return _is_recording(opened)
+        except (OSError, ValueError, KeyError):
+            return False
+
     def summary(self) -> str:
         """Return a few lines that tell a person what is inside."""
         from .recording_summary import summarize
 
         return summarize(self)
+
+
+def _is_recording(dataset: xr.Dataset) -> bool:
+    """Of this version's format or another's."""
+    return str(dataset.attrs.get("format", "")).startswith(FORMAT.rsplit(" ", 1)[0])
 
 
 def _check_fraction(held_out: float) -> None:

@@ -5,11 +5,12 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from types import FrameType
 from typing import Protocol, runtime_checkable
 
 from ..models.errors import UserError
+from ..models.files import DISK_ERRORS
 
 _DESCRIPTION = """Learned stochastic dynamics and control for underwater vehicles.
 
@@ -37,6 +38,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _fail("spinndrift: interrupted; what is on disk is whole", 130)
     except BrokenPipeError:
         sys.exit(141)
+    except OSError as error:
+        if error.errno not in DISK_ERRORS:
+            raise
+        where = error.filename or "a file"
+        _fail(f"spinndrift: {where}: can't be written ({error.strerror}); make room there", 2)
 
 
 @contextmanager
@@ -87,16 +93,15 @@ def _run(given: list[str]) -> None:
     command = _parsed(given)
     import jax
 
-    from ..models.files import check_writable
     from .compile_cache import keep_compiled
 
     keep_compiled()
     jax.config.update("jax_enable_x64", True)
     # Small programs then run in line: a call from a diagram costs 10 µs instead of up to 40.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    if (out := getattr(command, "out", None)) is not None:
-        check_writable(out, "--out")
-    command.run()
+    place = getattr(command, "place", nullcontext)  # those without choose a name as they run
+    with place():
+        command.run()
 
 
 def _parsed(given: list[str]) -> _Command:

@@ -1,18 +1,24 @@
 """The main job in one go: log, learned model, held-out error, closed-loop dive, one report."""
 
+import itertools
 import json
-import shutil
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ..models.errors import UserError
 from ..models.files import atomic_path
+from ..models.owned import FolderKind, ForeignError, run_folder
 from ..models.recording import Recording
 from ..models.vehicle import Vehicle, load_vehicle
+from ..systems.closed_loop import build_diagram
+from ..systems.controllers import MppiImpedance
 from ..systems.mavlink.logs import load_data
 from ..training.config import TrainingConfig
+from ..training.run_folder import TRAINING, CheckpointError
 from .figures_path import path_figure, samples_figure
 from .figures_time import progress_figure, tracking_figure
 from .learning import Learned, learn
@@ -20,12 +26,17 @@ from .learning_report import add_data, add_evaluation, add_training
 from .metrics import clearance
 from .pages import Page
 from .progress import progress_bar
-from .run_folder import scene, write_run
+from .run_folder import RUN, scene, write_files
 from .run_loop import Run, simulate
+from .run_signals import log_periods
 from .scenario import Scenario
 
 EMBEDDED = Path(__file__).with_name("data") / "sitl_dive.tlog.xz"
 """The log that comes along."""
+DEMO = FolderKind("demo", ("recording.nc", "report.html", "summary.json"))
+"""What a demo writes beside the folders of its training and its dive."""
+DEFAULT = Path("runs/demo")
+_USUAL = "bluerov2_heavy"
 _NORMS = ("position", "rotation", "linear_velocity", "angular_velocity")
 _UNITS = ("m", "rad", "m/s", "rad/s")
 
@@ -41,33 +52,79 @@ def demo(
 
     Files: recording.nc, training/ (as `spinndrift train`), dive/ (as `spinndrift run`),
     report.html, summary.json. Training that an earlier demo of the same log began is continued.
+    `out` is held by the caller (`demo_folder`).
 
     Raises:
-        UserError: the log can't be used; the sentence says why.
+        UserError: the log or the scenario can't be used; the sentence says why.
     """
     began = time.monotonic()
+    if vehicle_name is not None:
+        load_vehicle(vehicle_name)
     with progress_bar(f"1/4 reading {source.name}") as update:
         recording = load_data(source, vehicle=vehicle_name, progress=update)
-    vehicle = load_vehicle(recording.vehicle or "bluerov2_heavy")
+    stated = recording.vehicle or _USUAL
+    vehicle = load_vehicle(stated)
+    scenario = replace(scenario, station=replace(scenario.station, vehicle=stated, model=None))
+    _check_flies(scenario)
     recording.save(out / "recording.nc")
     with progress_bar("2/4 training") as update:
         learned = _learn(recording, vehicle, config, out / "training", update)
     model = out / "training" / "model.spinn"
     scenario = scenario.with_changes(model=model)
-    station = replace(scenario.station, vehicle=vehicle.name, model=model)
-    scenario = replace(scenario, station=station)
+    scenario = replace(scenario, station=replace(scenario.station, model=model))
     with progress_bar("3/4 flying") as update:
         run = simulate(scenario, update)
     if run.outcome.reason == "interrupted":
         raise KeyboardInterrupt
     with progress_bar("4/4 writing the report"):
-        shutil.rmtree(out / "dive", ignore_errors=True)
-        values = write_run(run, out / "dive")
+        values = write_files(run, out / "dive")
         _page(source, recording, vehicle, learned, run, values).write(out / "report.html")
     found = _summary(learned, values, time.monotonic() - began)
     with atomic_path(out / "summary.json") as partial:
         partial.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
     return _words(found, out)
+
+
+@contextmanager
+def demo_folder(out: Path | None) -> Iterator[Path]:
+    """Hold the folder of a demo, and those of its training and its dive.
+
+    Args:
+        out: the folder; None takes runs/demo, or runs/demo-2 and so on where that is foreign.
+
+    Raises:
+        UserError: as `run_folder`, of one of them.
+    """
+    with ExitStack() as held:
+        if out is None:
+            out = _own_or_free(held, DEFAULT)
+        else:
+            held.enter_context(run_folder(out, DEMO))
+        held.enter_context(run_folder(out / "training", TRAINING))
+        held.enter_context(run_folder(out / "dive", RUN))
+        yield out
+
+
+def _own_or_free(held: ExitStack, first: Path) -> Path:
+    for count in itertools.count(1):
+        out = first if count == 1 else first.with_name(f"{first.name}-{count}")
+        try:
+            return held.enter_context(run_folder(out, DEMO))
+        except ForeignError:
+            continue
+    raise AssertionError  # never: counting has no end
+
+
+def _check_flies(scenario: Scenario) -> None:
+    """Refuse a scenario that can't be flown, by building its loop about the untrained vehicle."""
+    controller = scenario.controller
+    if not isinstance(controller, MppiImpedance):
+        raise UserError(
+            f"--scenario: {scenario.name} is steered by {type(controller).__name__}, which does "
+            "not plan with a model; choose a scenario with MppiImpedance"
+        )
+    untrained = replace(controller, model=None, vehicle=None)
+    build_diagram(scenario.station, untrained, log_periods=log_periods(scenario))
 
 
 def _learn(
@@ -76,10 +133,7 @@ def _learn(
     """Continue the training in `out` if it is one of these data and settings, else begin anew."""
     try:
         return learn(recording, vehicle, config, out, resume=True, progress=update)
-    except UserError:
-        if not (out / "checkpoint.npz").exists():
-            raise
-        shutil.rmtree(out)
+    except CheckpointError:
         return learn(recording, vehicle, config, out, progress=update)
 
 

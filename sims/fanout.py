@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, TypeVar
 
 from ..models.errors import UserError
@@ -42,6 +43,24 @@ def run_here(
         except Exception as error:  # noqa: BLE001 - whatever it was, other tasks don't depend on it
             failed.append(Failed(task, f"{type(error).__name__}: {error}"))
     return failed
+
+
+def check_workers(address: str | None, workers: int) -> None:
+    """Refuse workers that tasks can't be given to, before anything is written for them.
+
+    Raises:
+        UserError: Dask is not installed, nothing answers at the address, a negative number, or both
+            an address and a number.
+    """
+    if workers < 0:
+        raise UserError(f"--workers {workers}: give 0 for this process, or a number of processes")
+    if address is not None and workers > 0:
+        raise UserError("--workers: the scheduler of --cluster has its own; leave one out")
+    if workers > 0:
+        _distributed()
+    if address is not None:
+        with _client(address, 0):
+            return
 
 
 def run_on_cluster(
@@ -90,12 +109,8 @@ def run_on_cluster(
 
 @contextmanager
 def _client(address: str | None, workers: int) -> Iterator[Any]:
-    try:
-        from distributed import Client, LocalCluster
-    except ImportError as error:
-        raise UserError(
-            "a cluster needs Dask, which is not installed: pip install 'spinndrift[cluster]'"
-        ) from error
+    distributed = _distributed()
+    Client, LocalCluster = distributed.Client, distributed.LocalCluster
     if address is not None:
         try:
             client = Client(address, timeout=5, set_as_default=False)
@@ -107,8 +122,6 @@ def _client(address: str | None, workers: int) -> Iterator[Any]:
         with client:
             yield client
         return
-    if workers < 1:
-        raise UserError(f"workers is {workers}: give at least 1")
     with (
         LocalCluster(
             n_workers=workers,
@@ -121,3 +134,13 @@ def _client(address: str | None, workers: int) -> Iterator[Any]:
         Client(cluster, set_as_default=False) as client,
     ):
         yield client
+
+
+def _distributed() -> ModuleType:
+    try:
+        import distributed
+    except ImportError as error:
+        raise UserError(
+            "a cluster needs Dask, which is not installed: pip install 'spinndrift[cluster]'"
+        ) from error
+    return distributed

@@ -13,12 +13,14 @@ from ..models.dynamics import Dynamics
 from ..models.effects.extended import Extended, core
 from ..models.errors import UserError
 from ..models.integrate import cast
+from ..models.owned import claim
 from ..models.recording import Recording
 from ..models.rigid_body import FossenDynamics
 from ..models.vehicle import Vehicle
 from ..training.config import TrainingConfig, WindowConfig
 from ..training.evaluate import Evaluation, evaluate
 from ..training.fit import TrainingResult, fit
+from ..training.run_folder import TRAINING
 from ..training.start import begun_with, estimate_diffusion, starting_model, with_diffusion
 from ..training.windows import Normalisation, Windows, make_windows
 
@@ -164,11 +166,13 @@ def learn(
     `preset.spinn`. With `resume` a run that has a checkpoint goes on from both.
 
     Raises:
-        UserError: the data don't suffice; the sentence says what is missing.
+        UserError: the data don't suffice; the sentence says what is missing. Or `out` holds what
+            this package did not write.
     """
     given = None if start is None else start.model
     config = begun_with(config, given)
     parts = split_parts(recording, vehicle, config.windows, given)
+    claim(out, TRAINING)
     kept = out / "start.spinn"
     if resume and kept.exists() and (out / "checkpoint.npz").exists():
         model, _ = load_model(kept)
@@ -185,7 +189,7 @@ def learn(
     preset = judged(vehicle.dynamics(), parts.learn)
     substeps = config.objective.substeps
     metadata: dict[str, Any] = {
-        "vehicle": vehicle.name,
+        "vehicle": recording.vehicle or vehicle.name,  # of a file its path: the name finds none
         "source": recording.dataset.attrs.get("source", ""),
         "dt": recording.dt,
         "substeps": substeps,

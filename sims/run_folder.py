@@ -1,10 +1,10 @@
-"""A run on disk: a folder that appears whole."""
+"""A run on disk: a folder whose files appear together."""
 
+import itertools
 import json
 import os
-import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from ..models import config
-from ..models.errors import UserError
-from ..models.files import partial_folder
+from ..models.files import atomic_files
+from ..models.locks import BusyError
+from ..models.owned import FolderKind, run_folder
 from ..systems.wrench_limits import ThrusterLimits
 from ..training.provenance import revision
 from .criteria import ReachGoal
@@ -25,9 +26,12 @@ from .report import PACKAGES, run_page
 from .run_loop import Run
 from .scenario import Scenario
 
+RUN = FolderKind("run", ("scenario.yaml", "log.nc", "metrics.json", "report.html", "meshcat.html"))
+"""What `spinndrift run` writes."""
+
 
 def write_run(run: Run, folder: str | os.PathLike[str], report: bool = True) -> dict[str, Any]:
-    """Write a run as a new folder, which appears when all of it is there, and return its metrics.
+    """Write a run as a new folder and return its metrics.
 
     `scenario.yaml` (defaults written out), `log.nc` (a recording), `metrics.json`, and with
     `report` also `report.html` and `meshcat.html`. But for the block `timing` the metrics of equal
@@ -36,8 +40,14 @@ def write_run(run: Run, folder: str | os.PathLike[str], report: bool = True) -> 
     Raises:
         UserError: the folder exists and is not empty, or can't be made.
     """
+    with run_folder(folder, RUN, "", new=True) as held:
+        return write_files(run, held, report)
+
+
+def write_files(run: Run, folder: Path, report: bool = True) -> dict[str, Any]:
+    """The same into a folder that is held (`run_folder`): all files take their places at once."""
     values = run_metrics(run)
-    with atomic_folder(folder) as partial:
+    with atomic_files(folder) as partial:
         (partial / "scenario.yaml").write_text(config.dump(run.scenario), encoding="utf-8")
         run.log.save(partial / "log.nc")
         text = json.dumps(values, indent=2, allow_nan=False, ensure_ascii=False)
@@ -97,40 +107,30 @@ def report_page(run: Run, values: dict[str, Any], replay: str = "") -> Page:
     )
 
 
-def free_folder(parent: str | os.PathLike[str], scenario: Scenario) -> Path:
-    """The first of <name>-<seed>, <name>-<seed>-2, … in `parent` that doesn't exist yet."""
-    first = Path(parent) / f"{scenario.name}-{scenario.seed}"
-    path, count = first, 1
-    while path.exists():
-        count += 1
-        path = first.with_name(f"{first.name}-{count}")
-    return path
-
-
-def check_free(folder: str | os.PathLike[str]) -> None:
-    """Refuse a folder that `write_run` would refuse, before anything is simulated.
-
-    Raises:
-        UserError: the path is a file or a folder with something in it.
-    """
-    path = Path(folder)
-    if path.exists() and not path.is_dir():
-        raise UserError(f"{path} is a file; name a folder that doesn't exist yet")
-    if path.is_dir() and any(path.iterdir()):
-        raise UserError(f"{path} is not empty; name a folder that doesn't exist yet")
-
-
 @contextmanager
-def atomic_folder(folder: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary sibling folder that becomes `folder` when the block ends.
-
-    On an error or an interrupt nothing is left behind.
+def new_folder(
+    out: str | os.PathLike[str] | None, scenario: Scenario, parent: str | os.PathLike[str] = "runs"
+) -> Iterator[Path]:
+    """Hold a new folder for a run: `out`, or the first free of <name>-<seed>, <name>-<seed>-2, ….
 
     Raises:
-        UserError: the folder exists and is not empty, or can't be made.
+        UserError: `out` exists and is not empty, or it can't be made.
     """
-    final = Path(folder)
-    check_free(final)
-    with partial_folder(final.with_name(f".partial-{secrets.token_hex(8)}"), final) as partial:
-        yield partial
-        os.replace(partial, final)
+    with ExitStack() as stack:
+        if out is not None:
+            yield stack.enter_context(run_folder(out, RUN, new=True))
+            return
+        names = (f"{scenario.name}-{scenario.seed}{end}" for end in _endings())
+        for path in (Path(parent) / name for name in names):
+            if os.path.lexists(path):
+                continue
+            try:
+                yield stack.enter_context(run_folder(path, RUN, "", new=True))
+            except BusyError:  # another process was as fast
+                continue
+            return
+
+
+def _endings() -> Iterator[str]:
+    yield ""
+    yield from (f"-{count}" for count in itertools.count(2))

@@ -2,8 +2,11 @@
 
 import importlib.util
 import os
+import resource
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -19,6 +22,17 @@ def shared_data(*parts: str) -> Path:
     if not path.exists():
         pytest.skip(f"needs {Path('shared', *parts)} beside the checkout")
     return path
+
+
+@contextmanager
+def full_disk(size: int = 0) -> Iterator[None]:
+    """No file of this process may grow beyond `size` bytes: an `OSError` as of a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def module_files(*rooms: str) -> dict[str, Path]:

@@ -6,11 +6,12 @@ import re
 import numpy as np
 import pytest
 
-from helpers import run_python
+from helpers import full_disk, run_python
 from spinndrift.models import config as yaml
 from spinndrift.models.checkpoint import load_model, save_model
 from spinndrift.models.effects.extended import Extended, core
 from spinndrift.models.effects.library import kind
+from spinndrift.models.owned import MARKER
 from spinndrift.models.recording import Recording
 from spinndrift.models.spinn import Spinn, SpinnConfig
 from spinndrift.models.vehicle import load_vehicle
@@ -23,6 +24,7 @@ from spinndrift.training.config import (
     WindowConfig,
 )
 from spinndrift.training.losses import Mse
+from spinndrift.training.run_folder import TRAINING
 
 TINY = TrainingConfig(
     objective=Mse(),
@@ -41,6 +43,10 @@ TINY = TrainingConfig(
 COMMANDS = (
     "import", "generate", "train", "evaluate", "run", "diagnose", "check", "study", "demo",
 )  # fmt: skip
+GENERATED = (
+    "--maneuvers", "surge-forward", "yaw-left", "--disturbances", "calm", "--trajectories", "3",
+    "--duration", "2", "--substeps", "2",
+)  # fmt: skip
 
 
 def called(*arguments):
@@ -56,11 +62,7 @@ def called(*arguments):
 def generated(tmp_path_factory):
     folder = tmp_path_factory.mktemp("generated")
     path = folder / "tiny.nc"
-    code = called(
-        "generate", "--out", path, "--maneuvers", "surge-forward", "yaw-left", "--disturbances",
-        "calm", "--trajectories", "3", "--duration", "2", "--substeps", "2",
-    )  # fmt: skip
-    assert code is None
+    assert called("generate", "--out", path, *GENERATED) is None
     return path
 
 
@@ -131,6 +133,7 @@ def test_an_error_in_a_fresh_process_has_exit_code_two():
     assert run_python(code).split() == ["2", "1"]
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_while_modules_are_imported_has_exit_code_130():
     code = (
         "import os, signal, subprocess, sys, time\n"
@@ -164,6 +167,17 @@ def test_generate_writes_what_was_asked_for(generated):
     assert np.all(surge > 0.1)
 
 
+def test_a_disk_that_is_full_in_the_end_is_told_and_the_old_file_stays(generated, capsys):
+    before = generated.read_bytes()
+    with full_disk(len(before) // 2):
+        assert called("generate", "--out", generated, *GENERATED) == 2
+    told = capsys.readouterr().err.splitlines()
+    assert [line for line in told if "can't be written (File too large); make room" in line]
+    assert generated.read_bytes() == before
+    assert [path.name for path in generated.parent.iterdir()] == [generated.name]
+    assert called("generate", "--out", generated, *GENERATED) is None  # it is one of ours
+
+
 def test_pieces_too_short_to_train_on_are_told_with_the_remedy(generated, tmp_path, capsys):
     out = tmp_path / "run"
     assert called("train", generated, "--out", out) == 2
@@ -185,13 +199,21 @@ def test_train_resume_and_evaluate(generated, tmp_path, capsys, monkeypatch):
     assert "data:image" in report
     assert called("train", generated, "--config", settings, "--out", out) == 2
     assert "--resume" in capsys.readouterr().err
+    assert {p.name for p in out.iterdir()} <= {*TRAINING.files, MARKER}
+    (out / "mine.txt").write_text("mine")
     more = ("--resume", "--steps", "6")
     monkeypatch.setattr("spinndrift.sims.learning.starting_model", None)  # that work is done
     assert called("train", generated, "--config", settings, "--out", out, *more) is None
     assert len((out / "metrics.csv").read_text().splitlines()) == 7
+    assert (out / "mine.txt").read_text() == "mine"
+    (out / "report.html").write_text("mine")
+    assert called("train", generated, "--config", settings, "--out", out, *more) == 2
+    assert "report.html in it was changed" in capsys.readouterr().err
+    assert (out / "report.html").read_text() == "mine"
     results = tmp_path / "results.json"
     arguments = (out / "model.spinn", generated, "--length", "0.5", "--out", results)
-    assert called("evaluate", *arguments) is None
+    for _ in range(2):  # a second time onto its own
+        assert called("evaluate", *arguments) is None
     overall = json.loads(results.read_text())
     assert set(overall) == {"preset", "learned"}
     assert 0 < overall["learned"]["rmse_position"] < 1

@@ -5,10 +5,14 @@ from dataclasses import replace
 
 from test_cli import TINY
 
-from spinndrift.sims.demo import EMBEDDED, demo
+from spinndrift.models.owned import MARKER
+from spinndrift.sims.demo import DEMO, EMBEDDED, demo, demo_folder
+from spinndrift.sims.run_folder import RUN
+from spinndrift.sims.run_loop import simulate
 from spinndrift.sims.scenario import load_scenario
 from spinndrift.systems.mavlink.logs import load_data
 from spinndrift.training.config import DriftConfig
+from spinndrift.training.run_folder import TRAINING
 
 SMALL = """
 duration: 0.5
@@ -18,13 +22,21 @@ controller: !MppiImpedance
 """
 
 
-def test_demo_tells_the_whole_story(tmp_path):
+def test_demo_tells_the_whole_story(tmp_path, monkeypatch):
     source = tmp_path / "short.nc"
     load_data(EMBEDDED).cut(0.0, 12.0).save(source)
     out = tmp_path / "demo"
     scenario = load_scenario("pylon_crossing_calm", SMALL)
     tiny = replace(TINY, drift=DriftConfig(iterations=0))  # test_cli has the fitted start
-    told = demo(source, out, scenario, tiny)
+    flown = []
+
+    def simulated(*given):
+        flown.append(simulate(*given))
+        return flown[0]
+
+    monkeypatch.setattr("spinndrift.sims.demo.simulate", simulated)
+    with demo_folder(out):
+        told = demo(source, out, scenario, tiny)
     assert "preset" in told
     assert "dive:" in told
     found = json.loads((out / "summary.json").read_text())
@@ -34,3 +46,18 @@ def test_demo_tells_the_whole_story(tmp_path):
     for section in ("The data", "Training", "Held-out error", "The dive"):
         assert section in report
     assert (out / "dive" / "meshcat.html").stat().st_size > 1e6
+    for folder, kind in ((out, DEMO), (out / "training", TRAINING), (out / "dive", RUN)):
+        assert {p.name for p in folder.iterdir() if p.is_file()} <= {*kind.files, MARKER}
+        (folder / "mine").mkdir()
+        (folder / "mine" / "notes.txt").write_text("mine")
+    # again: the training goes on where it was, the dive is replaced, what is foreign stays
+    monkeypatch.setattr("spinndrift.sims.learning.starting_model", None)
+    monkeypatch.setattr("spinndrift.sims.demo.simulate", lambda *_: flown[0])
+    report = (out / "dive" / "report.html").stat()
+    checkpoint = (out / "training" / "checkpoint.npz").read_bytes()
+    with demo_folder(out):
+        demo(source, out, scenario, tiny)
+    assert (out / "training" / "checkpoint.npz").read_bytes() == checkpoint
+    assert (out / "dive" / "report.html").stat().st_ino != report.st_ino
+    for folder in (out, out / "training", out / "dive"):
+        assert (folder / "mine" / "notes.txt").read_text() == "mine"

@@ -4,11 +4,22 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from killing import killed, litter
 from test_cli import called
 
+from spinndrift.models.owned import MARKER
 from spinndrift.models.recording import Recording, Trajectory
 
-FILES = {"diagnosis.json", "diagnosis.schema.json", "extended/model.spinn", "report.html"}
+PREPARE = """
+from types import SimpleNamespace
+import spinndrift.sims.diagnosis_report, spinndrift.training.diagnosis.diagnose
+from test_diagnose_command import Told
+spinndrift.training.diagnosis.diagnose.diagnose = lambda recording, vehicle, *_: SimpleNamespace(
+    diagnosis=Told(), extended=vehicle.dynamics()
+)
+spinndrift.sims.diagnosis_report.diagnosis_page = lambda *_: Told()
+"""
+FILES = {MARKER, "diagnosis.json", "diagnosis.schema.json", "extended/model.spinn", "report.html"}
 
 
 class Told:
@@ -17,22 +28,22 @@ class Told:
     sentence = "Nothing differs."
     causes = ()
 
-    def __init__(self, fault=None):
-        self.fault = fault
+    def __init__(self, fault=None, words="new"):
+        self.fault, self.words = fault, words
 
     def save(self, path):
-        path.write_text("new")
+        path.write_text(self.words)
 
     def write(self, path):
         if self.fault is not None:
             raise self.fault
-        path.write_text("new")
+        path.write_text(self.words)
 
 
 @pytest.fixture
 def diagnosing(monkeypatch):
-    def stand_in(fault=None):
-        told = Told(fault)
+    def stand_in(fault=None, words="new"):
+        told = Told(fault, words)
 
         def diagnose(recording, vehicle, *_):
             assert vehicle.name == "bluerov2_heavy"
@@ -75,14 +86,25 @@ def test_an_interrupt_while_writing_leaves_the_folder_as_it_was(tmp_path, diagno
     data, out = recorded(tmp_path / "still.nc", "bluerov2_heavy"), tmp_path / "out"
     assert called("diagnose", data, "--out", out) == 130
     assert not out.exists()
-    out.mkdir()
-    for name in ("diagnosis.json", "mine.txt"):
-        (out / name).write_text("old")
+    diagnosing(words="old")
+    assert called("diagnose", data, "--out", out) is None
+    (out / "mine.txt").write_text("mine")
+    before = {name: (out / name).read_bytes() for name in files(out)}
+    diagnosing(KeyboardInterrupt())
     assert called("diagnose", data, "--out", out) == 130
-    assert files(out) == {"diagnosis.json", "mine.txt"}
-    assert (out / "diagnosis.json").read_text() == "old"
+    assert {name: (out / name).read_bytes() for name in files(out)} == before
     assert "what is on disk is whole" in capsys.readouterr().err
     diagnosing()
     assert called("diagnose", data, "--out", out) is None
     assert files(out) == FILES | {"mine.txt"}
     assert (out / "diagnosis.json").read_text() == "new"
+
+
+def test_a_diagnosis_that_is_killed_as_it_writes_is_made_anew(tmp_path, diagnosing):
+    data, out = recorded(tmp_path / "still.nc", "bluerov2_heavy"), tmp_path / "out"
+    killed("report.html", 1, PREPARE, "diagnose", data, "--out", out)
+    assert len(litter(tmp_path)) == 2
+    diagnosing()
+    assert called("diagnose", data, "--out", out) is None
+    assert files(out) == FILES
+    assert litter(tmp_path) == []

@@ -1,5 +1,6 @@
 """Whatever goes wrong while a file is written, the old one stays and nothing else is left."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -54,10 +55,11 @@ def test_a_fault_leaves_the_old_file_and_no_litter(target: Path, fault, when: st
 @pytest.mark.parametrize("step", ["fsync", "replace"])
 def test_a_failing_disk_leaves_the_old_file_and_no_litter(target: Path, monkeypatch, step: str):
     def fail(*_):
-        raise OSError(28, "No space left on device")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, step, fail)
-    with pytest.raises(OSError, match="No space left"), atomic_path(target) as partial:
+    words = r"log\.nc: can't be written \(No space left on device\); make room"
+    with pytest.raises(UserError, match=words), atomic_path(target) as partial:
         partial.write_text("new")
     monkeypatch.undo()
     assert target.read_text() == "old"
@@ -172,7 +174,7 @@ def test_files_of_a_new_folder_appear_together(tmp_path: Path):
     out = tmp_path / "runs" / "out"
     with atomic_files(out) as partial:
         fill(partial, "new")
-        assert not out.exists()
+        assert content(out) == {f"{partial.name}/{name}": "new" for name in WHOLE}
     assert content(tmp_path / "runs") == {f"out/{name}": text for name, text in WHOLE.items()}
 
 
@@ -207,6 +209,7 @@ def test_a_fault_among_files_leaves_the_folder_as_it_was(tmp_path: Path, fault, 
     assert out.exists() == there
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_between_replacements_waits_until_all_are_done(tmp_path: Path, monkeypatch):
     (tmp_path / "b.html").write_text("old")
     replace, moved = os.replace, []

@@ -4,16 +4,19 @@ import json
 import os
 import re
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
+from killing import killed, litter
 
 from spinndrift.models import config
 from spinndrift.models.errors import UserError
+from spinndrift.models.owned import MARKER
 from spinndrift.models.recording import Recording
 from spinndrift.sims import run_folder
 from spinndrift.sims.cli import main
-from spinndrift.sims.run_folder import atomic_folder, free_folder, write_run
+from spinndrift.sims.run_folder import new_folder, write_run
 from spinndrift.sims.run_log import RunLog
 from spinndrift.sims.run_loop import simulate, simulate_seeds
 from spinndrift.sims.run_signals import mean_over
@@ -25,6 +28,13 @@ duration: 0.6
 controller:
   planner: {horizon: 10, sequences: 16, realisations: 1, knots: [2], effective_samples: 4,
     shown_paths: 4}
+"""
+EXAMPLE = """
+from run_example import example_log
+from spinndrift.sims import run_loop
+from spinndrift.sims.criteria import Outcome
+made = example_log(2.0, planned=False), Outcome("duration", 2.0, "over"), run_loop.Timing()
+run_loop.simulate = lambda scenario, *_, **__: run_loop.Run(scenario, *made)
 """
 HOLD = """
 name: hold
@@ -92,7 +102,7 @@ def test_log_holds_what_happened(crossing):
 
 def test_folder_is_whole(crossing, tmp_path):
     values = write_run(crossing, tmp_path / "run")
-    names = {"scenario.yaml", "log.nc", "metrics.json", "report.html", "meshcat.html"}
+    names = {"scenario.yaml", "log.nc", "metrics.json", "report.html", "meshcat.html", MARKER}
     assert {path.name for path in (tmp_path / "run").iterdir()} == names
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     text = (tmp_path / "run" / "scenario.yaml").read_text(encoding="utf-8")
@@ -104,7 +114,7 @@ def test_folder_is_whole(crossing, tmp_path):
     assert told["timing"]["real_time_factor"] > 0
     assert Recording.load(tmp_path / "run" / "log.nc").vehicle == "bluerov2_heavy"
     assert (tmp_path / "run" / "report.html").stat().st_size < 5e6
-    with pytest.raises(UserError, match="not empty"):
+    with pytest.raises(UserError, match="holds a run already"):
         write_run(crossing, tmp_path / "run")
     assert RunLog.load(tmp_path / "run" / "log.nc").plans is not None
 
@@ -122,14 +132,31 @@ def test_a_failure_leaves_nothing(crossing, tmp_path, monkeypatch):
 def test_folders_count_up(tmp_path):
     scenario = overridden(HOLD, "{}")
     for name in ("hold-0", "hold-0-2", "hold-0-3"):
-        folder = free_folder(tmp_path, scenario)
-        assert folder.name == name
-        with atomic_folder(folder) as partial:
-            (partial / "a").write_text("a")
-            assert not folder.exists()
-        assert (folder / "a").read_text() == "a"
+        with new_folder(None, scenario, tmp_path) as folder:
+            assert folder.name == name
+            (folder / "log.nc").write_text("a")
+
+    def fail():
+        with new_folder(None, scenario, tmp_path) as folder:
+            assert folder.name == "hold-0-4"
+            raise RuntimeError
+
+    for _ in range(2):  # what was never written into is gone
+        with pytest.raises(RuntimeError):
+            fail()
+    assert len(list(tmp_path.iterdir())) == 3
 
 
+def test_two_runs_at_once_take_two_folders(tmp_path, monkeypatch):
+    scenario = overridden(HOLD, "{}")
+    with new_folder(None, scenario, tmp_path) as first:
+        there = os.path.lexists  # both looked before either was there
+        monkeypatch.setattr(os.path, "lexists", lambda p: there(p) and Path(p) != first)
+        with new_folder(None, scenario, tmp_path) as second:
+            assert (first.name, second.name) == ("hold-0", "hold-0-2")
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_interrupt_keeps_what_was_flown():
     def press(fraction: float, remark: str) -> None:
         if fraction > 0.3:
@@ -297,9 +324,16 @@ def test_bad_input_exits_with_two_and_a_sentence(arguments, capsys, tmp_path, mo
 
 
 def test_command(tmp_path, capsys):
+    """A process that is killed as it writes leaves a folder that the same command takes."""
     (tmp_path / "hold.yaml").write_text(HOLD)
     out = tmp_path / "flown"
+    killed("metrics.json", 1, EXAMPLE, "run", tmp_path / "hold.yaml", "--out", out, "--no-report")
+    assert (out / MARKER).exists()
+    assert len(litter(tmp_path)) == 2
     main(["run", str(tmp_path / "hold.yaml"), "--seed", "4", "--out", str(out), "--no-report"])
-    assert {path.name for path in out.iterdir()} == {"scenario.yaml", "log.nc", "metrics.json"}
+    assert {p.name for p in out.iterdir()} == {"scenario.yaml", "log.nc", "metrics.json", MARKER}
     assert json.loads((out / "metrics.json").read_text())["seed"] == 4
     assert "wrote" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["run", str(tmp_path / "hold.yaml"), "--out", str(out)])
+    assert "holds a run already" in capsys.readouterr().err

@@ -5,6 +5,7 @@ import math
 import os
 import signal
 from dataclasses import replace
+from pathlib import Path
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,9 +13,11 @@ import numpy as np
 import pytest
 import xarray as xr
 from diagonal import Diagonal
+from killing import killed, litter
 
 from spinndrift.models import config as yaml
 from spinndrift.models.errors import UserError
+from spinndrift.models.owned import claim
 from spinndrift.sims.cli import main
 from spinndrift.sims.fanout import run_here
 from spinndrift.sims.study import train
@@ -28,7 +31,7 @@ from spinndrift.sims.study.config import (
 )
 from spinndrift.sims.study.judge import diffusions
 from spinndrift.sims.study.pages import render
-from spinndrift.sims.study.run import run_study
+from spinndrift.sims.study.run import STUDY, run_study
 from spinndrift.sims.study.table import collect
 from spinndrift.sims.study.task import RunSettings, Task, make_tasks
 from spinndrift.sims.study.train import descended
@@ -37,6 +40,11 @@ from spinndrift.training.guard import TrainingError
 from spinndrift.training.methods import METHODS, method_config
 
 TINY = scaled("tiny")
+PREPARE = """
+from diagonal import Diagonal
+from spinndrift.sims.study import train
+train.starting_model = lambda *_: Diagonal.of(mass=20.0, drag=20.0, diffusion=1.0)
+"""
 TASK = Task("rich", "fdm-geodesic", (0,))
 
 
@@ -63,6 +71,7 @@ def quick(monkeypatch):
 def finished(tmp_path_factory):
     """A folder of one finished task, with a model that compiles fast."""
     out = tmp_path_factory.mktemp("study")
+    claim(out, STUDY)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
             train, "starting_model", lambda *_: Diagonal.of(mass=20.0, drag=20.0, diffusion=1.0)
@@ -126,7 +135,10 @@ def test_tasks_begin_with_one_seed_of_everything():
     ("arguments", "words"),
     [
         (("--methods", "sorcery"), ("sorcery", "fdm-geodesic")),
-        (("--seeds", "0"), ("seeds",)),
+        (("--seeds", "0"), ("--seeds 0",)),
+        (("--together", "0"), ("--together 0",)),
+        (("--workers", "-1"), ("--workers -1",)),
+        (("--workers", "1", "--cluster", "tcp://127.0.0.1:1"), ("--workers", "leave one out")),
         (("--config", "missing.yaml"), ("missing.yaml",)),
         (("--config", "wrong.yaml"), ("wrong.yaml", "beleif", "belief")),
         (("--config", "same.yaml"), ("belief", "bluerov2_heavy")),
@@ -146,6 +158,7 @@ def test_bad_input_is_refused_in_one_sentence(arguments, words, capsys, tmp_path
     for word in words:
         assert word in told
     assert "Traceback" not in told
+    assert {p.name for p in tmp_path.iterdir()} == {"wrong.yaml", "same.yaml", "loop.yaml"}
 
 
 def test_every_option_is_explained(capsys):
@@ -176,7 +189,7 @@ def test_other_settings_are_refused(finished):
 def test_a_task_leaves_its_numbers(finished):
     folder = finished / "rich" / "fdm-geodesic" / "seed-0"
     assert sorted(p.name for p in folder.iterdir()) == [
-        "metrics.nc", "motions.nc", "result.json", "settings.yaml", "training",
+        "metrics.nc", "motions.nc", "result.json", "settings.yaml", "spinndrift.json", "training",
     ]  # fmt: skip
     result = json.loads((folder / "result.json").read_text())
     assert result["trained"]
@@ -198,7 +211,8 @@ def test_a_task_leaves_its_numbers(finished):
     assert not list(finished.rglob("*.lock"))
 
 
-def test_an_interrupted_task_goes_on_to_the_same_numbers(finished, quick, tmp_path):
+@pytest.mark.usefixtures("interruptible")
+def test_an_interrupted_task_leaves_a_checkpoint(quick, tmp_path):
     def interrupt(fraction, remark="", /):
         seen.append(remark)
         if len([r for r in seen if "loss" in r]) == 5:
@@ -210,16 +224,24 @@ def test_an_interrupted_task_goes_on_to_the_same_numbers(finished, quick, tmp_pa
     partial = tmp_path / "rich" / "fdm-geodesic" / ".seed-0.partial"
     assert (partial / "training" / "checkpoint.npz").exists()
     assert not (tmp_path / "rich" / "fdm-geodesic" / "seed-0").exists()
-    seen.clear()
+
+
+def test_a_killed_study_goes_on_to_the_same_numbers(finished, quick, tmp_path, monkeypatch):
+    given = ("study", "ablation", "--scale", "tiny", "--methods", "fdm-geodesic", "--regime")
+    given = (*given, "rich", "--seeds", "1", "--out", tmp_path)
+    killed("checkpoint.npz", 2, PREPARE, *given)
+    seed = Path("rich", "fdm-geodesic", "seed-0")
+    assert len(litter(tmp_path / seed.parent)) > 2
+    assert not (tmp_path / seed).exists()
+    seen = []
     run_task(TINY, TASK, str(tmp_path), lambda fraction, remark="", /: seen.append(remark))
-    assert len([r for r in seen if "loss" in r]) == 3
+    assert len([r for r in seen if "loss" in r]) == 6  # the second checkpoint was being written
     whole, cut = (
-        json.loads((out / "rich" / "fdm-geodesic" / "seed-0" / "result.json").read_text())
-        for out in (finished, tmp_path)
+        json.loads((out / seed / "result.json").read_text()) for out in (finished, tmp_path)
     )
     assert cut["metrics"] == whole["metrics"]
     assert cut["diffusion"] == whole["diffusion"]
-    assert not partial.exists()
+    assert litter(tmp_path / seed.parent) == []
 
 
 def test_seeds_trained_together_are_those_trained_alone(finished, quick, tmp_path):

@@ -3,8 +3,10 @@
 import pytest
 
 from spinndrift.models.checkpoint import load_model
+from spinndrift.models.owned import MARKER
 from spinndrift.models.spinn import Spinn
 from spinndrift.sims.cli import main
+from spinndrift.sims.study.run import STUDY
 from spinndrift.sims.study.table import read_csv
 
 METHODS = ("fdm-geodesic", "pinn")
@@ -32,6 +34,14 @@ def test_every_method_leaves_a_model_and_a_row(out):
         assert isinstance(model, Spinn)
     silent = next(r for r in rows if r["method"] == "pinn")
     assert silent["b_surge_ratio"] == silent["spread_velocity_ratio"] == 0
+
+
+def test_the_folder_says_what_is_in_it(out):
+    files = {p.name for p in out.iterdir() if p.is_file()}
+    assert files <= {*STUDY.files, MARKER}
+    marked = {p.parent.relative_to(out).parts for p in out.rglob(MARKER)}
+    seeds = {("sparse", method, "seed-0") for method in METHODS}
+    assert marked == {(), *seeds, *((*seed, "training") for seed in seeds)}
 
 
 def test_the_pages_show_it(out):

@@ -14,12 +14,14 @@ from jaxtyping import Array
 
 from ..models.dynamics import Dynamics
 from ..models.files import atomic_path
+from ..models.netcdf import save_netcdf
 from .metrics import AXES, BANDS, GROUPS, coverage, displacement, energy_score, norms
 from .objective import Batch
 from .predict import predict
 from .windows import Windows
 
 _CHUNK = 16
+_COLUMNS = ("model", "quantity", "of", "band", "horizon_s", "value")
 
 
 @dataclass(frozen=True)
@@ -89,15 +91,16 @@ class Evaluation:
         path = Path(path)
         if path.suffix not in (".csv", ".json", ".nc"):
             raise ValueError(f"{path}: save an evaluation as .csv, .json or .nc")
+        if path.suffix == ".nc":
+            save_netcdf(self.dataset, path)
+            return
         with atomic_path(path) as partial:
-            if path.suffix == ".nc":
-                self.dataset.to_netcdf(partial, engine="h5netcdf")
-            elif path.suffix == ".json":
+            if path.suffix == ".json":
                 text = json.dumps({k: _plain(v) for k, v in self.overall().items()}, indent=2)
                 partial.write_text(text + "\n", encoding="utf-8")
             else:
                 rows = self.tidy()
-                lines = [",".join(rows[0]), *(",".join(str(v) for v in r.values()) for r in rows)]
+                lines = [",".join(_COLUMNS), *(",".join(str(r[c]) for c in _COLUMNS) for r in rows)]
                 partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def summary(self) -> str:
@@ -117,6 +120,21 @@ class Evaluation:
                 f"{row['energy_pose'] + row['energy_velocity']:>9.4f}"
             )
         return "\n".join(lines)
+
+
+def is_evaluation(path: Path) -> bool:
+    """Whether a file is what `Evaluation.save` writes."""
+    try:
+        if path.suffix == ".nc":
+            with xr.open_dataset(path, engine="h5netcdf") as opened:
+                return {"rmse", "coverage", "energy_score"} <= set(opened.data_vars)
+        if path.suffix == ".json":
+            found = json.loads(path.read_text(encoding="utf-8"))
+            return all("rmse_position" in row for row in found.values()) and bool(found)
+        with path.open(encoding="utf-8") as handle:
+            return handle.readline().strip() == ",".join(_COLUMNS)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return False
 
 
 def evaluate(

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import os
 import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,10 +16,31 @@ import numpy as np
 
 from ..models import config as yaml
 from ..models.errors import UserError
-from ..models.files import atomic_path
+from ..models.files import atomic_path, disk_errors_told
+from ..models.owned import FolderKind, claim
 from .config import TrainingConfig
 
+TRAINING = FolderKind(
+    "training",
+    (
+        "checkpoint.npz",
+        "metrics.csv",
+        "config.yaml",
+        "run.json",
+        "model.spinn",
+        "start.spinn",
+        "preset.spinn",
+        "evaluation.csv",
+        "evaluation.json",
+        "report.html",
+    ),
+)
+"""What `spinndrift train` writes, with what `fit` writes of it."""
 _MAY_DIFFER = ("steps", "patience", "max_recoveries", "checkpoint_every")
+
+
+class CheckpointError(UserError):
+    """A checkpoint that can't be gone on from: damaged, or of other settings or other data."""
 
 
 @dataclass
@@ -89,8 +111,12 @@ class RunFolder:
         self.model = self.path / "model.spinn"
 
     def begin(self, config: TrainingConfig, provenance: dict[str, Any]) -> None:
-        """Write what is run, before the first step."""
-        self.path.mkdir(parents=True, exist_ok=True)
+        """Write what is run, before the first step.
+
+        Raises:
+            UserError: the folder holds what this package did not write.
+        """
+        claim(self.path, TRAINING)
         for name, text in (
             ("config.yaml", yaml.dump(config)),
             ("run.json", json.dumps(provenance, indent=2) + "\n"),
@@ -110,7 +136,7 @@ class RunFolder:
         """Fill `state` from the checkpoint of the same settings and data.
 
         Raises:
-            UserError: the checkpoint is damaged, or of other settings or other data.
+            CheckpointError: the checkpoint is damaged, or of other settings or other data.
         """
         try:
             with (
@@ -124,9 +150,9 @@ class RunFolder:
                 raise UserError("it was trained on other windows; resume with the same data")
             state.fill(arrays, header["state"])
         except UserError as error:
-            raise UserError(f"{self.checkpoint}: {error}") from error
+            raise CheckpointError(f"{self.checkpoint}: {error}") from error
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise UserError(
+            raise CheckpointError(
                 f"{self.checkpoint}: not a whole checkpoint of this run ({error}); start anew "
                 "without resume"
             ) from error
@@ -154,8 +180,15 @@ class RunFolder:
         if new:
             writer.writeheader()
         writer.writerows(rows)
-        with self.metrics.open("a", encoding="utf-8", newline="") as handle:
-            handle.write(text.getvalue())
+        before = 0 if new else self.metrics.stat().st_size
+        with disk_errors_told(self.metrics):
+            try:
+                with self.metrics.open("a", encoding="utf-8", newline="") as handle:
+                    handle.write(text.getvalue())
+            except OSError:
+                if self.metrics.exists():
+                    os.truncate(self.metrics, before)  # no part of the rows stays
+                raise
 
     def read_metrics(self) -> dict[str, np.ndarray]:
         """Columns by name; empty cells are NaN."""

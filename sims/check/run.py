@@ -11,14 +11,18 @@ import jax
 
 from ...models.errors import UserError
 from ...models.files import atomic_path
+from ...models.owned import FolderKind, check_folder, claim
 from ..compile_cache import give_back_programs, keep_compiled
-from ..fanout import Failed, run_here, run_on_cluster
+from ..fanout import Failed, check_workers, run_here, run_on_cluster
 from ..progress import Update
 from .cases import Case
 from .judging import judge
 from .rivals import compete, pysindy
 
 _DONE, _RIVALS = "judged.json", "rivals.json"
+CHECK = FolderKind("check", ("diagnosis.md",), edited=("diagnosis.md",))
+"""What a check writes beside the folders of its cases."""
+_CASE = FolderKind("judged case", ("diagnosis.json", _DONE, _RIVALS))
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,7 @@ class JudgeCase:
         give_back_programs()
         folder = Path(self.out) / case.name
         own, beside = self.left(case)
+        claim(folder, _CASE)
         if own:
             judged, finding = judge(
                 case, self.alpha, lambda f, remark="": progress(f, f"{case.name}: {remark}")
@@ -77,11 +82,13 @@ def run_cases(
     Raises:
         UserError: a case can't be read, or was judged with another alpha; pysindy is not there.
     """
+    check_workers(None, workers)
     if rivals:
         pysindy()  # now, not after the first case
     work = JudgeCase(str(Path(out).absolute()), alpha, rivals)
-    for case in cases:
-        _judgement(work, case)  # of another alpha: now, not after the last case
+    for case in cases:  # what is in the way: now, not after the last case
+        check_folder(Path(work.out) / case.name, _CASE)
+        _judgement(work, case)
     left = [case for case in cases if any(work.left(case))]
     if workers == 0:
         failed = run_here(work, left, progress) if left else []

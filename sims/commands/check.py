@@ -1,5 +1,7 @@
 """`spinndrift check`: promises of this package, on cases whose answer is known."""
 
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -34,6 +36,19 @@ class CheckDiagnosis:
     """Folder for what was found in each case."""
     docs: Path | None = None
     """Markdown file to write the tables into, such as docs/diagnosis.md."""
+
+    @contextmanager
+    def place(self) -> Iterator[None]:
+        """Hold what is to be written."""
+        from ...models.owned import run_folder
+        from ..check.run import CHECK
+        from ..marked_page import held_page
+
+        with ExitStack() as held:
+            if self.docs is not None:
+                held.enter_context(held_page(self.docs))
+            held.enter_context(run_folder(self.out, CHECK))
+            yield
 
     def run(self) -> None:
         """Diagnose, judge, tell."""
@@ -73,10 +88,9 @@ class Check:
         OmitArgPrefixes,
     ]
 
-    @property
-    def out(self) -> Path:
-        """Folder for what was found."""
-        return self.what.out
+    def place(self) -> AbstractContextManager[None]:
+        """Hold what is to be written."""
+        return self.what.place()
 
     def run(self) -> None:
         """Measure, judge, tell."""

@@ -1,5 +1,7 @@
 """`spinndrift check estimator`: is the filter's covariance right, also when sensors fail?"""
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,6 +42,19 @@ class CheckEstimator:
     """Folder for what was found in each setting."""
     docs: Path | None = None
     """Markdown file to write the tables into, such as docs/estimator.md."""
+
+    @contextmanager
+    def place(self) -> Iterator[None]:
+        """Hold what is to be written."""
+        from ...models.owned import run_folder
+        from ..estimator_check.run import ESTIMATOR
+        from ..marked_page import held_page
+
+        with ExitStack() as held:
+            if self.docs is not None:
+                held.enter_context(held_page(self.docs))
+            held.enter_context(run_folder(self.out, ESTIMATOR))
+            yield
 
     def run(self) -> None:
         """Fly, judge, tell."""

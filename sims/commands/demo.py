@@ -16,8 +16,9 @@ class Demo:
     log: Path | None = None
     """Your own log (.tlog, .BIN), recording (.nc) or CSV folder; by default the one that comes
     along."""
-    out: Path = Path("runs/demo")
-    """Folder for everything that is made."""
+    out: Path | None = None
+    """Folder for everything that is made; by default runs/demo, or runs/demo-2 and so on where that
+    holds something else."""
     vehicle: str | None = None
     """Preset name or YAML file to start from; by default what the data name, or bluerov2_heavy."""
     scenario: str = "pylon_crossing_calm"
@@ -29,7 +30,7 @@ class Demo:
         """Run the demo and print its summary."""
         from ...training.config import TrainingConfig
         from ..cores import share_cores
-        from ..demo import EMBEDDED, demo
+        from ..demo import EMBEDDED, demo, demo_folder
         from ..progress import console, tell_code
         from ..scenario import load_scenario
 
@@ -40,4 +41,6 @@ class Demo:
         source = EMBEDDED if self.log is None else self.log
         scenario = load_scenario(self.scenario)
         tell_code(self.scenario, scenario.code)
-        console().print(demo(source, self.out, scenario, config, self.vehicle))
+        with demo_folder(self.out) as out:
+            told = demo(source, out, scenario, config, self.vehicle)
+        console().print(told)

@@ -1,6 +1,7 @@
 """`spinndrift diagnose`: what a simulation gets wrong, by name."""
 
 import math
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -8,8 +9,12 @@ from typing import Literal
 from tyro.conf import Positional
 
 from ...models.errors import UserError
+from ...models.owned import FolderKind, run_folder
 from ..progress import console, progress_bar
 
+DIAGNOSIS = FolderKind(
+    "diagnosis", ("diagnosis.json", "diagnosis.schema.json", "extended/model.spinn", "report.html")
+)
 _USUAL = "bluerov2_heavy"
 _STATE_VEHICLES = (".nc", ".nc4", ".h5", ".yaml", ".yml")
 """Endings of files that can state their vehicle; logs can't."""
@@ -46,6 +51,10 @@ class Diagnose:
     out: Path = Path("diagnosis")
     """Folder to write."""
 
+    def place(self) -> AbstractContextManager[Path]:
+        """Hold what is to be written."""
+        return run_folder(self.out, DIAGNOSIS)
+
     def run(self) -> None:
         """Load, diagnose, write."""
         import json
@@ -64,6 +73,8 @@ class Diagnose:
         config = DiagnoseConfig(alpha=self.alpha, refit=self.refit)
         base, metadata = (None, {}) if self.model is None else load_model(self.model, dtype=float)
         named = metadata.get("vehicle")
+        if self.vehicle is not None:
+            load_vehicle(self.vehicle)  # now, not after the data are read
         with progress_bar(f"reading {self.data.name}") as update:
             recording = load_data(
                 self.data,
@@ -72,7 +83,8 @@ class Diagnose:
                 resample=False,
                 progress=update,
             )
-        vehicle = load_vehicle(self._vehicle(recording.vehicle, named))
+        stated = self._vehicle(recording.vehicle, named)
+        vehicle = load_vehicle(stated)
         if self.diffusion is not None:
             base = vehicle.dynamics(np.array(self.diffusion))
         with progress_bar("diagnosing") as update:
@@ -85,7 +97,7 @@ class Diagnose:
             save_model(
                 partial / "extended" / "model.spinn",
                 finding.extended,
-                {"vehicle": vehicle.name, "source": str(self.data), "dt": recording.dt},
+                {"vehicle": stated, "source": str(self.data), "dt": recording.dt},
             )
             page.write(partial / "report.html")
         shown = console()
@@ -101,8 +113,6 @@ class Diagnose:
         """Refuse options that can't be meant, before anything is read."""
         from ...models.checks import require_rate
 
-        if self.out.exists() and not self.out.is_dir():
-            raise UserError(f"--out {self.out}: is a file; name a folder")
         require_rate(self.alpha, "--alpha")
         if self.diffusion is None:
             return

@@ -1,5 +1,6 @@
 """`spinndrift evaluate`: a model against data it has not seen."""
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +28,15 @@ class Evaluate:
     """Seconds of each window."""
     vehicle: str | None = None
     """Preset name or YAML file to compare with; by default what the model names."""
+
+    def place(self) -> AbstractContextManager[Path | None]:
+        """Hold what is to be written."""
+        from ...models.owned import output_file
+        from ...training.evaluate import is_evaluation
+
+        if self.out is None:
+            return nullcontext()
+        return output_file(self.out, is_evaluation, "evaluation of spinndrift")
 
     def run(self) -> None:
         """Load, predict, compare."""

@@ -1,5 +1,6 @@
 """`spinndrift generate`: simulated training data."""
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -27,6 +28,13 @@ class Generate:
     disturbances: str = "still"
     """Named set of disturbances: still, calm, harbour, slack_tide, flood_tide."""
     config: Annotated[GenerateConfig, OmitArgPrefixes] = field(default_factory=GenerateConfig)
+
+    def place(self) -> AbstractContextManager[Path]:
+        """Hold what is to be written."""
+        from ...models.owned import output_file
+        from ...models.recording import Recording
+
+        return output_file(self.out, Recording.is_one, "recording of spinndrift")
 
     def run(self) -> None:
         """Simulate and write."""

@@ -1,5 +1,6 @@
 """`spinndrift import`: a log or a CSV folder becomes a Recording."""
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -39,11 +40,18 @@ class Import:
     system: int | None = None
     """MAVLink system id, where a log holds several autopilots."""
 
+    def place(self) -> AbstractContextManager[Path]:
+        """Hold what is to be written."""
+        from ...models.owned import output_file
+        from ...models.recording import Recording
+
+        return output_file(self._out(), Recording.is_one, "recording of spinndrift")
+
     def run(self) -> None:
         """Read, convert, write, summarise."""
         from ...systems.mavlink.logs import LogOptions, load_data
 
-        out = self.out if self.out is not None else Path(f"{stem(self.log)}.nc")
+        out = self._out()
         if out.suffix != ".nc":
             raise UserError(f"--out {out}: a Recording is a NetCDF file; give a name ending in .nc")
         options = LogOptions(self.minimum, self.gap, self.water_density, self.disarmed, self.system)
@@ -55,6 +63,9 @@ class Import:
         shown = console()
         shown.print(recording.summary())
         shown.print(f"wrote {out}")
+
+    def _out(self) -> Path:
+        return self.out if self.out is not None else Path(f"{stem(self.log)}.nc")
 
 
 def stem(path: Path) -> str:

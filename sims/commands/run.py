@@ -46,21 +46,20 @@ class Run:
 
     def run(self) -> None:
         """Simulate, write, summarise."""
-        from ..run_folder import check_free, free_folder, write_run
+        from ..run_folder import new_folder, write_files
         from ..run_loop import simulate
         from ..scenario import load_scenario
 
         scenario = load_scenario(self.scenario, self.scenario_text)
         tell_code(self.scenario, scenario.code)
         scenario = scenario.with_changes(self.seed, self.duration, self.model)
-        out = free_folder("runs", scenario) if self.out is None else self.out
-        check_free(out)
-        if self.quiet:
-            flown = simulate(scenario, engine=self.engine)
-        else:
-            with progress_bar(f"flying {scenario.name}") as update:
-                flown = simulate(scenario, update, self.engine)
-        values = write_run(flown, out, self.report)
+        with new_folder(self.out, scenario) as out:
+            if self.quiet:
+                flown = simulate(scenario, engine=self.engine)
+            else:
+                with progress_bar(f"flying {scenario.name}") as update:
+                    flown = simulate(scenario, update, self.engine)
+            values = write_files(flown, out, self.report)
         if not self.quiet:
             self._summary(values, out)
         if flown.outcome.reason == "interrupted":

@@ -1,5 +1,7 @@
 """`spinndrift study`: the paper's simulation study, rerun."""
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -49,6 +51,20 @@ class Study:
     render_only: Annotated[
         bool, FlagCreatePairsOff, arg(help="Run nothing, write tables and pages anew.")
     ] = False
+
+    @contextmanager
+    def place(self) -> Iterator[None]:
+        """Hold what is to be written."""
+        from ...models.owned import output_file, run_folder
+        from ..study.pages import check_shown, is_page
+        from ..study.run import STUDY
+
+        with ExitStack() as held:
+            if self.docs is not None:
+                held.enter_context(output_file(self.docs, is_page, "page of a study", "--docs"))
+                check_shown(self.docs)
+            held.enter_context(run_folder(self.out, STUDY))
+            yield
 
     def run(self) -> None:
         """Train, judge, tell."""

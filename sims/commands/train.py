@@ -1,5 +1,6 @@
 """`spinndrift train`: a learned model from data."""
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -43,6 +44,13 @@ class Train:
     resume: bool = False
     """Continue the run in `--out`."""
 
+    def place(self) -> AbstractContextManager[Path]:
+        """Hold what is to be written."""
+        from ...models.owned import run_folder
+        from ...training.run_folder import TRAINING
+
+        return run_folder(self.out, TRAINING)
+
     def run(self) -> None:
         """Train, evaluate, report."""
         from ...models.config import load
@@ -67,6 +75,8 @@ class Train:
                 f"--out {self.out}: holds a training run; continue it with --resume or name "
                 "another folder"
             )
+        if self.vehicle is not None:
+            load_vehicle(self.vehicle)  # now, not after the data are read
         start, metadata = (None, {}) if self.model is None else Start.read(self.model)
         with progress_bar(f"reading {self.data.name}") as update:
             recording = load_data(self.data, vehicle=self.vehicle, progress=update)

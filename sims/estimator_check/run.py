@@ -14,13 +14,19 @@ import numpy as np
 from ...models import config
 from ...models.errors import UserError
 from ...models.files import atomic_path
+from ...models.owned import FolderKind
 from ...training.provenance import revision
 from ..compile_cache import give_back_programs, keep_compiled
 from ..fanout import Failed, run_here, run_on_cluster
 from ..progress import Update
 from ..run_loop import Engine, simulate_seeds
 from .scores import Scores, score, stacked
-from .settings import Setting
+from .settings import Setting, setting_files
+
+ESTIMATOR = FolderKind(
+    "check of the estimator", ("estimator.md", *setting_files()), edited=("estimator.md",)
+)
+"""What a check writes, beside the folder of the demo's model."""
 
 
 @dataclass(frozen=True)

@@ -71,6 +71,12 @@ def chosen(only: Sequence[str]) -> list[str]:
     return [name for name in table if name in found]
 
 
+def setting_files() -> tuple[str, ...]:
+    """Where the scores of all settings lie, from the folder of a check."""
+    faults = (f"faults/{name}.npz" for name, _, _ in _faults(0.0))
+    return (*(f"consistency/{name}.npz" for name in _WATERS), *faults)
+
+
 def consistency_settings(names: Sequence[str], seconds: float, model: Path | None) -> list[Setting]:
     """Healthy sensors in several waters; `model` is the learned plant, where that is chosen.
 

@@ -1,7 +1,9 @@
 """The study told: report.html, and ablation.md for the documentation."""
 
+import glob
 import math
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from ...models import config as yaml
+from ...models.errors import UserError
 from ...models.files import atomic_path
 from ...training.methods import METHODS
 from ..pages import Page
@@ -26,6 +29,8 @@ from .figures import (
 from .table import Row, collect, done_runs, summarise, write_csv, write_netcdf
 
 _MET = {"reproduced": "met", "not reproduced": "not met", "not tested": "not tested"}
+_TITLE = "# Ablation study"
+_FIGURES = re.compile(r"results|diffusion|training|distributions-.*")
 _COLUMNS = (
     ("w2", "W₂"),
     ("w2_ratio", "W₂ / floor"),
@@ -49,6 +54,30 @@ _EXPLAINED = (
     "samples' error compares single motions, which favours a law without noise; the mean path's "
     "does not."
 )
+
+
+def is_page(path: Path) -> bool:
+    """Whether a file is a page that `render` wrote."""
+    try:
+        return path.read_text(encoding="utf-8").startswith(f"{_TITLE}\n")
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def check_shown(docs: Path) -> None:
+    """Refuse a page whose figures would replace others than those it shows.
+
+    Raises:
+        UserError: naming such a figure.
+    """
+    shown = docs.read_text(encoding="utf-8") if docs.exists() else ""
+    for at in sorted(docs.parent.glob(f"{glob.escape(docs.stem)}-*.png")):
+        name = at.name.removeprefix(f"{docs.stem}-").removesuffix(".png")
+        if _FIGURES.fullmatch(name) and f"]({at.name})" not in shown:
+            raise UserError(
+                f"--docs {docs}: {at} is no figure of it and would be replaced; move it away or "
+                "name another page"
+            )
 
 
 def render(out: str | os.PathLike[str], docs: str | os.PathLike[str] | None = None) -> list[Row]:
@@ -217,7 +246,7 @@ def ablation_text(
     """A page in docs/ with verdicts, aims and numbers, all computed from the rows."""
     files = {name: f"{name}.png" for name in figures} | (names or {})
     lines = [
-        "# Ablation study",
+        _TITLE,
         "",
         *_wrapped(f"{_told(rows)}, as written by"),
         "",

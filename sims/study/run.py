@@ -8,12 +8,29 @@ from pathlib import Path
 from ...models import config as yaml
 from ...models.errors import UserError
 from ...models.files import atomic_path
-from ..fanout import Failed, run_here, run_on_cluster
+from ...models.owned import FolderKind, claim
+from ...training.maneuvers import MANEUVERS
+from ..fanout import Failed, check_workers, run_here, run_on_cluster
 from ..progress import Update
-from .config import StudyConfig
+from .config import REGIMES, StudyConfig
 from .judge import check_vehicles
 from .task import Task
 from .work import run_task
+
+STUDY = FolderKind(
+    "study",
+    (
+        "study.yaml",
+        "table.csv",
+        "summary.csv",
+        *(f"{regime}.nc" for regime in REGIMES),
+        *(f"{name}.png" for name in ("results", "diffusion", "training")),
+        *(f"distributions-{name}.png" for name in MANEUVERS),
+        "report.html",
+        "ablation.md",
+    ),
+)
+"""What a study writes beside the folders of its runs."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +64,7 @@ def run_study(
         UserError: settings are wrong, or `out` holds runs of other settings.
     """
     check_vehicles(study)
+    check_workers(cluster, workers)
     folder = Path(out).absolute()
     left = []
     for task in tasks:
@@ -55,6 +73,7 @@ def run_study(
             run.check()
         if not all(run.done for run in runs):
             left.append(task)
+    claim(folder, STUDY)
     with atomic_path(folder / "study.yaml") as partial:
         partial.write_text(yaml.dump(study), encoding="utf-8")
     if not left:

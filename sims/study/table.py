@@ -13,6 +13,7 @@ import xarray as xr
 
 from ...models.errors import UserError
 from ...models.files import atomic_path
+from ...models.netcdf import save_netcdf
 from .config import REGIMES
 
 Row = dict[str, Any]
@@ -167,7 +168,7 @@ def write_netcdf(out: str | os.PathLike[str]) -> list[Path]:
     """Join the metrics of each regime's runs in `<regime>.nc`, dims (run, scenario, side, …)."""
     written = []
     for regime in REGIMES:
-        parts = []
+        parts: list[xr.Dataset] = []
         for folder in done_runs(out):
             path = folder / "metrics.nc"
             if folder.parent.parent.name != regime or not path.exists():
@@ -179,9 +180,9 @@ def write_netcdf(out: str | os.PathLike[str]) -> list[Path]:
             parts.append(run.assign_coords({k: ("run", [v]) for k, v in names.items()}))
         if parts:
             path = Path(out) / f"{regime}.nc"
-            with atomic_path(path) as partial:
-                joined = xr.concat(parts, dim="run")
-                coded = {name: {"compression": "gzip"} for name in joined.data_vars}
-                joined.to_netcdf(partial, engine="h5netcdf", encoding=coded)
+            joined = xr.concat(parts, dim="run")
+            save_netcdf(
+                joined, path, {str(name): {"compression": "gzip"} for name in joined.data_vars}
+            )
             written.append(path)
     return written

@@ -1,6 +1,5 @@
 """One task of a study and its folders: whole or absent, never run twice at once, resumable."""
 
-import fcntl
 import json
 import os
 from collections.abc import Iterator
@@ -12,9 +11,13 @@ from typing import Any
 from ...models import config as yaml
 from ...models.errors import UserError
 from ...models.files import atomic_path
+from ...models.locks import locked
+from ...models.owned import FolderKind, check_folder, claim, finish, sweep
 from ...training.config import TrainingConfig
 from ...training.methods import METHODS, method_config
 from .config import REGIMES, Regime, StudyConfig
+
+SEED = FolderKind("run of a study", ("settings.yaml", "result.json", "metrics.nc", "motions.nc"))
 
 
 @dataclass(frozen=True)
@@ -73,8 +76,9 @@ def make_tasks(
     for name in regimes:
         if name not in REGIMES:
             raise UserError(f"regime '{name}' is unknown; take some of {', '.join(REGIMES)}")
-    if seeds < 1 or together < 1:
-        raise UserError(f"seeds is {seeds}: give at least 1")
+    for option, number in (("seeds", seeds), ("together", together)):
+        if number < 1:
+            raise UserError(f"--{option} {number}: give at least 1")
     starts = range(0, seeds, together)
     return [
         Task(regime, method, tuple(range(first, min(first + together, seeds))))
@@ -103,12 +107,13 @@ class RunPath:
         return (self.final / "result.json").exists()
 
     def check(self) -> None:
-        """Refuse what other settings left here.
+        """Refuse what other settings left here, and what this package did not write.
 
         Raises:
-            UserError: naming the folder and the first setting that differs.
+            UserError: naming the folder, and the first setting that differs.
         """
         for folder in (self.final, self.partial):
+            check_folder(folder, SEED)
             path = folder / "settings.yaml"
             if not path.exists():
                 continue
@@ -118,13 +123,14 @@ class RunPath:
                     f"{folder}: was made with other settings ({_difference(there, here)}); name "
                     "another folder with --out, or remove this one"
                 )
+        if not self.done and self.final.is_dir() and any(self.final.iterdir()):
+            raise UserError(f"{self.final}: lacks its result.json; move the folder away")
 
     @contextmanager
     def held(self) -> Iterator[None]:
         """Keep other processes off this run; waits while one that is alive holds it."""
         self._lock.parent.mkdir(parents=True, exist_ok=True)
-        with self._lock.open("w") as handle:
-            fcntl.flock(handle, fcntl.LOCK_EX)  # goes with the process that took it
+        with locked(self._lock, None):
             yield
 
     def begin(self) -> Path:
@@ -134,7 +140,9 @@ class RunPath:
             UserError: other settings were at work here.
         """
         self.check()
-        self.partial.mkdir(parents=True, exist_ok=True)
+        claim(self.partial, SEED)
+        for folder in (self.partial, self.partial / "training"):
+            sweep(folder)
         with atomic_path(self.partial / "settings.yaml") as path:
             path.write_text(yaml.dump(self.settings), encoding="utf-8")
         return self.partial
@@ -143,8 +151,8 @@ class RunPath:
         """Write result.json and give the folder its final name."""
         with atomic_path(self.partial / "result.json") as path:
             path.write_text(json.dumps(_plain(result), indent=2) + "\n", encoding="utf-8")
+        finish(self.partial, SEED)
         os.replace(self.partial, self.final)
-        self._lock.unlink(missing_ok=True)
 
 
 def _difference(there: str, here: str) -> str:

@@ -11,12 +11,14 @@ import numpy as np
 from ...models.checkpoint import load_model, save_model
 from ...models.dynamics import Dynamics
 from ...models.errors import UserError
+from ...models.owned import claim
 from ...models.vehicle import load_vehicle
 from ...training.config import TrainingConfig
 from ...training.ensemble import fit_ensemble
 from ...training.fit import Progress, TrainingResult, fit
 from ...training.generate import generate
 from ...training.guard import TrainingError, not_finite
+from ...training.run_folder import TRAINING
 from ...training.start import starting_model
 from ...training.windows import Windows, make_windows
 from ..progress import Update
@@ -115,6 +117,7 @@ def train_seeds(
         def started(step: int, total: int, loss: float, done: int = number) -> None:
             progress(_DRIFT * (done + step / total) / count, "drift first")
 
+        claim(folders[number], TRAINING)
         kept = folders[number] / "start.spinn"
         if kept.exists():
             starts.append(load_model(kept)[0])

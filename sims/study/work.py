@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 
+from ...models.netcdf import save_netcdf
 from ...training.law_metrics import overall
 from ...training.provenance import revision, versions
 from ..compile_cache import keep_compiled
@@ -83,11 +84,11 @@ def _finish(
             trained.model, study, settings.regime, settings.seed, substeps, progress
         )
         metrics = overall(compared)
-        compared.astype("float32").to_netcdf(folder / "metrics.nc", engine="h5netcdf")
+        save_netcdf(compared.astype("float32"), folder / "metrics.nc")
         if settings.seed == 0:
             motions = shown_motions(trained.model, study, settings.regime, settings.seed, substeps)
             if motions is not None:
-                motions.to_netcdf(folder / "motions.nc", engine="h5netcdf")
+                save_netcdf(motions, folder / "motions.nc")
     bounded = bool(metrics) and metrics["finite"]["value"] == 1.0
     result = trained.result
     run.finish(

@@ -87,8 +87,8 @@ def run_folder(
     _checked(path, kind, called, new)
     with made_folder(folder, about), locked(folder / _LOCK, about):
         before = _checked(path, kind, called, new)  # again: now nobody else writes
-        sweep(folder)
         _begin(folder, kind, before)
+        sweep(folder)
         try:
             yield Path(path)
             finish(folder, kind)

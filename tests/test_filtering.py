@@ -249,7 +249,7 @@ def simulate(core: DelayedFilter, key: Array, steps: int, blind_after: Array, gr
         )
         state = core.step(state, readings, k)
         true = jax.tree.map(lambda leaf: leaf[0], past)
-        P = core._covariance(state, state.nominal, state.since[:7])
+        P = core.covariance(state)
         error = es.error(state.nominal, true)
         out = Run(error, P, core.status(state, k), error[9:15])
         return (X_new, V_new, states, state, past), out
@@ -408,7 +408,7 @@ def test_a_lost_filter_opens_its_gate_after_some_patience():
     counts = []
     for k in range(150):
         state = step(state, still_readings(k, 0), jnp.asarray(float(k)))
-        counts.append(int(state.rejected[0]))
+        counts.append(int(state.trust.rejected[0]))
     assert max(counts) == 5
     assert counts[-1] < 5
     assert abs(float(state.nominal.v_B[0])) < 0.05

@@ -16,24 +16,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from scipy.stats import chi2
 
 from ...models import se3
 from ...models.checks import Vector3, check_numbers, require
 from ...models.sensors import Compass, DepthSensor, Dvl, Imu
-from ...models.sensors.base import velocity_at
-from . import error_state, measurement
+from . import error_state, inertial, measurement
 from .error_state import Navigation
+from .inertial import Motion, Samples
+from .trust import SIZES, Shown, Trust, counted, imu_off, judged
 
-SLOT = 18
+SLOT = 22
 """Has sample, force 3, mean rate 3 | has dvl, v 3 | has depth, depth | has compass, yaw | rate at
-the end 3."""
-_DVL, _DEPTH, _COMPASS, _RATE = 7, 11, 13, 15
+the end 3 | `inertial.LEFT_OPEN`."""
+_DVL, _DEPTH, _COMPASS, _RATE, _OPEN = 7, 11, 13, 15, 18
 _FLAGS = np.array([_DVL, _DEPTH, _COMPASS])
-_FEW = 5  # samples whose mean force is held beyond the newest one
+_SINCE = 9  # components of `FilterState.since` that are sums
 _LONGEST = 0.1  # s that the covariance waits at most for a reading
-_REMEMBERED = 2.0  # s: time constant of the averages of how samples differ
 
 STATUS = (
     "time",
@@ -68,9 +68,10 @@ class EkfConfig:
             (`tests/test_filtering.py`).
         horizon: how long readings may take to arrive (s).
         gate: share of good readings that pass the chi-square gate.
-        patience: after so many rejections in a row what the sensor measures counts as unknown, by
-            the size of the residual, and its reading is taken: a filter that lost its way must not
-            shut its sensors out for good.
+        patience: after so many rejections in a row either the sensor is at fault and is left out,
+            until as many readings pass again, or the filter may have lost its way: then what the
+            sensor measures counts as unknown, by the size of the residual, and its reading is taken
+            (`systems.filtering.trust`).
         output_rate: estimates per second (Hz).
         silence: a sensor without an accepted reading for so long is not trusted (s).
         lost_velocity: the state is lost where velocity is known no better than this, 1 σ (m/s).
@@ -106,20 +107,14 @@ class FilterState(NamedTuple):
 
     nominal: Navigation
     P: Float[Array, "18 18"]
-    ring: Float[Array, "slots 18"]
-    since: Float[Array, "10"]
-    """Since P's time: the time, sums of force · dt and rate · dt, and v_B at its beginning."""
-    rate: Float[Array, "3"]
-    """Newest angular rate (rad/s) in body axes, its bias still in it."""
-    rate_before: Float[Array, "3"]
-    """The one before."""
-    steps: Float[Array, "6 6"]
-    """Mean square of what a sample of [force, rate] differs from the one foreseen."""
-    bends: Float[Array, "6 6"]
-    """Mean square of the second differences of [force, rate]."""
-    nis: Float[Array, "3"]
-    rejected: Float[Array, "3"]
-    accepted_at: Float[Array, "3"]
+    ring: Float[Array, "slots 22"]
+    since: Float[Array, "12"]
+    """Since P's time: the time, sums of force · dt and rate · dt, variances that missing forces and
+    rates leave, and v_B at its beginning."""
+    samples: Samples
+    motion: Motion
+    shown: Shown
+    trust: Trust
 
 
 class Readings(NamedTuple):
@@ -133,6 +128,13 @@ class Readings(NamedTuple):
     """Depth (m), valid, time (s)."""
     compass: Float[Array, "3"]
     """Yaw (rad), valid, time (s)."""
+
+    def by_kind(self) -> tuple[Float[Array, "5"], Bool[Array, "3"], Float[Array, "3"]]:
+        """Of DVL, depth gauge and compass: all values, valid marks, times (s)."""
+        readings = (self.dvl, self.depth, self.compass)
+        values = jnp.concatenate([each[:-2] for each in readings])
+        marks = jnp.stack([each[-2] > 0 for each in readings])
+        return values, marks, jnp.stack([each[-1] for each in readings])
 
 
 class DelayedFilter(eqx.Module):
@@ -201,14 +203,11 @@ class DelayedFilter(eqx.Module):
             Navigation(X_WB, V_WB_B[:3], zero, zero, zero),
             jnp.diag(self.deviations() ** 2),
             jnp.zeros((self.slots, SLOT), V_WB_B.dtype),
-            jnp.concatenate([jnp.zeros(7, V_WB_B.dtype), V_WB_B[:3]]),
-            V_WB_B[3:],
-            V_WB_B[3:],
-            jnp.zeros((6, 6), V_WB_B.dtype),
-            jnp.zeros((6, 6), V_WB_B.dtype),
-            zero,
-            zero,
-            zero,
+            jnp.concatenate([jnp.zeros(_SINCE, V_WB_B.dtype), V_WB_B[:3]]),
+            Samples.start(V_WB_B[3:]),
+            Motion.start(V_WB_B.dtype),
+            Shown.start(V_WB_B.dtype),
+            Trust.start(V_WB_B.dtype),
         )
 
     def step(self, state: FilterState, readings: Readings, k: Float[Array, ""]) -> FilterState:
@@ -228,70 +227,49 @@ class DelayedFilter(eqx.Module):
         samples: Float[Array, "n 6"],
         readings: Readings,
         last: Float[Array, ""],
-    ) -> tuple[FilterState, Float[Array, "n 18"]]:
+    ) -> tuple[FilterState, Float[Array, "n 22"]]:
         """Put samples that end with number `last` into the ring; return the slots that leave it.
 
         `samples` are the IMU's, oldest first; of `readings` only the other sensors count. The slots
         are then passed by `move`, and where it stops `fuse`, until all are: `step` for n samples.
         """
         dtype, h, n = state.ring.dtype, self.period, samples.shape[0]
-        X_BS = self.imu.mount(dtype)
-        rate = se3.rotate(X_BS, samples[:, 3:].T)
-        force = se3.rotate(X_BS, samples[:, :3].T)
         number = last - (self.slots + n - 1) + jnp.arange(self.slots + n, dtype=dtype)
-        rate = jnp.where(number[None, self.slots :] >= 0, rate, state.rate[:, None])
-        before = jnp.concatenate([state.rate[:, None], rate[:, :-1]], axis=1)
-        if any(self.imu.position):  # from the sensor's place to Bo
-            r = jnp.broadcast_to(X_BS[4:, None], rate.shape)
-            spin = velocity_at(r, jnp.concatenate([jnp.zeros_like(rate), rate]))
-            force = force - se3.cross(rate, spin) - se3.cross((rate - before) / h, r)
-        moves = (number[None, self.slots :] >= 1).astype(dtype)
-        mean = rate if self.imu.integrating else (rate + before) / 2
-        new = [moves, force, mean, jnp.zeros((SLOT - _DVL, n), dtype)]
-        ring = jnp.concatenate([state.ring, jnp.concatenate(new).T])
-        following = jnp.concatenate([ring[1:, 4:_DVL], ring[-1:, 4:_DVL]])
-        state = self._compared(state, ring, rate)
 
-        def place(old: Array, reading: Array) -> Array:
-            """The columns with [1, value] in the slot of a valid reading's time."""
-            here = (number == jnp.round(reading[-1] / h)) & (reading[-2] > 0)
+        def over(memory: Samples, given: tuple[Array, Array]) -> tuple[Samples, Array]:
+            return inertial.take(self.imu, memory, *given)
+
+        memory, rows = jax.lax.scan(over, state.samples, (samples, number[self.slots :]))
+        rest = jnp.zeros((n, _OPEN - _DVL), dtype)
+        new = jnp.concatenate([rows[:, :_DVL], rest, rows[:, _DVL:]], axis=1)
+        ring = jnp.concatenate([state.ring, new])
+        following = jnp.concatenate([ring[1:, 4:_DVL], ring[-1:, 4:_DVL]])
+        shown, usable = state.shown.with_readings(self.dvl, *readings.by_kind())
+
+        def place(old: Array, reading: Array, i: int) -> Array:
+            """The columns with [1, value] in the slot of a usable reading's time."""
+            here = (number == jnp.round(reading[-1] / h)) & usable[i]
             row = jnp.concatenate([jnp.ones(1, dtype), reading[:-2]])
             return jnp.where(here[:, None], row[None], old)
 
         columns = [
             ring[:, :_DVL],
-            place(ring[:, _DVL:_DEPTH], readings.dvl),
-            place(ring[:, _DEPTH:_COMPASS], readings.depth),
-            place(ring[:, _COMPASS:_RATE], readings.compass),
+            place(ring[:, _DVL:_DEPTH], readings.dvl, 0),
+            place(ring[:, _DEPTH:_COMPASS], readings.depth, 1),
+            place(ring[:, _COMPASS:_RATE], readings.compass, 2),
             (ring[:, 4:_DVL] + following) / 2,
+            ring[:, _OPEN:],
         ]
         ring = jnp.concatenate(columns, axis=1)
-        return state._replace(ring=ring[n:]), ring[:n]
+        return state._replace(ring=ring[n:], samples=memory, shown=shown), ring[:n]
 
-    def _compared(
-        self, state: FilterState, ring: Float[Array, "m 18"], rate: Float[Array, "3 n"]
-    ) -> FilterState:
-        """Compare the n newest samples, at the end of `ring`, with those before them."""
-        n, m = rate.shape[1], ring.shape[0]
-        rates = jnp.concatenate([state.rate_before[None], state.rate[None], rate.T])
-        force = ring[m - n - _FEW :, 1:4]
-        has = ring[m - n - _FEW :, :1]
-        decay = jnp.exp(-jnp.asarray(self.period, ring.dtype) / _REMEMBERED)
-        steps, bends = state.steps, state.bends
-        for i in range(n):
-            # both need two samples before them
-            known = has[_FEW + i - 2, 0] * (1 - decay)
-            foreseen = _mean(force[i : i + _FEW], has[i : i + _FEW])
-            at, now = _FEW + i, i + 2
-            step = jnp.concatenate([force[at] - foreseen, rates[now] - rates[now - 1]])
-            bend = [force[at] - 2 * force[at - 1] + force[at - 2]]
-            bend = jnp.concatenate([*bend, rates[now] - 2 * rates[now - 1] + rates[now - 2]])
-            steps = steps + known * (step[:, None] * step[None] - steps)
-            bends = bends + known * (bend[:, None] * bend[None] - bends)
-        return state._replace(rate_before=rates[-2], rate=rates[-1], steps=steps, bends=bends)
+    def _still(self, x: Navigation, omega: Float[Array, "3"]) -> Float[Array, "3"]:
+        """The force without bias that keeps the velocity in B at a rate ω."""
+        up = jnp.asarray((0.0, 0.0, self.imu.gravity), x.v_B.dtype)
+        return se3.rotate_inverse(x.X_WB, up) + se3.cross(omega, x.v_B)
 
     def move(
-        self, state: FilterState, slots: Float[Array, "n 18"], first: Float[Array, ""]
+        self, state: FilterState, slots: Float[Array, "n 22"], first: Float[Array, ""]
     ) -> tuple[FilterState, Float[Array, ""]]:
         """Move the nominal state from slot `first` on over the next one that needs `fuse`.
 
@@ -307,63 +285,104 @@ class DelayedFilter(eqx.Module):
         times = jnp.where(ahead & (order <= at), h * slots[:, 0], 0)
 
         def over(
-            given: tuple[Navigation, Array], slot: tuple[Array, Array]
-        ) -> tuple[tuple[Navigation, Array], None]:
-            x, since = given
+            given: tuple[Navigation, Motion, Array], slot: tuple[Array, Array]
+        ) -> tuple[tuple[Navigation, Motion, Array], None]:
+            x, motion, since = given
             dt, values = slot
-            force, omega = values[1:4] - x.accel_bias, values[4:7] - x.gyro_bias
+            force, omega = values[1:4] - x.accel_bias, values[4:_DVL] - x.gyro_bias
+            still = self._still(x, omega)
+            force = jnp.where(values[_OPEN] > 0, still, force)
+            known = jnp.all(values[_OPEN:] <= 0)
+            motion = motion.after(force - still, omega, jnp.where(known, dt, 0))
             sample = error_state.sample_increment(force, omega, dt)
             decay = jnp.exp(-dt / self.compass.wander_time)
             x = error_state.apply(x, sample, self.imu.gravity)
             x = x._replace(sensors=jnp.concatenate([x.sensors[:2], decay * x.sensors[2:]]))
-            gone = jnp.concatenate([dt[None], force * dt, omega * dt])
-            return (x, jnp.concatenate([since[:7] + gone, since[7:]])), None
+            left_open = jnp.where(dt > 0, motion.variances(values[_OPEN:]), 0)
+            gone = jnp.concatenate([dt[None], force * dt, omega * dt, left_open])
+            return (x, motion, jnp.concatenate([since[:_SINCE] + gone, since[_SINCE:]])), None
 
-        (x, since), _ = jax.lax.scan(over, (state.nominal, state.since), (times, slots))
-        return state._replace(nominal=x, since=since), at
+        start = (state.nominal, state.motion, state.since)
+        (x, motion, since), _ = jax.lax.scan(over, start, (times, slots))
+        return state._replace(nominal=x, motion=motion, since=since), at
 
     def fuse(
-        self, state: FilterState, slot: Float[Array, "18"], k: Float[Array, ""]
+        self, state: FilterState, slot: Float[Array, "22"], k: Float[Array, ""]
     ) -> FilterState:
         """Bring P up to date and use the readings of the slot that left with sample number k."""
-        x = state.nominal
-        P = self._covariance(state, x, state.since[:7])
-        found = (
-            measurement.dvl_innovation(self.dvl, x, slot[_RATE:], slot[_DVL + 1 : _DEPTH]),
+        x, P, trust = state.nominal, self.covariance(state), state.trust
+        plain = (
+            measurement.dvl_innovation(self.dvl, x, slot[_RATE:_OPEN], slot[_DVL + 1 : _DEPTH]),
             measurement.depth_innovation(self.depth, x, slot[_DEPTH + 1 : _COMPASS]),
             measurement.compass_innovation(self.compass, x, slot[_COMPASS + 1 : _RATE]),
         )
+        factors = jnp.unstack(trust.noise_factor)
+        found = [each._replace(R=f * each.R) for each, f in zip(plain, factors, strict=True)]
         used = jnp.stack([slot[flag] > 0 for flag in (_DVL, _DEPTH, _COMPASS)])
-        # A filter that lost its way: what the sensor measures counts as unknown from here on.
-        lost = used & (state.rejected >= self.config.patience)
-        own = (error_state.VELOCITY, error_state.POSITION, error_state.ROTATION)
-        for i, (each, part) in enumerate(zip(found, own, strict=True)):
-            doubt = jnp.where(lost[i], each.residual**2, 0)
-            H = each.H[:, part]
-            P = P.at[part, part].add(H.T @ (doubt[:, None] * H))
-        gates = [float(chi2.ppf(self.config.gate, each.residual.size)) for each in found]
-        x, P, nis, accepted = measurement.update(x, P, found, used, gates)
         time = (k - self.slots) * self.period
+
+        sizes = jnp.stack([jnp.linalg.norm(each.residual) for each in plain])
+        spreads = jnp.stack([jnp.trace(each.H @ P @ each.H.T) for each in plain])
+        trust, left_out, follow = judged(
+            trust,
+            used,
+            sizes,
+            imu_off(self.imu, self.dvl, self.depth, self.compass),
+            self.config.patience,
+            self._vouched_for(state, time),
+            spreads,
+        )
+        for i, each in enumerate(plain):
+            P = self._unknown(P, i, each.H, jnp.where(follow[i], each.residual**2, 0))
+        gates = tuple(float(chi2.ppf(self.config.gate, size)) for size in SIZES)
+        plain_nis = measurement.normalized_squares(P, plain)
+        x, P, nis, accepted = measurement.update(x, P, found, used & ~left_out, gates)
+        for i, each in enumerate(plain):
+            lacks = trust.doubt[i] - jnp.diag(each.H @ P @ each.H.T)
+            P = self._unknown(P, i, each.H, jnp.maximum(lacks, 0))
+        elapsed = state.since[0]
+        trust = counted(trust, used, accepted, nis, plain_nis, gates, sizes, time, elapsed)
         return state._replace(
             nominal=x,
             P=P,
-            since=jnp.concatenate([jnp.zeros(7, P.dtype), x.v_B]),
-            nis=jnp.where(used, nis, state.nis),
-            rejected=jnp.where(accepted, 0, state.rejected + used.astype(P.dtype)),
-            accepted_at=jnp.where(accepted, time, state.accepted_at),
+            since=jnp.concatenate([jnp.zeros(_SINCE, P.dtype), x.v_B]),
+            trust=trust,
         )
 
-    def _covariance(
-        self, state: FilterState, after: Navigation, gone: Float[Array, "7"]
+    def _vouched_for(self, state: FilterState, time: Float[Array, ""]) -> Bool[Array, "3"]:
+        """For each sensor, whether the IMU and another sensor are well."""
+        c, trust = self.config, state.trust
+        well = (time - trust.accepted_at <= c.silence) & (trust.distrusted < 1)
+        well = well & (trust.rejected < c.patience) & (trust.accepted_at > 0)
+        others = jnp.sum(well) - well.astype(int)
+        return (others > 0) & (state.samples.calm > c.silence)
+
+    @staticmethod
+    def _unknown(
+        P: Float[Array, "18 18"], sensor: int, H: Float[Array, "m 18"], variance: Float[Array, "m"]
     ) -> Float[Array, "18 18"]:
-        """P after the time and the sums of force · dt and rate · dt of `gone`."""
+        """P with what a sensor measures less known, by a variance in each of its values."""
+        part = (error_state.VELOCITY, error_state.POSITION, error_state.ROTATION)[sensor]
+        own = H[:, part]
+        return P.at[part, part].add(own.T @ (variance[:, None] * own))
+
+    def covariance(self, state: FilterState) -> Float[Array, "18 18"]:
+        """P at the horizon."""
+        return self._covariance(state, state.nominal, state.since[:_SINCE])
+
+    def _covariance(
+        self, state: FilterState, after: Navigation, gone: Float[Array, "9"]
+    ) -> Float[Array, "18 18"]:
+        """P after `gone`: what `FilterState.since` sums."""
         time = gone[0]
         some = jnp.maximum(time, self.period)
-        before = state.nominal._replace(v_B=state.since[7:])
+        before = state.nominal._replace(v_B=state.since[_SINCE:])
         F, Q = error_state.transition(
-            before, after, gone[1:4] / some, gone[4:] / some, time, self._noisy_imu, self.compass
+            before, after, gone[1:4] / some, gone[4:7] / some, time, self._noisy_imu, self.compass
         )
         P = F @ state.P @ F.T + Q
+        open_ = jnp.zeros_like(jnp.diag(P)).at[error_state.VELOCITY].set(gone[7])
+        P = P + jnp.diag(open_.at[error_state.ROTATION].set(gone[8]))
         if not self.imu.integrating:
             P = P + time / self.period * self._between_samples(state)
         return (P + P.T) / 2
@@ -378,28 +397,31 @@ class DelayedFilter(eqx.Module):
         """
         T = self.period
         open_ = jnp.zeros_like(state.P)
-        turn, force = state.bends[3:, 3:], state.bends[:3, :3]
+        turn, force = state.samples.bends[3:, 3:], state.samples.bends[:3, :3]
         open_ = open_.at[error_state.ROTATION, error_state.ROTATION].set(turn * T**2 / 24)
         return open_.at[error_state.VELOCITY, error_state.VELOCITY].set(force * T**2 / 6)
 
     def status(self, state: FilterState, k: Float[Array, ""]) -> Float[Array, "10"]:
         """The status vector after `step` number k; see `STATUS`."""
         time = jnp.maximum(k - self.slots, 0) * self.period
-        age = time - state.accepted_at
-        return jnp.concatenate([time[None], state.nis, state.rejected, age])
+        age, trust = time - state.trust.accepted_at, state.trust
+        return jnp.concatenate([time[None], trust.nis, trust.rejected, age])
 
     def health(
         self, state: FilterState, P: Float[Array, "18 18"], k: Float[Array, ""]
     ) -> Float[Array, "5"]:
         """The health vector after `step` number k, for the covariance P that is shown."""
-        c, variance = self.config, jnp.diag(P)
-        age = jnp.maximum(k - self.slots, 0) * self.period - state.accepted_at
-        trusted = (age <= c.silence) & (state.rejected < c.patience)
-        trusted = jnp.concatenate([jnp.ones(1, P.dtype), trusted.astype(P.dtype)])
+        c, variance, trust = self.config, jnp.diag(P), state.trust
+        age = jnp.maximum(k - self.slots, 0) * self.period - trust.accepted_at
+        fit = (age <= c.silence) & (trust.rejected < c.patience) & (trust.distrusted < 1)
+        # a doubt of what a reading may be off anyway is none
+        small = jnp.asarray([self.dvl.noise, self.depth.noise, self.compass.noise], P.dtype)
+        fit = fit & ~state.shown.stuck & (trust.doubt <= small**2) & (trust.noise_factor <= 1)
+        fit = jnp.concatenate([(state.samples.calm > 1)[None], fit])
         lost = jnp.any(variance[error_state.VELOCITY] > c.lost_velocity**2)
         lost = lost | jnp.any(variance[error_state.ROTATION] > c.lost_attitude**2)
-        state_ = jnp.where(lost, 2.0, jnp.where(jnp.all(trusted > 0), 0.0, 1.0))
-        return jnp.concatenate([state_[None].astype(P.dtype), trusted])
+        overall = jnp.where(lost, 2.0, jnp.where(jnp.all(fit), 0.0, 1.0))
+        return jnp.concatenate([overall[None].astype(P.dtype), fit.astype(P.dtype)])
 
     def present(
         self, state: FilterState, ahead: float | Float[Array, ""]
@@ -412,16 +434,19 @@ class DelayedFilter(eqx.Module):
         """
         x, ring = state.nominal, state.ring
         time = ring[:, 0] * self.period
-        force, omega = ring[:, 1:4].T - x.accel_bias[:, None], ring[:, 4:7].T - x.gyro_bias[:, None]
+        missing, left_open = ring[:, _OPEN] > 0, jax.vmap(state.motion.variances)(ring[:, _OPEN:])
+        still = self._still(x, jnp.zeros_like(x.v_B))[:, None]
+        force = jnp.where(missing[None], still, ring[:, 1:4].T - x.accel_bias[:, None])
+        omega = ring[:, 4:7].T - x.gyro_bias[:, None]
         increment = error_state.chain_all(error_state.sample_increment(force, omega, time))
         now = error_state.apply(x, increment, self.imu.gravity)
         waiting = jnp.concatenate(
-            [time[:, None], force.T * time[:, None], omega.T * time[:, None]], 1
+            [time[:, None], force.T * time[:, None], omega.T * time[:, None], left_open], 1
         )
-        P = self._covariance(state, now, state.since[:7] + jnp.sum(waiting, axis=0))
-        rate = state.rate - x.gyro_bias
-        mean = _mean(force[:, -_FEW:].T, ring[-_FEW:, :1])
-        beyond = error_state.sample_increment(mean, rate, ahead * ring[-1, 0])
+        P = self._covariance(state, now, state.since[:_SINCE] + jnp.sum(waiting, axis=0))
+        foreseen = state.samples.foreseen - jnp.concatenate([x.accel_bias, x.gyro_bias])
+        rate = foreseen[3:]
+        beyond = error_state.sample_increment(foreseen[:3], rate, ahead * ring[-1, 0])
         now = error_state.apply(now, beyond, self.imu.gravity)
         P = P + self._foreseen(state, now, ahead)
         return now.X_WB, jnp.concatenate([now.v_B, rate]), P
@@ -435,9 +460,4 @@ class DelayedFilter(eqx.Module):
         J = J.at[error_state.POSITION, :3].set(ahead / 2 * a)
         J = J.at[error_state.ROTATION, 3:].set(a).at[error_state.VELOCITY, :3].set(a)
         J = J.at[error_state.VELOCITY, 3:].set(ahead * error_state.skew(now.v_B))
-        return J @ state.steps @ J.T
-
-
-def _mean(values: Float[Array, "n 3"], has: Float[Array, "n 1"]) -> Float[Array, "3"]:
-    """Mean of the rows that there are, zero if there are none."""
-    return jnp.sum(values * has, axis=0) / jnp.maximum(jnp.sum(has), 1)
+        return J @ state.samples.steps @ J.T

@@ -127,6 +127,15 @@ def together(found: Sequence[Innovation]) -> Innovation:
     return Innovation(jnp.concatenate(residuals), jnp.concatenate(rows), R)
 
 
+def normalized_squares(P: Float[Array, "18 18"], found: Sequence[Innovation]) -> Float[Array, " n"]:
+    """Each sensor's NIS by itself."""
+    scores = []
+    for each in found:
+        S = each.H @ P @ each.H.T + each.R
+        scores.append(each.residual @ small_inverse(S) @ each.residual)
+    return jnp.stack(scores)
+
+
 def update(
     nominal: Navigation,
     P: Float[Array, "18 18"],

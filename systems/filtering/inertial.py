@@ -1,0 +1,209 @@
+"""Inertial samples one by one: which to believe, and how far each was from what was foreseen.
+
+A sample is left out where it is not finite, at or beyond the instrument's range, stuck (values
+repeat to the last bit) or far from the samples before it. What is left out adds to the covariance:
+by the size of what was refused, since it may have been true, and by how the vehicle usually moves.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ...models import se3
+from ...models.sensors import Imu
+from ...models.sensors.base import velocity_at
+
+FEW = 5
+"""Samples whose mean force is what is foreseen of the next."""
+
+_REMEMBERED = 2.0  # s: time constant of the averages of how samples differ
+_RECENT = 0.25  # s
+_USUAL = 10.0  # s: time constant of the averages of how the vehicle moves
+_KEPT_UP = 1.0  # s for which an acceleration or a rate of turn lasts
+_FADES = 0.3  # s: time constant with which the last rate fades where none follows
+_STUCK_TOGETHER = 5  # repeats of all three values of a triad: noise does not do that
+_STUCK_ALONE = 50  # repeats of one value, whose steps may be as coarse as its noise
+_ODD = 10.0  # standard deviations beyond which a sample is odd
+_ODD_RUN = 5  # odd samples in a row are a motion
+
+
+LEFT_OPEN = 4
+"""Of force, then of rate: 2 T times how long it has been missing, at most a second (s²), and the
+variance of what was refused of velocity (m²/s²) or angle (rad²)."""
+
+
+class Samples(NamedTuple):
+    """What is remembered of the samples until now, in body axes."""
+
+    shown: Float[Array, "6"]
+    """Newest reading as it came, in the sensor's axes."""
+    repeats: Float[Array, "6"]
+    """For how many readings each value has been the same."""
+    missing: Float[Array, "2"]
+    """For how long force and rate have been missing (s)."""
+    odd: Float[Array, ""]
+    """Odd samples in a row."""
+    calm: Float[Array, ""]
+    """Time since a sample was last left out (s)."""
+    count: Float[Array, ""]
+    """Samples until now."""
+    forces: Float[Array, "few 3"]
+    """The newest good forces (m/s²)."""
+    rates: Float[Array, "2 3"]
+    """The newest two rates (rad/s), the biases still in them."""
+    steps: Float[Array, "6 6"]
+    """Mean square of what a sample of [force, rate] differs from the one foreseen."""
+    bends: Float[Array, "6 6"]
+    """Mean square of the second differences of [force, rate]."""
+
+    @classmethod
+    def start(cls, rate: Float[Array, "3"]) -> "Samples":
+        """Before the first sample, at a rate that was estimated."""
+        zero = jnp.zeros((), rate.dtype)
+        square = jnp.zeros((6, 6), rate.dtype)
+        return cls(
+            jnp.full(6, jnp.inf, rate.dtype),
+            jnp.zeros(6, rate.dtype),
+            jnp.zeros(2, rate.dtype),
+            zero,
+            jnp.full((), 1e3, rate.dtype),
+            zero,
+            jnp.zeros((FEW, 3), rate.dtype),
+            jnp.stack([rate, rate]),
+            square,
+            square,
+        )
+
+    @property
+    def foreseen(self) -> Float[Array, "6"]:
+        """The next sample: mean of the last few forces, and the last rate."""
+        known = jnp.clip(self.count, 1, FEW)
+        return jnp.concatenate([jnp.sum(self.forces, axis=0) / known, self.rates[-1]])
+
+
+class Motion(NamedTuple):
+    """How the vehicle moves, for what a missing sample leaves open."""
+
+    recent: Float[Array, "6"]
+    """Acceleration (m/s²) and rate (rad/s) over the last quarter of a second, in body axes."""
+    usual: Float[Array, "2"]
+    """Their mean squares."""
+
+    @classmethod
+    def start(cls, dtype: jnp.dtype) -> "Motion":
+        """Of a vehicle that was not seen yet."""
+        return cls(jnp.zeros(6, dtype), jnp.asarray([0.3**2, 0.2**2], dtype))
+
+    def after(
+        self, acceleration: Float[Array, "3"], rate: Float[Array, "3"], dt: Float[Array, ""]
+    ) -> "Motion":
+        """With what was seen for another dt; nothing is seen in no time."""
+        now = jnp.concatenate([acceleration, rate])
+        recent = self.recent + (1 - jnp.exp(-dt / _RECENT)) * (now - self.recent)
+        squares = jnp.sum(recent.reshape(2, 3) ** 2, axis=1)
+        usual = self.usual + (1 - jnp.exp(-dt / _USUAL)) * (squares - self.usual)
+        floor = jnp.asarray([0.1**2, 0.05**2], usual.dtype)
+        return Motion(recent, jnp.maximum(usual, floor))
+
+    def variances(self, left_open: Float[Array, "4"]) -> Float[Array, "2"]:
+        """Variances of velocity and angle that a row's `LEFT_OPEN` stands for.
+
+        An acceleration a that lasts for τ makes a velocity of variance a² t² at first and 2 a² τ t
+        later.
+        """
+        return left_open[0::2] * self.usual + left_open[1::2]
+
+
+def take(
+    imu: Imu,
+    memory: Samples,
+    sample: Float[Array, "6"],
+    number: Float[Array, ""],
+) -> tuple[Samples, Float[Array, "11"]]:
+    """The memory after a sample and its row in body axes; nothing happens where `number` is < 0.
+
+    The row: 1 if it moves the vehicle, force 3, mean rate 3, then `LEFT_OPEN`. A missing force is
+    zero: what stands in for it depends on the state.
+    """
+    dtype, T = sample.dtype, 1 / imu.rate
+    limits = jnp.repeat(jnp.asarray([imu.accelerometer_range, imu.gyroscope_range], dtype), 3)
+    repeats = jnp.where(sample == memory.shown, memory.repeats + 1, 0)
+    within = jnp.isfinite(sample) & (jnp.abs(sample) < limits)
+    by_triad = jnp.stack([repeats[:3], repeats[3:]])
+    stuck = (by_triad.min(axis=1) >= _STUCK_TOGETHER) | (by_triad.max(axis=1) >= _STUCK_ALONE)
+    good = jnp.stack([within[:3].all(), within[3:].all()]) & ~stuck
+    sample = jnp.where(within, sample, 0)
+
+    X_BS = imu.mount(dtype)
+    rate = se3.rotate(X_BS, sample[3:])
+    fading = memory.rates[-1] * jnp.exp(-(memory.missing[1] + T) / _FADES)
+    rate = jnp.where(good[1], rate, fading)
+    force = se3.rotate(X_BS, sample[:3])
+    if any(imu.position):  # from the sensor's place to Bo
+        r = X_BS[4:]
+        spin = velocity_at(r, jnp.concatenate([jnp.zeros_like(rate), rate]))
+        turning = (rate - memory.rates[-1]) * imu.rate
+        force = force - se3.cross(rate, spin) - se3.cross(turning, r)
+
+    # How far the sample is from what was foreseen, in standard deviations of such steps.
+    step = jnp.concatenate([force, rate]) - memory.foreseen
+    noise = jnp.repeat(jnp.asarray(imu.noise_std(), dtype), 3)
+    floor = jnp.asarray((2.0,) * 3 + (0.5,) * 3, dtype)
+    bound = _ODD * jnp.sqrt(jnp.diag(memory.steps) + noise**2) + floor
+    far = (jnp.abs(step) > bound) & jnp.repeat(good, 3) & (memory.count > FEW)
+    odd = jnp.where(far.any(), memory.odd + 1, 0.0).astype(dtype)
+    refused = jnp.stack([far[:3].any(), far[3:].any()]) & (odd <= _ODD_RUN)
+    squares = jnp.stack([jnp.sum(step[:3] ** 2), jnp.sum(step[3:] ** 2)])
+    believed = good & ~refused
+
+    missing = jnp.where(believed, 0.0, memory.missing + T)
+    held = 2 * T * jnp.minimum(missing, _KEPT_UP)
+    doubted = jnp.where(refused, squares * T**2, 0.0)
+    left_open = jnp.where(believed, 0.0, jnp.stack([held, doubted])).T.reshape(-1)
+    rate = jnp.where(believed[1], rate, fading)
+    force = jnp.where(believed[0], force, 0.0)
+    mean = rate if imu.integrating else (rate + memory.rates[-1]) / 2
+
+    after = _learn(imu, memory, step, bound, force, rate, believed)
+    after = after._replace(
+        shown=jnp.where(within, sample, memory.shown),
+        repeats=repeats,
+        missing=missing,
+        odd=odd,
+        calm=jnp.where(believed.all(), memory.calm + T, 0.0),
+        count=memory.count + 1,
+    )
+    row = jnp.concatenate([(number >= 1).astype(dtype)[None], force, mean, left_open])
+    return jax.tree.map(lambda new, old: jnp.where(number >= 0, new, old), after, memory), row
+
+
+def _learn(
+    imu: Imu,
+    memory: Samples,
+    step: Float[Array, "6"],
+    bound: Float[Array, "6"],
+    force: Float[Array, "3"],
+    rate: Float[Array, "3"],
+    believed: Bool[Array, "2"],
+) -> Samples:
+    """The averages after a sample; one that is left out teaches nothing of itself."""
+    known = believed.all() & (memory.count > FEW)
+
+    def mean_square(old: Array, x: Array) -> Array:
+        """Plain mean over the first ones, then what fades with time."""
+        fading = 1 - jnp.exp(-jnp.asarray(1 / (imu.rate * _REMEMBERED), x.dtype))
+        weight = jnp.maximum(1 / jnp.maximum(memory.count - FEW, 1), fading)
+        return jnp.where(known, old + weight * (x[:, None] * x[None] - old), old)
+
+    step = jnp.clip(step, -bound, bound)
+    forces = jnp.concatenate([memory.forces[1:], force[None]])
+    rates = jnp.concatenate([memory.rates, rate[None]])
+    bend = jnp.concatenate([forces[-1] - 2 * forces[-2] + forces[-3], jnp.diff(rates, 2, 0)[0]])
+    return memory._replace(
+        forces=jnp.where(believed[0], forces, memory.forces),
+        rates=rates[1:],
+        steps=mean_square(memory.steps, step),
+        bends=mean_square(memory.bends, bend),
+    )

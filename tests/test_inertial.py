@@ -1,0 +1,136 @@
+"""Inertial samples: what is left out, what stands in for it, what it leaves open."""
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from spinndrift.models.sensors import Imu
+from spinndrift.systems.filtering.inertial import FEW, LEFT_OPEN, Motion, Samples, take
+
+IMU = Imu()
+T = 1 / IMU.rate
+N = 400
+FORCE, RATE = slice(1, 4), slice(4, 7)
+
+
+@jax.jit
+def taken(samples: jax.Array) -> tuple[Samples, jax.Array]:
+    def over(memory, given):
+        return take(IMU, memory, *given)
+
+    numbers = jnp.arange(len(samples), dtype=samples.dtype)
+    return jax.lax.scan(over, Samples.start(jnp.zeros(3)), (samples, numbers))
+
+
+def noisy(seed: int = 0, force: float = 0.01, rate: float = 0.001) -> np.ndarray:
+    """Samples at rest, with noise."""
+    rng = np.random.default_rng(seed)
+    noise = rng.standard_normal((N, 6)) * np.repeat([force, rate], 3)
+    return noise + np.array([0, 0, 9.81, 0, 0, 0])
+
+
+def rows(samples: np.ndarray) -> np.ndarray:
+    return np.asarray(taken(jnp.asarray(samples))[1])
+
+
+def left_out(row: np.ndarray) -> np.ndarray:
+    """Whether force and rate of rows are left out."""
+    return row[..., -LEFT_OPEN::2] > 0
+
+
+def test_good_samples_go_through_as_they_are():
+    samples = noisy()
+    found = rows(samples)
+    np.testing.assert_array_equal(found[:, 1:7], samples)
+    np.testing.assert_array_equal(found[:, 0], np.arange(N) >= 1)  # the first moves nothing
+    assert not found[:, -LEFT_OPEN:].any()
+
+
+def test_what_is_not_finite_or_out_of_range_is_left_out():
+    for value in (np.nan, np.inf, -np.inf, 1000.0, -IMU.accelerometer_range):
+        samples = noisy()
+        samples[100, 0] = value
+        samples[200, 5] = value
+        found = rows(samples)
+        assert np.isfinite(found).all()
+        out = left_out(found)
+        np.testing.assert_array_equal(np.flatnonzero(out[:, 0]), [100])
+        np.testing.assert_array_equal(np.flatnonzero(out[:, 1]), [200])
+        # nothing was refused that could have been true
+        assert not found[:, -LEFT_OPEN + 1 :: 2].any()
+
+
+def test_a_frozen_unit_is_found_out_and_coarse_steps_are_none():
+    samples = noisy()
+    samples[100:200] = samples[99]
+    out = left_out(rows(samples)).all(axis=1)
+    np.testing.assert_array_equal(np.flatnonzero(out), np.arange(104, 200))
+    coarse = np.round(noisy() / 0.02) * 0.02  # steps of twice the noise of the force
+    coarse[:, 3:] = np.round(noisy()[:, 3:] / 0.001) * 0.001
+    assert not left_out(rows(coarse)).any()
+
+
+def test_one_value_that_stands_still_is_found_out():
+    samples = noisy()
+    samples[100:, 1] = samples[99, 1]
+    out = left_out(rows(samples))
+    assert not out[:140].any()
+    assert out[150:, 0].all()
+
+
+def test_a_spike_in_range_is_refused_and_may_have_been_true():
+    samples = noisy()
+    samples[100, 0] += 50.0
+    samples[200, 4] += 5.0
+    found = rows(samples)
+    assert left_out(found)[100, 0]
+    assert left_out(found)[200, 1]
+    doubted = found[:, -LEFT_OPEN + 1 :: 2]
+    np.testing.assert_allclose(doubted[100, 0], (50 * T) ** 2, rtol=1e-2)
+    np.testing.assert_allclose(doubted[200, 1], (5 * T) ** 2, rtol=1e-2)
+    np.testing.assert_allclose(found[200, RATE], 0, atol=0.01)  # the last rate goes on
+
+
+def test_a_step_that_stays_is_a_motion():
+    samples = noisy()
+    samples[100:, 0] += 30.0
+    samples[100:, 4] += 3.0
+    out = left_out(rows(samples)).any(axis=1)
+    assert 0 < out.sum() <= 10
+    assert not out[120:].any()
+
+
+def test_the_scatter_is_that_of_white_noise():
+    """A sample minus the mean of the last few: σ² (1 + 1/few); rates minus the last: 2 σ²."""
+    memory, _ = taken(jnp.asarray(noisy(force=0.3, rate=0.02)))
+    scatter = np.diag(memory.steps)
+    effective = N / 2  # two seconds of memory in four
+    bound = 4 * math.sqrt(2 / effective)
+    np.testing.assert_allclose(scatter[:3] / (0.09 * (1 + 1 / FEW)), 1, atol=bound)
+    np.testing.assert_allclose(scatter[3:] / (2 * 0.0004), 1, atol=bound)
+
+
+def test_what_a_missing_force_leaves_open():
+    """a² t² while an acceleration lasts, growing as time later."""
+    motion = Motion(jnp.zeros(6), jnp.array([0.5**2, 0.1**2]))
+    samples = noisy()
+    samples[100:300, :3] = np.nan
+    opened = jax.vmap(motion.variances)(jnp.asarray(rows(samples)[:, -LEFT_OPEN:]))
+    total = np.cumsum(np.asarray(opened)[:, 0])
+    np.testing.assert_allclose(total[149], 0.25 * 0.5**2, rtol=0.03)
+    np.testing.assert_allclose(total[299] - total[199], 2 * 0.25 * 1.0, rtol=0.02)
+    assert not np.asarray(opened)[:, 1].any()
+
+
+def test_how_a_vehicle_usually_moves():
+    after = jax.jit(partial(Motion.after, dt=jnp.asarray(0.01)))
+    motion = Motion.start(jnp.dtype("float64"))
+    for _ in range(6000):
+        motion = after(motion, jnp.array([0.6, 0, 0.8]), jnp.array([0, 0.3, 0.4]))
+    np.testing.assert_allclose(motion.usual, [1.0, 0.25], rtol=0.02)
+    for _ in range(12000):
+        motion = after(motion, jnp.zeros(3), jnp.zeros(3))
+    np.testing.assert_allclose(motion.usual, [0.1**2, 0.05**2])  # no vehicle is quite at rest

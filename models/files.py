@@ -12,6 +12,7 @@ from pathlib import Path
 
 from .errors import UserError
 
+_PARTIAL = ".partial-"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 """What the operating system says of a disk that takes no more, rather than of a mistake."""
 
@@ -28,8 +29,10 @@ def disk_errors_told(path: str | os.PathLike[str]) -> Iterator[None]:
     except OSError as error:
         if error.errno not in DISK_ERRORS:
             raise
+        parts = (part for part in Path(path).parts if not part.startswith(_PARTIAL))
         raise UserError(
-            f"{path}: can't be written ({error.strerror}); make room there or name another place"
+            f"{Path(*parts)}: can't be written ({error.strerror}); make room there or name another "
+            "place"
         ) from error
 
 
@@ -74,7 +77,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 def partial_name() -> str:
     """How the name of a file or folder begins that is being written, different each time."""
-    return f".partial-{secrets.token_hex(8)}"
+    return f"{_PARTIAL}{secrets.token_hex(8)}"
 
 
 def remove(path: Path) -> None:

@@ -63,13 +63,17 @@ def test_what_can_not_be_written_is_told_and_leaves_nothing(tmp_path, name, ther
 def test_files_that_belong_together_are_written_all_or_none(tmp_path):
     (tmp_path / "a.txt").write_text("old")
 
-    def write() -> None:
+    def write(writer) -> None:
         with atomic_files(tmp_path) as partial:
             (partial / "a.txt").write_text("new")
-            (partial / "b.txt").write_text("n" * 2 * ROOM)
+            writer(partial / "b.txt")
 
-    with full_disk(ROOM), pytest.raises(UserError, match="can't be written"):
-        write()
+    for writer, words in (
+        (lambda at: at.write_text("n" * 2 * ROOM), f"^{tmp_path}: can't be written"),
+        (table, f"^{tmp_path}/b.txt: can't be written"),
+    ):
+        with full_disk(ROOM), pytest.raises(UserError, match=words):
+            write(writer)
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a.txt": "old"}
 
 

@@ -41,6 +41,9 @@ _NAMES = {
     "health_good": "estimator good",
     "health_degraded": "estimator degraded",
     "health_lost": "estimator lost",
+    "allowed_collision_probability": "allowed collision probability",
+    "plans_beyond_allowed": "plans beyond what is allowed",
+    "least_risk_to_goal": "collision risk on the widest way to the goal",
     "planner_median_ms": "one call of the planner, median (ms)",
     "planner_p95_ms": "one call of the planner, 95 % below (ms)",
 }
@@ -136,9 +139,8 @@ def _path_section(
 
 def _risk(planner: dict[str, Any]) -> str:
     """Whether the chance constraint was kept."""
-    allowed, beyond = (
-        planner.get(f"{name}") for name in ("allowed_collision_probability", "plans_beyond_allowed")
-    )
+    allowed = planner.get("allowed_collision_probability")
+    beyond = planner.get("plans_beyond_allowed")
     if allowed is None:
         return " No collision risk is allowed for: the chance constraint is left out."
     text = f" Dashed: the collision risk that the chance constraint allows, {100 * allowed:g} %."

@@ -39,11 +39,9 @@ def find_passage(scenario: Scenario) -> Passage | None:
     if not isinstance(scenario.success, ReachGoal) or scenario.goal is None:
         return None
     controller, station = scenario.controller, scenario.station
-    std, allowed = 0.0, 0.0
+    std, allowed = 0.0, None
     if isinstance(controller, MppiImpedance):
-        std = controller.planner.clearance_std
-        risk = controller.planner.collision_risk
-        allowed = 0.5 if risk is None else risk
+        std, allowed = controller.planner.clearance_std, controller.planner.collision_risk
     widest = widest_way(
         np.array(station.start.position),
         scenario.goal,
@@ -66,13 +64,12 @@ def holding(scenario: Scenario) -> ControllerKind:
 
 def no_safe_plan(scenario: Scenario, passage: Passage) -> str:
     """The sentences that say so."""
-    if passage.std == 0:
-        return "No safe plan: the vehicle fits through on no way to the goal."
     held = " The vehicle held its place." if isinstance(scenario.controller, MppiImpedance) else ""
-    return (
-        f"No safe plan: every way to the goal has a collision risk of {_percent(passage.risk)} or "
-        f"more, and {_percent(passage.allowed)} is allowed.{held}"
-    )
+    risk = f"has a collision risk of {_percent(passage.risk)} or more"
+    if passage.allowed is None:
+        return f"No safe plan: no way to the goal is wide enough for the hull; each {risk}.{held}"
+    allowed = _percent(passage.allowed)
+    return f"No safe plan: every way to the goal {risk}, and {allowed} is allowed.{held}"
 
 
 def _check(field: str, pose: PoseConfig, scenario: Scenario) -> None:

@@ -29,12 +29,12 @@ class Passage(NamedTuple):
     Attributes:
         clearance: no way keeps more than this (m) from the obstacles all along.
         std: standard deviation of the clearance that is reckoned with (m).
-        allowed: allowed probability of a collision.
+        allowed: allowed probability of a collision; None asks that the vehicle fits through.
     """
 
     clearance: float
-    std: float
-    allowed: float
+    std: float = 0.0
+    allowed: float | None = None
 
     @property
     def risk(self) -> float:
@@ -46,7 +46,7 @@ class Passage(NamedTuple):
     @property
     def safe(self) -> bool:
         """Whether the allowed risk may be kept to."""
-        return self.risk <= self.allowed
+        return self.clearance >= 0 if self.allowed is None else self.risk <= self.allowed
 
 
 def widest_way(

@@ -76,7 +76,9 @@ def test_risk_is_that_of_the_widest_way():
     assert not tight.safe
     assert Passage(0.08 * norm.isf(0.05) + 1e-9, 0.08, 0.05).safe
     assert Passage(np.inf, 0.08, 0.05).risk == 0
-    assert (Passage(-0.01, 0.0, 0.0).safe, Passage(0.01, 0.0, 0.0).safe) == (False, True)
+    assert (Passage(-0.01).safe, Passage(0.01).safe) == (False, True)
+    assert (Passage(-0.01).risk, Passage(0.01).risk) == (1.0, 0.0)
+    assert Passage(0.01, 0.08).safe
 
 
 def test_the_gap_of_an_upright_hull():

@@ -78,5 +78,9 @@ class Run:
                 told.append(f"{name} {block[key]:.2f} m")
         if timing["real_time_factor"] is not None:
             told.append(f"{timing['real_time_factor']:.1f} × real time")
+        beyond = values["planner"].get("plans_beyond_allowed")
+        if beyond:
+            allowed = values["planner"]["allowed_collision_probability"]
+            told.append(f"collision risk beyond the allowed {100 * allowed:g} % in {beyond} plans")
         shown.print(", ".join(told))
         shown.print(f"wrote {out}" + (f"; open {out / 'report.html'}" if self.report else ""))

@@ -89,6 +89,11 @@ blind: $(INSTALLED) ## write cases of hidden effects for `spinndrift check diagn
 	PYTHONPATH=tests $(BIN)/python -m hidden runs/blind --scale $(or $(SCALE),small) \
 		$(if $(NULLS),--nulls $(NULLS))
 
+.PHONY: fuzz
+fuzz: $(INSTALLED) ## N=100000 mutated inputs of each kind of file; ONLY=bin, FIRST=number to go on
+	$(ONE_THREAD) PYTHONPATH=tests $(BIN)/python -m fuzz --count $(or $(N),100000) \
+		--first $(or $(FIRST),0) $(if $(ONLY),--only $(ONLY))
+
 .PHONY: lock
 lock: ## write requirements.txt anew with the newest versions that pyproject.toml allows
 	@rm -rf build/lock && mkdir -p build && $(PYTHON) -m venv build/lock

@@ -5,14 +5,9 @@ loadable if it is registered here (`register`), so that reading a file never run
 """
 
 import dataclasses
-import io
 import json
-import struct
-import zipfile
-import zlib
 from collections.abc import Callable
 from os import PathLike
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,7 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .archive import read_archive
+from .config import structured
 from .dynamics import Dynamics
+from .effects.base import Effect
 from .effects.extended import Extended
 from .effects.library import kind
 from .errors import UserError
@@ -32,22 +30,9 @@ from .spinn import Spinn, SpinnConfig
 
 FORMAT = "spinndrift model"
 VERSION = 1
-
-
-_DAMAGE = (
-    ValueError,  # not a zip, wrong JSON, wrong array header
-    TypeError,  # a lone array instead of an archive, wrong JSON structure
-    AttributeError,
-    LookupError,  # a missing array or header field
-    EOFError,
-    SyntaxError,  # array header
-    ArithmeticError,
-    RuntimeError,  # zip features nobody wrote here: encryption, other compressions
-    MemoryError,  # an absurd size in a damaged array header
-    zipfile.BadZipFile,
-    zlib.error,
-    struct.error,
-)
+_MOST_THRUSTERS = 64
+_LARGEST = 1e6
+"""Of an effect's options, which are counts, times, lengths and numbers of terms."""
 
 
 class Kind(NamedTuple):
@@ -87,11 +72,14 @@ def template(description: dict[str, Any]) -> Dynamics:
     """A model of the structure that `describe` told, with arbitrary numbers.
 
     Raises:
-        ValueError: the kind is unknown or its configuration is wrong.
+        UserError: the kind is unknown, or there is no configuration.
+        ValueError: the configuration is wrong (LookupError and TypeError likewise).
     """
-    name = description["kind"]
-    if name not in _KINDS:
-        raise ValueError(f"kind {name!r} is none of {', '.join(sorted(_KINDS))}")
+    name = description.get("kind")
+    if not isinstance(name, str) or name not in _KINDS:
+        raise UserError(f"kind {str(name)[:40]!r} is none of {', '.join(sorted(_KINDS))}")
+    if "config" not in description:
+        raise UserError("there is no config")
     return _KINDS[name].template(description["config"])
 
 
@@ -133,54 +121,46 @@ def load_model(
     header, leaves = _read(path)
     try:
         model = template(header)
-        arrays, static = eqx.partition(model, eqx.is_array)
-        old, treedef = jax.tree.flatten(arrays)
-        if [leaf.shape for leaf in old] != [leaf.shape for leaf in leaves]:
-            raise ValueError("the arrays don't have the shapes of the described model")
-    except (LookupError, TypeError, ValueError) as error:
+    except UserError as error:
         raise UserError(f"{path}: not a model this version can make ({error}).") from error
+    except (LookupError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{path}: not a model this version can make (its description is damaged, or another "
+            "version's); save it again."
+        ) from error
+    arrays, static = eqx.partition(model, eqx.is_array)
+    old, treedef = jax.tree.flatten(arrays)
+    if [(a.shape, a.dtype.kind) for a in old] != [(a.shape, a.dtype.kind) for a in leaves]:
+        raise UserError(f"{path}: its arrays don't have the shapes of the described model.")
     wide = any(leaf.dtype == np.float64 for leaf in leaves)
     if dtype is None and wide and jnp.asarray(0.0).dtype != jnp.float64:
         raise UserError(
             f"{path}: holds float64 numbers; enable jax_enable_x64 or pass dtype=jnp.float32."
         )
     if dtype is not None:
-        leaves = [
-            leaf.astype(dtype) if np.issubdtype(leaf.dtype, np.floating) else leaf
-            for leaf in leaves
-        ]
+        with np.errstate(over="ignore"):  # such numbers are refused below
+            leaves = [leaf.astype(dtype) if leaf.dtype.kind == "f" else leaf for leaf in leaves]
+    if not all(np.isfinite(leaf).all() for leaf in leaves):
+        raise UserError(
+            f"{path}: holds numbers that are not finite; train or save the model again."
+        )
     filled = jax.tree.unflatten(treedef, [jnp.asarray(leaf) for leaf in leaves])
     return eqx.combine(filled, static), header["metadata"]
 
 
 def _read(path: str | PathLike[str]) -> tuple[dict[str, Any], list[np.ndarray]]:
     """Header and arrays of a file whose format, version and completeness have been checked."""
-    try:
-        content = io.BytesIO(Path(path).read_bytes())
-        with np.load(content, allow_pickle=False) as archive:
-            header = json.loads(archive["header"].tobytes())
-            if not isinstance(header, dict) or header.get("format") != FORMAT:
-                raise ValueError("no spinndrift header")
-            version = header.get("version")
-            if isinstance(version, int) and version > VERSION:
-                raise UserError(
-                    f"{path}: model format version {version} is newer than {VERSION}; "
-                    "update spinndrift."
-                )
-            leaves = [archive[f"array_{i:04d}"] for i in range(len(header["arrays"]))]
-            told = [[list(leaf.shape), str(leaf.dtype)] for leaf in leaves]
-            if told != header["arrays"] or not isinstance(header["metadata"], dict):
-                raise ValueError("header and arrays don't agree")
-    except UserError:
-        raise
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such model file; check the path.") from None
-    except OSError as error:
-        raise UserError(f"{path}: can't be read ({error.strerror or error}).") from error
-    except _DAMAGE as error:
+    header, leaves = read_archive(path, "model")
+    if header.get("format") != FORMAT:
+        raise UserError(f"{path}: not a spinndrift model file; give one that training wrote.")
+    version = header.get("version")
+    if isinstance(version, int) and version > VERSION:
         raise UserError(
-            f"{path}: not a whole spinndrift model file ({error}); save or copy it again."
-        ) from error
+            f"{path}: model format version {version} is newer than {VERSION}; update spinndrift."
+        )
+    told = [[list(leaf.shape), str(leaf.dtype)] for leaf in leaves]
+    if told != header.get("arrays") or not isinstance(header.get("metadata"), dict):
+        raise UserError(f"{path}: header and arrays don't agree; save or copy the file again.")
     return header, leaves
 
 
@@ -199,8 +179,8 @@ def _unit_body() -> FossenDynamics:
 
 
 def _spinn(config: dict[str, Any]) -> Spinn:
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in config.items()}
-    return create_spinn(SpinnConfig(**values), _unit_body(), jax.random.key(0), jnp.float32)
+    made = structured(SpinnConfig, config, "configuration")
+    return create_spinn(made, _unit_body(), jax.random.key(0), jnp.float32)
 
 
 register(FossenDynamics, lambda _: {}, lambda _: cast(_unit_body(), jnp.float32))
@@ -221,9 +201,27 @@ def _describe_extended(model: Extended) -> dict[str, Any]:
     return {"base": describe(model.base), "effects": effects, "thrusters": n}
 
 
+def _neutral(name: str, options: dict[str, Any]) -> Effect:
+    """An effect of that name, its options of the types of their defaults."""
+    cls = kind(name)
+    usual = {field.name: field.default for field in dataclasses.fields(cls)}
+    if not isinstance(options, dict):
+        raise ValueError(f"options of {name}")
+    for option, value in options.items():
+        numbers = value if isinstance(value, list) else [value]
+        plain = all(isinstance(n, int | float) and abs(n) < _LARGEST for n in numbers)
+        if not (isinstance(value, str) if isinstance(usual[option], str) else plain):
+            raise ValueError(f"{option} of {name}")
+        if isinstance(usual[option], int) and not (isinstance(value, int) and value >= 1):
+            raise ValueError(f"{option} of {name}")
+    return cls.neutral(jnp.float32, **options)
+
+
 def _extended(config: dict[str, Any]) -> Extended:
-    effects = tuple(kind(e["name"]).neutral(jnp.float32, **e["options"]) for e in config["effects"])
-    n = int(config["thrusters"])
+    effects = tuple(_neutral(e["name"], e["options"]) for e in config["effects"])
+    n = config["thrusters"]
+    if n not in range(1, _MOST_THRUSTERS + 1):
+        raise ValueError(f"{n} thrusters")
     places, inverse = jnp.zeros((3, n), jnp.float32), jnp.zeros((n, 6), jnp.float32)
     base = template(config["base"])
     return Extended(base, effects, places, places, inverse)  # pyright: ignore[reportCallIssue]

@@ -43,6 +43,8 @@ from .errors import UserError
 from .yaml_text import Tagged, emit, line_of, parse
 
 T = TypeVar("T")
+_LARGEST_INT = 2**53
+"""Whole numbers up to here are the same in floating point."""
 FieldPath = tuple[str | int, ...]
 
 
@@ -64,15 +66,28 @@ def load(cls: type[T], path: str | PathLike[str], base: T | None = None) -> T:
 def loads(cls: type[T], text: str, source: str = "text", base: T | None = None) -> T:
     """Read a `cls` from YAML text; `source` is how messages call the text.
 
-    Mappings are laid over those of `base` key by key, lists and values of another tag replace it.
+    Mappings are laid over those of `base` key by key, also where only `base` has a tag; lists and
+    values of another tag replace it.
 
     Raises:
         UserError: one line a fault, each `source:line: field: what was found; what to write`.
     """
     data, node = parse(text, source)
-    data = {} if data is None else data
+    if data is None:
+        if base is None and (needed := _needed(cls)):
+            raise UserError(f"{source}: holds nothing; write a mapping with {', '.join(needed)}")
+        data = {}
     if base is not None:
         data = _overlaid(parse(dump(base), source)[0], data)
+    return structured(cls, data, source, node)
+
+
+def structured(cls: type[T], data: Any, source: str, node: Any = None) -> T:
+    """Make a `cls` of plain values; `node` is the tree of the text they come from, for its lines.
+
+    Raises:
+        UserError: as of `loads`.
+    """
     try:
         return _CONVERTER.structure(data, cls)
     except (BaseValidationError, ValueError, TypeError) as error:
@@ -87,6 +102,8 @@ def loads(cls: type[T], text: str, source: str = "text", base: T | None = None) 
 def _overlaid(base: Any, data: Any) -> Any:
     if isinstance(base, Tagged) and isinstance(data, Tagged) and base.tag == data.tag:
         return Tagged(data.tag, _overlaid(base.value, {} if data.value is None else data.value))
+    if isinstance(base, Tagged) and isinstance(data, Mapping):
+        return Tagged(base.tag, _overlaid(base.value, data))
     if isinstance(base, Mapping) and isinstance(data, Mapping):
         return {**base, **{k: _overlaid(base[k], v) if k in base else v for k, v in data.items()}}
     return data
@@ -112,8 +129,12 @@ def _show(value: Any) -> str:
             return f"`{str(value).lower()}` (a boolean)"
         case str():
             return f"`{value}` (text)"
+        case int() if abs(value) > 10**30:
+            return f"`{str(value)[:30]}…` (a number)"
         case int() | float():
             return f"`{value}` (a number)"
+        case str() if len(value) > 60:
+            return f"`{value[:60]}…` (text)"
         case list():
             return f"a list of {len(value)}"
         case dict():
@@ -136,6 +157,8 @@ def _bool(value: Any, _: Any) -> bool:
 def _int(value: Any, _: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise _fault(value, "a whole number")
+    if abs(value) > _LARGEST_INT:
+        raise _fault(value, f"a whole number of at most {_LARGEST_INT}")
     return value
 
 
@@ -279,9 +302,7 @@ def _union(cls: Any, converter: Converter) -> Any:
     kinds: list[Any] = [member for member in members if dataclasses.is_dataclass(member)]
     classes = {kind.__name__: kind for kind in kinds}
     others = [member for member in members if not dataclasses.is_dataclass(member)]
-    choices = [f"!{name} {{…}}" for name in classes] + [
-        getattr(member, "__name__", str(member)) for member in others
-    ]
+    choices = [f"!{name} {{…}}" for name in classes] + [_wanted(member) for member in others]
     remedy = "one of " + ", ".join(choices + (["null"] if optional else []))
 
     def structure(value: Any, _: Any) -> Any:
@@ -350,17 +371,55 @@ def _faults(error: BaseException, path: FieldPath, cls: Any) -> list[tuple[Field
         for note in getattr(error, "__notes__", ())
         if isinstance(note, AttributeValidationNote | IterableValidationNote)
     ]
-    path = path + tuple(names)
+    path = path + tuple(name if isinstance(name, str | int) else str(name) for name in names)
     if isinstance(error, BaseValidationError):
         return [fault for part in error.exceptions for fault in _faults(part, path, error.cl)]
     if isinstance(error, ForbiddenExtraKeysError):
         known = _fields(error.cl)
-        return [((*path, key), _unknown(key, known)) for key in sorted(error.extra_fields, key=str)]
+        strange = sorted(map(str, error.extra_fields))
+        return [((*path, key), _unknown(key, known)) for key in strange]
     if isinstance(error, KeyError) and names:
-        kind = next((f.type for f in dataclasses.fields(cls) if f.name == names[-1]), "value")
-        kind = str(getattr(kind, "__name__", kind))
-        return [(path, f"is missing; add `{names[-1]}: <{kind}>`")]
+        kind = next((f.type for f in dataclasses.fields(cls) if f.name == names[-1]), str)
+        return [(path, f"is missing; write {_wanted(kind)}")]
     return [(path, str(error))]
+
+
+def _needed(cls: Any) -> list[str]:
+    """Fields of a dataclass that have no default."""
+    missing = dataclasses.MISSING
+    return [
+        field.name
+        for field in dataclasses.fields(cls)
+        if field.init and field.default is missing and field.default_factory is missing
+    ]
+
+
+def _wanted(cls: Any) -> str:
+    """What stands for a value of a type, in words."""
+    plain = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+    if cls in plain:
+        return plain[cls]
+    if cls is Path:
+        return "a path"
+    if get_origin(cls) is Literal:
+        return "one of " + ", ".join(map(str, get_args(cls)))
+    if get_origin(cls) in (list, tuple):
+        inner = [part for part in get_args(cls) if part is not Ellipsis]
+        size = f" of {len(inner)}" if get_origin(cls) is tuple and len(inner) > 1 else ""
+        return f"a list{size}"
+    if _is_array(cls):
+        return "a list of numbers"
+    if _is_union(cls):
+        members: tuple[Any, ...] = get_args(cls)
+        words = [
+            f"!{getattr(m, '__name__', m)} {{…}}" if dataclasses.is_dataclass(m) else _wanted(m)
+            for m in members
+            if m is not NoneType
+        ]
+        return words[0] if len(words) == 1 else "one of " + ", ".join(words)
+    if dataclasses.is_dataclass(cls):
+        return f"a mapping with {', '.join(_needed(cls) or _fields(cls))}"
+    return "a mapping" if get_origin(cls) is dict else "a value"
 
 
 def _unknown(key: Any, known: list[str]) -> str:

@@ -16,7 +16,7 @@ import xarray as xr
 from jaxtyping import Array
 
 from .errors import UserError
-from .netcdf import save_netcdf
+from .netcdf import load_netcdf, save_netcdf
 from .recording_build import Trajectory, assemble, window
 from .recording_schema import (
     COMMANDS,
@@ -28,6 +28,7 @@ from .recording_schema import (
     UNEVEN,
     WRENCH,
     check,
+    check_plausible,
     observed,
     present,
 )
@@ -408,15 +409,7 @@ class Recording:
             UserError: if the file is missing, no NetCDF, or no recording.
         """
         path = Path(path)
-        if not path.is_file():
-            raise UserError(f"{path}: no such file; give a recording (.nc)")
-        try:
-            with xr.open_dataset(path, engine="h5netcdf") as opened:
-                dataset = opened.load()
-        except (OSError, ValueError, KeyError) as error:
-            raise UserError(
-                f"{path}: can't be read as NetCDF-4 ({error}); write it again with `save`"
-            ) from error
+        dataset = load_netcdf(path)
         if not _is_recording(dataset):
             raise UserError(f"{path}: a NetCDF file, but no recording (see docs/recording.md)")
         if dataset.attrs["format"] != FORMAT:
@@ -424,17 +417,18 @@ class Recording:
                 f"{path}: written as '{dataset.attrs['format']}', this version reads '{FORMAT}'"
             )
         try:
-            return cls(dataset)
+            recording = cls(dataset)
+            check_plausible(dataset)
         except ValueError as error:
             raise UserError(f"{path}: {error}") from error
+        return recording
 
     @staticmethod
     def is_one(path: Path) -> bool:
         """Whether a file says that `save` wrote it, whatever else is wrong with it."""
         try:
-            with xr.open_dataset(path, engine="h5netcdf") as opened:
-                return _is_recording(opened)
-        except (OSError, ValueError, KeyError):
+            return _is_recording(load_netcdf(path))
+        except UserError:
             return False
 
     def summary(self) -> str:

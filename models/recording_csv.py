@@ -24,7 +24,16 @@ from .frames import pose_to_enu, twist_frd_to_flu
 from .kinematics import contradictions
 from .recording import Recording
 from .recording_build import Trajectory
-from .recording_schema import COMMANDS, MAY_LACK, TWIST, UNEVEN, WRENCH
+from .recording_schema import (
+    COMMANDS,
+    LIMITS,
+    MAY_LACK,
+    QUANTITIES,
+    TWIST,
+    UNEVEN,
+    WRENCH,
+    variable_units,
+)
 from .resample import continuous, geodesic, grid, hold, linear, slerp
 
 METADATA = "recording.yaml"
@@ -33,12 +42,17 @@ Frames = Literal["ENU/FLU", "NED/FRD"]
 _POSITION, _QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 _STATE = ("t", *_POSITION, *_QUATERNION, *TWIST)
 _LACKABLE = MAY_LACK["X_WB"] + MAY_LACK["V_WB_B"]
+_SHORTEST_STEP, _LONGEST_STEP = 1e-5, 1e3
 _UNIFORM, _GAP_STEPS, _GAP_S = 1e-3, 10.0, 1.0
 _FEW_STEPS, _USUAL = 4.5, 0.9
 """Where samples stay in their places a step is too long at so many times the 90th percentile: files
 whose lines come in bursts are not cut at each of them."""
 _NORM = 0.02
 _RANGES = {"pwm": (500.0, 2500.0, "µs (1500 is stopped)"), "voltage": (1.0, 100.0, "V")}
+_LATEST = 1e10
+"""s, more than since 1970."""
+_MOST_SAMPLES = 10_000_000
+"""Of a run on its grid: a week at 16 Hz."""
 
 
 @dataclass(frozen=True)
@@ -111,12 +125,13 @@ def read_csv(
     for name, scenario in files.items():
         table = read_table(folder / name)
         runs.extend(_cut(_run(table, scenario, meta, notes), table, notes, resample))
-    dt = _step([run.t for run in runs], rate or meta.rate, notes, resample)
+    dt = _step(folder, [run.t for run in runs], rate or meta.rate, notes, resample)
     trajectories = [_on_grid(run, dt) if resample else _as_recorded(run, dt) for run in runs]
     try:
-        return Recording.from_trajectories(
+        recording = Recording.from_trajectories(
             trajectories, dt, vehicle=meta.vehicle, source=meta.source or folder.name, notes=notes
         )
+        return recording
     except UserError:
         raise
     except ValueError as error:
@@ -127,6 +142,7 @@ def _run(table: Table, scenario: str, meta: CsvFolder, notes: list[str]) -> _Run
     groups = _groups(table, meta.ignore)
     _check_time(table)
     _check_finite(table, [*_STATE, *(c for columns in groups.values() for c in columns)])
+    _check_limits(table, groups)
     t = table[["t"]][0]
     X = np.concatenate([_unit(table), table[_POSITION]])
     V = table[TWIST]
@@ -165,9 +181,9 @@ def _groups(table: Table, ignore: Sequence[str]) -> dict[str, list[str]]:
     if any(name in rest for name in WRENCH):
         groups["F_Bo_B"] = list(WRENCH)
     for variable, stem in (("thruster_force", "f"), ("pwm", "pwm")):
-        numbers = [int(m[1]) for name in rest if (m := re.fullmatch(rf"{stem}(\d+)", name))]
-        if numbers:
-            groups[variable] = [f"{stem}{i}" for i in range(1, max(numbers) + 1)]
+        count = sum(1 for name in rest if re.fullmatch(rf"{stem}[0-9]+", name))
+        if count:
+            groups[variable] = [f"{stem}{i}" for i in range(1, count + 1)]
     if not groups:
         raise UserError(
             f"{table.path}: no command; add X,Y,Z,K,M,N or f1..f8 or pwm1..pwm8 after the state"
@@ -194,6 +210,7 @@ def _check_time(table: Table) -> None:
     if not np.isfinite(t).all():
         row = int(np.argmin(np.isfinite(t)))
         raise UserError(f"{table.at(row)}: column `t` is no finite number; give seconds")
+    _check_range(table, ["t"], -_LATEST, _LATEST, "s")
     if t.size < 2:
         raise UserError(f"{table.path}: a single sample is no trajectory; give at least two")
     for row in (np.flatnonzero(np.diff(t) <= 0)[:1] + 1).tolist():
@@ -217,6 +234,19 @@ def _check_finite(table: Table, columns: Sequence[str]) -> None:
             )
 
 
+def _check_limits(table: Table, groups: dict[str, list[str]]) -> None:
+    """Refuse what no vehicle does, with the units that files are in."""
+    columns = {"X_WB": ["", "", "", "", *_POSITION], "V_WB_B": list(TWIST)} | groups
+    for variable, names in columns.items():
+        if variable in _RANGES:
+            continue
+        quantities = QUANTITIES[variable]
+        for i, name in enumerate(names):
+            quantity = quantities[i if len(quantities) > 1 else 0]
+            if name:
+                _check_range(table, [name], *LIMITS[quantity], variable_units(variable))
+
+
 def _check_range(table: Table, columns: list[str], low: float, high: float, unit: str) -> None:
     values = table[columns]
     bad = (values < low) | (values > high)
@@ -230,7 +260,8 @@ def _check_range(table: Table, columns: list[str], low: float, high: float, unit
 
 def _unit(table: Table) -> np.ndarray:
     q = table[_QUATERNION]
-    norm = np.linalg.norm(q, axis=0)
+    with np.errstate(over="ignore"):  # an infinite length is as wrong as another
+        norm = np.linalg.norm(q, axis=0)
     bad = np.abs(norm - 1) > _NORM
     if bad.any():
         row = int(np.argmax(bad))
@@ -273,12 +304,31 @@ def _cut(run: _Run, table: Table, notes: list[str], resample: bool) -> list[_Run
 
 
 def _step(
-    times: Sequence[np.ndarray], rate: float | None, notes: list[str], resample: bool
+    folder: Path,
+    times: Sequence[np.ndarray],
+    rate: float | None,
+    notes: list[str],
+    resample: bool,
 ) -> float:
-    if rate is not None:
-        return 1.0 / rate
+    """Step of the recording (s), which all runs share."""
     dt = float(np.median(np.concatenate([np.diff(t) for t in times])))
-    dt = 1.0 / round(1.0 / dt) if abs(1.0 / dt - round(1.0 / dt)) < 1e-2 else dt
+    if rate is not None:
+        dt = 1.0 / rate
+    elif not _SHORTEST_STEP <= dt <= _LONGEST_STEP:
+        raise UserError(
+            f"{folder}: steps of {dt:g} s; `t` is in seconds, and steps last {_SHORTEST_STEP:g} to "
+            f"{_LONGEST_STEP:g} s"
+        )
+    elif abs(1.0 / dt - round(1.0 / dt)) < 1e-2:
+        dt = 1.0 / round(1.0 / dt)
+    longest = max(float(t[-1] - t[0]) for t in times)
+    if longest > _MOST_SAMPLES * dt:
+        raise UserError(
+            f"{folder}: a run of {longest:g} s has more than {_MOST_SAMPLES} samples at "
+            f"{1 / dt:.4g} Hz; give a lower `rate` in {METADATA}, or cut the run"
+        )
+    if rate is not None:
+        return dt
     if resample and not all(_even(t, dt) for t in times):
         notes.append(f"Uneven time steps were resampled to {1 / dt:.4g} Hz.")
     return dt

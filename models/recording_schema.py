@@ -45,9 +45,43 @@ LABELS: dict[str, tuple[str, ...]] = {
     "wrench_component": WRENCH,
     "axis": AXES,
 }
+LIMITS: dict[str, tuple[float, float]] = {
+    "attitude": (-1.01, 1.01),
+    "position": (-1e7, 1e7),
+    "velocity": (-100.0, 100.0),
+    "rate": (-100.0, 100.0),
+    "force": (-1e6, 1e6),
+    "moment": (-1e6, 1e6),
+    "thrust": (-1e5, 1e5),
+    "pwm": (0.0, 10000.0),
+    "voltage": (0.0, 1000.0),
+    "specific force": (-1e4, 1e4),
+    "depth": (-1e3, 2e4),
+    "channel": (0.0, 65535.0),
+    "time": (0.0, 1e9),
+}
+"""What no vehicle exceeds, in the units above: beyond it numbers are damaged or of another unit.
+
+Positions may be those of a map's grid, whose northings go to 1e7 m."""
+QUANTITIES: dict[str, tuple[str, ...]] = {
+    "X_WB": ("attitude",) * 4 + ("position",) * 3,
+    "V_WB_B": ("velocity",) * 3 + ("rate",) * 3,
+    "F_Bo_B": ("force",) * 3 + ("moment",) * 3,
+    "thruster_force": ("thrust",),
+    "pwm": ("pwm",),
+    "voltage": ("voltage",),
+    "imu_specific_force": ("specific force",),
+    "imu_angular_rate": ("rate",),
+    "pressure_depth": ("depth",),
+    "vertical_velocity": ("velocity",),
+    "rc": ("channel",),
+    UNEVEN: ("time",),
+}
+"""Of the components of a variable, or of all of them."""
 # Channels that a log may simply not have; they are then NaN throughout a trajectory.
 MAY_LACK = {"X_WB": ("x", "y", "z"), "V_WB_B": TWIST}
 _NORM_TOLERANCE = 1e-4
+_SHORTEST_STEP, _LONGEST_STEP = 1e-6, 1e4
 
 
 def variable_dims(name: str) -> tuple[str, ...]:
@@ -95,6 +129,35 @@ def check(dataset: xr.Dataset) -> None:
         _check_elapsed(dataset, mask)
 
 
+def check_plausible(dataset: xr.Dataset) -> None:
+    """Refuse measured data that hold what no vehicle can do; a diverged simulation may hold it.
+
+    Raises:
+        ValueError: with one sentence naming the variable, the place and the remedy.
+    """
+    for name, quantities in QUANTITIES.items():
+        if name not in dataset:
+            continue
+        values = dataset[name].to_numpy()
+        low, high = np.array([LIMITS[quantity] for quantity in quantities]).T
+        if dataset[name].dims == LEADING:
+            low, high = low[0], high[0]
+        bad = (values < low) | (values > high)
+        if bad.any():
+            where = tuple(np.argwhere(bad)[0].tolist())
+            j, k, n, *component = where
+            labels = LABELS.get(str(dataset[name].dims[-1]), tuple(range(1, values.shape[-1] + 1)))
+            label = f"[{labels[component[0]]}]" if component else ""
+            c = component[0] if component and len(quantities) > 1 else 0
+            low, high = LIMITS[quantities[c]]
+            scenario = str(dataset["scenario"].to_numpy()[j])
+            raise ValueError(
+                f"{name}{label}: {values[where]:.4g} at scenario '{scenario}', trajectory {k}, "
+                f"index {n}; no vehicle goes below {low:g} or above {high:g} "
+                f"{variable_units(name)}: mend the unit, or cut the trajectory there"
+            )
+
+
 def _check_elapsed(dataset: xr.Dataset, mask: np.ndarray) -> None:
     times = dataset[UNEVEN].to_numpy()
     rises = (np.diff(times, axis=2) > 0) | ~mask[..., 1:]
@@ -116,8 +179,11 @@ def _check_layout(dataset: xr.Dataset) -> None:
         raise ValueError(
             f"no command: give at least one of {', '.join(COMMANDS)} so that there is an input"
         )
-    for name in dataset.data_vars:
+    for name in dataset.variables:
         _check_variable(dataset, name)
+    for name in ("format", "vehicle", "source", "notes"):
+        if not isinstance(dataset.attrs.get(name, ""), str):
+            raise ValueError(f"{name}: this attribute must be text")
     if dataset["mask"].dtype != np.bool_ or dataset["mask"].dims != LEADING:
         raise ValueError(f"mask: must be bool over {LEADING}")
     names = [str(s) for s in dataset["scenario"].to_numpy()]
@@ -133,6 +199,8 @@ def _check_variable(dataset: xr.Dataset, name: Hashable) -> None:
     if name not in known:
         return
     variable = dataset[name]
+    if name in dataset.coords:
+        raise ValueError(f"{name}: is a coordinate; make it a variable over {LEADING}")
     if variable.dims != variable_dims(str(name)):
         raise ValueError(
             f"{name}: dimensions must be {variable_dims(str(name))}, got {variable.dims}"
@@ -149,14 +217,32 @@ def _check_variable(dataset: xr.Dataset, name: Hashable) -> None:
 def _check_time(dataset: xr.Dataset) -> None:
     if "time" not in dataset.coords or "dt" not in dataset.attrs:
         raise ValueError("time: needs the coordinate `time` (s) and the attribute `dt` (s)")
-    time, dt = dataset["time"].to_numpy(), float(dataset.attrs["dt"])
-    if not (np.isfinite(dt) and dt > 0):
-        raise ValueError(f"dt: must be a positive number of seconds, got {dt}")
+    time, dt = dataset["time"].to_numpy(), _seconds(dataset, "dt")
+    if "command_period" in dataset.attrs:
+        _seconds(dataset, "command_period")
+    if not np.issubdtype(time.dtype, np.floating) or time.ndim != 1:
+        raise ValueError(f"time: must be numbers (s), got {time.dtype}")
+    if "start_time" in dataset:
+        start = dataset["start_time"]
+        if start.dims != LEADING[:2] or not np.issubdtype(start.dtype, np.floating):
+            raise ValueError(f"start_time: must be numbers (s) over {LEADING[:2]}")
     expected = dt * np.arange(time.size)
     if not np.allclose(time, expected, rtol=0, atol=1e-6 * dt * max(1, time.size)):
         raise ValueError(
             f"time: must be 0, {dt:g}, {2 * dt:g}, … s; resample uneven data to one step first"
         )
+
+
+def _seconds(dataset: xr.Dataset, name: str) -> float:
+    """An attribute that is a time step."""
+    value = dataset.attrs[name]
+    number = isinstance(value, int | float | np.floating | np.integer)
+    if not number or not _SHORTEST_STEP <= value <= _LONGEST_STEP:
+        raise ValueError(
+            f"{name}: must be a number of seconds from {_SHORTEST_STEP:g} to {_LONGEST_STEP:g}, "
+            f"got {str(value)[:60]}"
+        )
+    return float(value)
 
 
 def _check_values(dataset: xr.Dataset, name: str, mask: np.ndarray) -> None:
@@ -186,7 +272,8 @@ def _may_lack(dataset: xr.Dataset, name: str) -> np.ndarray:
 
 
 def _check_quaternions(dataset: xr.Dataset, mask: np.ndarray) -> None:
-    norm = np.linalg.norm(dataset["X_WB"].to_numpy()[..., :4], axis=-1)
+    with np.errstate(over="ignore"):  # an infinite length is as wrong as another
+        norm = np.linalg.norm(dataset["X_WB"].to_numpy()[..., :4], axis=-1)
     off = mask & (np.abs(norm - 1) > _NORM_TOLERANCE)
     if off.any():
         j, k, n = np.argwhere(off)[0]

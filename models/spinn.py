@@ -65,8 +65,8 @@ class SpinnConfig:
 
     def __post_init__(self) -> None:
         check_numbers(self)
-        require(self.width >= 1, self, "width", "give at least 1 unit")
-        require(self.depth >= 1, self, "depth", "give at least 1 hidden layer")
+        require(1 <= self.width <= 1024, self, "width", "give 1 to 1024 units")
+        require(1 <= self.depth <= 32, self, "depth", "give 1 to 32 hidden layers")
         require(self.activation in ACTIVATIONS, self, "activation", f"use one of {ACTIVATIONS}")
         require(self.spd in _OPERATORS, self, "spd", f"use one of {tuple(_OPERATORS)}")
         require(self.potential in ("gravity", "pose"), self, "potential", "use gravity or pose")

@@ -6,6 +6,7 @@ diagonal is the same in forward-left-up and in forward-starboard-down axes.
 """
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -164,4 +165,9 @@ def load_vehicle(name_or_path: str | Path) -> Vehicle:
             f"vehicle `{name_or_path}` is no preset; take one of {', '.join(vehicle_names())}, or "
             "the path of a .yaml file"
         )
-    return load(Vehicle, _FOLDER / f"{name_or_path}.yaml")
+    return _preset(str(name_or_path))
+
+
+@lru_cache
+def _preset(name: str) -> Vehicle:
+    return load(Vehicle, _FOLDER / f"{name}.yaml")

@@ -29,6 +29,10 @@ _CORE = (
 )
 
 
+_DIGITS = 4000
+"""Many more than the largest number in double precision has, and as many as Python reads."""
+
+
 @dataclass(frozen=True)
 class Tagged:
     """A value with a local tag: `!Kind {…}`; a tag that stands alone has the value {}."""
@@ -43,7 +47,7 @@ class _Loader(yaml.SafeLoader):
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
             line = key_node.start_mark.line + 1
-            if not isinstance(key, Hashable):
+            if not isinstance(key, str | int | float | None):
                 raise yaml.constructor.ConstructorError(
                     None, None, "a key must be a plain word or number", key_node.start_mark
                 )
@@ -59,6 +63,10 @@ class _Loader(yaml.SafeLoader):
 
     def _int(self, node: yaml.ScalarNode) -> int:
         text = self.construct_scalar(node)
+        if len(text) > _DIGITS:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"a number of {len(text)} digits is too long", node.start_mark
+            )
         return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
 
     def _tagged(self, suffix: str, node: yaml.Node) -> Tagged:

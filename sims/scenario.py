@@ -3,7 +3,6 @@
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +10,7 @@ from jaxtyping import Float
 from ..models import config
 from ..models.checks import check_numbers, require
 from ..models.errors import UserError
-from ..models.yaml_text import Tagged, emit, parse
+from ..models.yaml_text import parse
 from ..systems.controllers import ControllerKind, MppiImpedance
 from ..systems.own import OwnSystem
 from ..systems.station_config import StationConfig
@@ -144,33 +143,20 @@ def load_scenario(name_or_path: str | Path, text: str = "") -> Scenario:
             )
         path = _FOLDER / f"{name_or_path}.yaml"
     scenario = config.load(Scenario, path)
-    return overridden(path.read_text(encoding="utf-8"), text) if text.strip() else scenario
+    return overridden(scenario, text) if text.strip() else scenario
 
 
-def overridden(base: str, text: str) -> Scenario:
-    """The scenario of YAML text `base` with YAML `text` laid over it.
+def overridden(base: Scenario | str, text: str) -> Scenario:
+    """A scenario (or the YAML text of one) with YAML `text` laid over it.
 
     Raises:
         UserError: the two together are no scenario.
     """
-    below, _ = parse(base, "scenario")
-    above, _ = parse(text, _TEXT)
-    if not isinstance(above, dict):
+    scenario = config.loads(Scenario, base, "scenario") if isinstance(base, str) else base
+    if not isinstance(parse(text, _TEXT)[0], dict):
         raise UserError(f"{_TEXT}: give a mapping, such as 'duration: 5'")
     try:
-        return config.loads(Scenario, emit(_merged(below, above)), _TEXT)
-    except UserError as error:  # lines of the merged text are of no use to anyone
+        return config.loads(Scenario, text, _TEXT, scenario)
+    except UserError as error:  # it is a line of the command: its parts have no numbers
         message = re.sub(rf"^{_TEXT}:\d+: ", f"{_TEXT}: ", str(error), flags=re.MULTILINE)
         raise UserError(message) from error
-
-
-def _merged(below: Any, above: Any) -> Any:
-    if isinstance(above, Tagged):
-        if isinstance(below, Tagged) and below.tag == above.tag:
-            return Tagged(above.tag, _merged(below.value, above.value))
-        return above
-    if isinstance(below, Tagged) and isinstance(above, dict):
-        return Tagged(below.tag, _merged(below.value, above))
-    if isinstance(below, dict) and isinstance(above, dict):
-        return below | {key: _merged(below.get(key), value) for key, value in above.items()}
-    return above

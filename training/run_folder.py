@@ -1,10 +1,10 @@
 """A training run on disk: checkpoint, metrics, settings; a kill at any moment spoils none."""
 
 import csv
+import dataclasses
 import io
 import json
 import os
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..models import config as yaml
+from ..models.archive import read_archive
 from ..models.errors import UserError
 from ..models.files import atomic_path, disk_errors_told
 from ..models.owned import FolderKind, claim
@@ -41,6 +42,14 @@ _MAY_DIFFER = ("steps", "patience", "max_recoveries", "checkpoint_every")
 
 class CheckpointError(UserError):
     """A checkpoint that can't be gone on from: damaged, or of other settings or other data."""
+
+
+@dataclass(frozen=True)
+class _Event:
+    """What happened at a step, for the report."""
+
+    step: int
+    text: str
 
 
 @dataclass
@@ -101,6 +110,26 @@ class TrainState:
         self.best_value = float.fromhex(plain["best_value"])
 
 
+@dataclass(frozen=True)
+class _Plain:
+    """What `TrainState.plain` writes."""
+
+    step: int
+    best_value: str
+    best_step: int
+    stale: int
+    rate_scale: float
+    excluded: list[int]
+    events: list[_Event]
+    seconds: float
+
+    def __post_init__(self) -> None:
+        float.fromhex(self.best_value)
+        counts = (self.step, self.best_step, self.stale, *self.excluded)
+        if min(counts) < 0 or not self.rate_scale > 0 or self.seconds < 0:
+            raise ValueError("a count, rate or time below zero")
+
+
 class RunFolder:
     """The files of one run: checkpoint.npz, metrics.csv, config.yaml, run.json, model.spinn."""
 
@@ -139,22 +168,19 @@ class RunFolder:
             CheckpointError: the checkpoint is damaged, or of other settings or other data.
         """
         try:
-            with (
-                self.checkpoint.open("rb") as handle,
-                np.load(handle, allow_pickle=False) as archive,
-            ):
-                header = json.loads(archive["header"].tobytes())
-                arrays = [archive[f"array_{i:04d}"] for i in range(len(archive.files) - 1)]
-            _check_same(yaml.loads(TrainingConfig, header["config"], "checkpoint"), config)
-            if header["data"] != data:
-                raise UserError("it was trained on other windows; resume with the same data")
-            state.fill(arrays, header["state"])
+            header, arrays = read_archive(self.checkpoint, "checkpoint")
         except UserError as error:
-            raise CheckpointError(f"{self.checkpoint}: {error}") from error
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise CheckpointError(f"{error} Or start anew without resume.") from error
+        try:
+            made = yaml.loads(TrainingConfig, str(header.get("config")), "settings")
+            _check_same(made, config)
+            if header.get("data") != data:
+                raise UserError("it was trained on other windows; resume with the same data")
+            plain = yaml.structured(_Plain, header.get("state"), "state")
+            state.fill(arrays, dataclasses.asdict(plain))
+        except ValueError as error:
             raise CheckpointError(
-                f"{self.checkpoint}: not a whole checkpoint of this run ({error}); start anew "
-                "without resume"
+                f"{self.checkpoint}: no checkpoint of this run ({error}); start anew without resume"
             ) from error
 
     def begin_metrics(self, step: int) -> None:

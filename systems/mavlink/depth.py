@@ -14,6 +14,7 @@ noise over that of the measurement.
 
 import itertools
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import scipy.signal
@@ -63,7 +64,7 @@ def in_water(
         if signal is not None:
             x = signal.x.copy()
             x[2] -= excess * _filtered(signal.t, x[2], top, bottom)
-            signal = Series(signal.t, x, signal.source)
+            signal = replace(signal, x=x)
         found.append(signal)
     return found[0], found[1]
 

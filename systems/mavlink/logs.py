@@ -8,6 +8,7 @@ from pathlib import Path
 from ...models.errors import UserError
 from ...models.recording import Recording
 from ...models.recording_csv import METADATA, read_csv
+from ...models.recording_schema import check_plausible
 from ...models.vehicle import load_vehicle
 from .fuse import fuse
 from .log_bytes import LogBytes, Progress, no_progress, read_log_bytes
@@ -83,11 +84,6 @@ def import_log(
         )
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    except KeyError as error:
-        raise UserError(
-            f"{path}: a message lacks the field {error}, so this is no log of an ArduPilot version "
-            "that is known (4.0 to 4.6)"
-        ) from error
     if not trajectories:
         raise UserError(
             f"{path}: no stretch of {options.minimum:g} s with attitude and thruster outputs is "
@@ -100,6 +96,7 @@ def import_log(
         recording = Recording.from_trajectories(
             trajectories, 1.0 / rate, vehicle=vehicle, source=path.name, notes=report.notes()
         )
+        check_plausible(recording.dataset)
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
     period = 1.0 / signals.outputs.rate

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .log_bytes import Progress, no_progress
+from .table import Table, numbers
 
 _HEAD = b"\xa3\x95"
 _FMT_TYPE, _FMT_LENGTH = 128, 89
@@ -37,8 +38,6 @@ _TYPES: dict[str, tuple[str, float | None]] = {
     "Z": ("S64", None),
 }
 
-Table = Mapping[str, np.ndarray]
-
 
 @dataclass(frozen=True)
 class BinLog:
@@ -55,17 +54,21 @@ class _Format:
     codes: str
     columns: tuple[str, ...]
 
-    def dtype(self) -> np.dtype:
-        columns = zip(self.columns, self.codes, strict=False)
-        fields = [("_head", "V3"), *((column, _TYPES[code][0]) for column, code in columns)]
-        return _padded(np.dtype(fields), self.length)
+    def dtype(self) -> np.dtype | None:
+        """Layout of a record, of the length that its FMT record tells; None if it has none.
 
-
-def _padded(dtype: np.dtype, length: int) -> np.dtype:
-    """Widen a record type to the length its FMT record tells, if the columns cover less."""
-    if dtype.itemsize >= length:
-        return dtype
-    return np.dtype([*dtype.descr, ("_rest", f"V{length - dtype.itemsize}")])
+        So it is where a column has no name or another's, or the columns are longer than a record.
+        """
+        columns = list(zip(self.columns, self.codes, strict=False))
+        names = [column for column, _ in columns]
+        if "" in names or len(set(names)) < len(names):
+            return None
+        types = [np.dtype(_TYPES[code][0]) for _, code in columns]
+        offsets = np.cumsum([3, *(kind.itemsize for kind in types)]).tolist()
+        if offsets[-1] > self.length:
+            return None
+        layout = {"names": names, "formats": types, "offsets": offsets[:-1]}
+        return np.dtype({**layout, "itemsize": self.length})  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
 def read_bin(data: bytes, wanted: Collection[str], progress: Progress = no_progress) -> BinLog:
@@ -76,7 +79,7 @@ def read_bin(data: bytes, wanted: Collection[str], progress: Progress = no_progr
     for number, found in offsets.items():
         layout = formats[number]
         dtype = layout.dtype()
-        if dtype.itemsize != layout.length:
+        if dtype is None:
             unreadable.append(layout.name)
             continue
         tables[layout.name] = _decode(data, np.asarray(found), layout, dtype)
@@ -108,8 +111,8 @@ def _scan(
             break
         if number == _FMT_TYPE:
             layout = _format(data[i : i + _FMT_LENGTH])
-            if layout is not None:
-                known = data[i + 3]
+            known = data[i + 3]
+            if layout is not None and known not in formats:
                 formats[known], lengths[known] = layout, layout.length
                 if layout.name in wanted and keep[known] is None:
                     keep[known] = []
@@ -138,11 +141,12 @@ def _format(record: bytes) -> _Format | None:
 def _decode(data: bytes, offsets: np.ndarray, layout: _Format, dtype: np.dtype) -> Table:
     raw = np.frombuffer(data, np.uint8)
     rows = raw[offsets[:, None] + np.arange(layout.length)].view(dtype)[:, 0]
-    table: dict[str, np.ndarray] = {}
+    table = Table(layout.name)
     for column, code in zip(layout.columns, layout.codes, strict=False):
         values = rows[column]
-        scale = _TYPES[code][1]
-        table[column] = values * scale if scale is not None else values
-    if "TimeUS" in table:
-        table["t"] = table["TimeUS"] * 1e-6
+        if values.dtype.kind == "S":
+            table[column] = values
+        else:
+            table[column] = numbers(values) * (_TYPES[code][1] or 1.0)
+    table["t"] = table["TimeUS"] * 1e-6
     return table

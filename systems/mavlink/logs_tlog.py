@@ -18,6 +18,7 @@ import numpy as np
 from ...models.errors import UserError
 from .log_bytes import Progress, no_progress
 from .packets import Packets, message_id, message_name, rows_of, scan
+from .table import Table, numbers
 
 _GROUND_STATION, _NO_AUTOPILOT, _SUBMARINE, _ARDUPILOT = 6, 8, 12, 3
 _CLOCKS = ("ATTITUDE", "ATTITUDE_QUATERNION", "SYSTEM_TIME")
@@ -26,7 +27,6 @@ _BETWEEN_BOOTS_S = 10.0
 _WRAP_US_S = 2**32 * 1e-6
 _WRAP_MS_S = 2**32 * 1e-3
 
-Table = Mapping[str, np.ndarray]
 System = tuple[int, int]
 
 
@@ -60,7 +60,7 @@ def read_tlog(
     heard = _heard(packets)
     chosen, notes = _choose(data, packets, heard, system)
     own = (packets.system == chosen[0]) & (packets.component == chosen[1])
-    tables: dict[str, dict[str, np.ndarray]] = {}
+    tables: dict[str, Table] = {}
     index: dict[str, np.ndarray] = {}
     broken = 0
     names = sorted(set(wanted) | set(_CLOCKS))
@@ -71,7 +71,9 @@ def read_tlog(
             broken += int(candidates.size - good.size)
             if good.size:
                 index[name] = good
-                tables[name] = {f: rows[f] for f in rows.dtype.names or ()}
+                columns = {f: rows[f] for f in rows.dtype.names or ()}
+                clean = {f: numbers(x) if x.dtype.kind == "f" else x for f, x in columns.items()}
+                tables[name] = Table(name, clean)
         progress(0.7 + 0.1 * n / len(names))
     boots, clock_note = _put_on_vehicle_clock(tables, index, packets.stamps(data))
     if packets.skipped:
@@ -141,7 +143,7 @@ def _choose(
 
 
 def _put_on_vehicle_clock(
-    tables: dict[str, dict[str, np.ndarray]], index: dict[str, np.ndarray], stamps: np.ndarray
+    tables: dict[str, Table], index: dict[str, np.ndarray], stamps: np.ndarray
 ) -> tuple[tuple[float, ...], list[str]]:
     """Add the column `t` to every table and sort by it; see the module's head."""
     timed = [name for name in tables if "time_boot_ms" in tables[name]]
@@ -172,7 +174,7 @@ def _put_on_vehicle_clock(
             t = base[i] + elapsed
         table["t"] = t
         sorting = np.argsort(t, kind="stable")
-        tables[name] = {column: values[sorting] for column, values in table.items()}
+        tables[name] = table.rows(sorting)
     return boots, notes
 
 

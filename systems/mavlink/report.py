@@ -81,9 +81,20 @@ def tell(
         tuple(lines),
         tuple(has),
         (*bad, *_lacking(signals), *_unexcited(kept), *signals.lacks),
-        signals.notes,
+        (*signals.notes, *_left_out(signals)),
         tuple(dropped),
     )
+
+
+def _left_out(signals: Signals) -> list[str]:
+    """A sentence on each signal of which samples were left out."""
+    found = [value for value in vars(signals).values() if isinstance(value, Series)]
+    return [
+        f"{one.source}: {one.left_out} sample{'s' * (one.left_out > 1)} left out that "
+        "were no numbers, or beyond what a vehicle does."
+        for one in found
+        if one.left_out
+    ]
 
 
 def _at(series: Series) -> str:

@@ -9,6 +9,8 @@ from ...models.resample import conjugate, multiply, rotation_exp, rotation_log
 from .signals import Series, Signals, Spans
 
 _GUARD_S = 0.1
+_SLOWEST_S = 60.0
+"""s between samples of the slowest signal: fewer tell nothing of a motion."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def jumps(signals: Signals) -> list[tuple[float, str]]:
 
 
 def _without_gaps(one: Series, gap: float) -> Spans:
-    allowed = max(gap, 5.0 / one.rate if one.rate else gap)
+    allowed = max(gap, min(5.0 / one.rate, _SLOWEST_S) if one.rate else gap)
     good = np.isfinite(one.t)
     t = one.t[good]
     breaks = np.flatnonzero(np.diff(t) > allowed)

@@ -3,11 +3,14 @@
 Readers fill `Signals`; cutting and resampling (`segments.py`, `fuse.py`) know no message names.
 """
 
+import math
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ...models.recording_schema import LIMITS
 from .codec import MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS, filter_delay, thruster_pwm
 
 
@@ -18,6 +21,8 @@ class Series:
     t: np.ndarray
     x: np.ndarray
     source: str
+    left_out: int = 0
+    """Samples that were no numbers, or beyond what any vehicle does."""
 
     @property
     def rate(self) -> float:
@@ -67,21 +72,25 @@ class Signals:
     notes: tuple[str, ...] = ()
 
 
-def series(t: np.ndarray, x: np.ndarray, source: str) -> Series | None:
+def series(t: np.ndarray, x: np.ndarray, source: str, quantity: str) -> Series | None:
     """Make a series: sorted, without repeated times; None if fewer than two samples are left.
 
-    Samples with NaN or infinity in a component that has numbers elsewhere are left out.
+    Left out are samples beyond the `LIMITS` of the quantity, and with NaN or infinity in a
+    component that has numbers elsewhere.
     """
     t, x = np.asarray(t, np.float64), np.asarray(x, np.float64)
-    known = np.isfinite(x).reshape(-1, t.size)
+    if not t.size:
+        return None
+    low, high = LIMITS[quantity]
+    known = ((x >= low) & (x <= high)).reshape(-1, t.size)
     good = np.isfinite(t) & (known | ~known.any(axis=1, keepdims=True)).all(axis=0)
     t, x = t[good], x[..., good]
     order = np.argsort(t, kind="stable")
     t = t[order]
-    new = np.concatenate([[True], np.diff(t) > 1e-6]) if t.size else np.zeros(0, bool)
+    new = np.concatenate([[True], np.diff(t) > 1e-6])[: t.size]
     if np.count_nonzero(new) < 2:
         return None
-    return Series(t[new], x[..., order][..., new], source)
+    return Series(t[new], x[..., order][..., new], source, int(np.count_nonzero(~good)))
 
 
 def sampled_spans(t: np.ndarray, labels: Sequence[str]) -> Spans:
@@ -110,7 +119,7 @@ def undelayed(one: Series, known: Mapping[str, float], parameter: str) -> tuple[
     if not 1.0 <= cutoff <= 500.0:
         return one, []
     delay = filter_delay(cutoff)
-    return Series(one.t - delay, one.x, one.source), [
+    return replace(one, t=one.t - delay), [
         f"{one.source}: times moved back by {1e3 * delay:.0f} ms, the delay of {parameter} "
         f"{cutoff:g} Hz."
     ]
@@ -126,6 +135,37 @@ class Parameter:
     t: float
     name: str
     value: float
+
+
+_RANGES = (
+    (r"SERVO\d+_FUNCTION", -1.0, 255.0),
+    (r"MOT_\d+_DIRECTION", -1.0, 1.0),
+    (r"INS_(GYRO|ACCEL)_FILTER", 0.0, 1000.0),
+    (r"BARO_SPEC_GRAV", 0.9, 1.2),
+    (r"BARO\d_GND_PRESS", 0.0, 2e5),
+    (r"EK3_SRC1_POSZ", 0.0, 100.0),
+    (r"EK3_(ACC_P|ALT_M)_NSE", 1e-3, 1e3),
+)
+"""What the autopilot allows for parameters that matter here, and somewhat more."""
+
+
+def parameters_of(
+    t: np.ndarray, names: np.ndarray, values: np.ndarray
+) -> tuple[list[Parameter], list[str]]:
+    """The parameters of a log, and a sentence on those left out because they can't be so."""
+    found, strange = [], []
+    for at, raw, value in zip(t.tolist(), names.tolist(), values.tolist(), strict=True):
+        name = raw.decode("ascii", "replace")
+        low, high = next(
+            ((low, high) for form, low, high in _RANGES if re.fullmatch(form, name)),
+            (-math.inf, math.inf),
+        )
+        if math.isfinite(value) and low <= value <= high:
+            found.append(Parameter(at, name, value))
+        elif math.isfinite(low) or not math.isfinite(value):
+            strange.append(f"{name} {value:g}")
+    said = [f"Parameters that can't be were left out: {', '.join(strange)}."] if strange else []
+    return found, said
 
 
 @dataclass(frozen=True)
@@ -151,11 +191,12 @@ def wiring(parameters: Sequence[Parameter], first: float, last: float) -> Wiring
     directions: dict[int, int] = {}
     notes = []
     for p in parameters:
-        parts = p.name.split("_")
-        if p.name.startswith("SERVO") and p.name.endswith("_FUNCTION") and parts[0][5:].isdigit():
-            functions.setdefault(int(parts[0][5:]), []).append((p.t, round(p.value)))
-        elif p.name.startswith("MOT_") and p.name.endswith("_DIRECTION") and parts[1].isdigit():
-            directions[int(parts[1])] = -1 if p.value < 0 else 1
+        servo = re.fullmatch(r"SERVO([1-9]|1[0-6])_FUNCTION", p.name)
+        motor = re.fullmatch(r"MOT_([1-8])_DIRECTION", p.name)
+        if servo:
+            functions.setdefault(int(servo[1]), []).append((p.t, round(p.value)))
+        elif motor:
+            directions[int(motor[1])] = -1 if p.value < 0 else 1
     motor_of = {
         channel: next((f - 32 for _, f in history if f in MOTOR_FUNCTIONS), None)
         for channel, history in sorted(functions.items())
@@ -235,4 +276,4 @@ def thruster_outputs(
     if dead.any():
         which = ", ".join(str(i + 1) for i in np.flatnonzero(dead))
         notes.append(f"Thrusters {which} never got a pulse; they are taken as stopped.")
-    return series(t, thruster_pwm(raw, mirror[:, None]), source), notes
+    return series(t, thruster_pwm(raw, mirror[:, None]), source, "pwm"), notes

@@ -7,18 +7,19 @@ import numpy as np
 from ...models.errors import UserError
 from . import codec
 from .depth import in_water
-from .logs_tlog import Table, TlogLog
+from .logs_tlog import TlogLog
 from .signals import (
-    Parameter,
     Series,
     Signals,
     Spans,
+    parameters_of,
     sampled_spans,
     series,
     thruster_outputs,
     undelayed,
     wiring,
 )
+from .table import Table
 
 WANTED = (
     "ATTITUDE",
@@ -62,7 +63,12 @@ def signals_from_tlog(
             "ask for it with SET_MESSAGE_INTERVAL (50 Hz or more) while logging"
         )
     first, last = float(attitude.t[0]), float(attitude.t[-1])
-    parameters = _parameters(tables)
+    table = tables.get("PARAM_VALUE")
+    parameters, strange = (
+        ([], [])
+        if table is None
+        else parameters_of(table["t"], table["param_id"], table["param_value"])
+    )
     wired = wiring(parameters, first, last)
     known = {p.name: p.value for p in parameters}
     outputs, notes = _outputs(outputs_table, wired, motors)
@@ -90,7 +96,7 @@ def signals_from_tlog(
         cuts=tuple((t, "reboot of the autopilot") for t in log.boots),
         has=tuple(has),
         lacks=() if aids else ("No DVL, odometry, vision or GPS message in the log.",),
-        notes=(*log.notes, *wired.notes, *notes, *bias_note, *rate_delay, *force_delay),
+        notes=(*log.notes, *strange, *wired.notes, *notes, *bias_note, *rate_delay, *force_delay),
     )
 
 
@@ -98,10 +104,10 @@ def _attitude(tables: Mapping[str, Table]) -> Series:
     found = []
     if (q := tables.get("ATTITUDE_QUATERNION")) is not None:
         x = codec.attitude(q["q1"], q["q2"], q["q3"], q["q4"])
-        found.append(series(q["t"], x, "ATTITUDE_QUATERNION"))
+        found.append(series(q["t"], x, "ATTITUDE_QUATERNION", "attitude"))
     if (e := tables.get("ATTITUDE")) is not None:
         x = codec.attitude_from_euler(e["roll"], e["pitch"], e["yaw"])
-        found.append(series(e["t"], x, "ATTITUDE"))
+        found.append(series(e["t"], x, "ATTITUDE", "attitude"))
     usable = [s for s in found if s is not None]
     if not usable:
         raise UserError("no ATTITUDE in this log; stream ATTITUDE (50 Hz is good) while logging")
@@ -112,14 +118,15 @@ def _rates(tables: Mapping[str, Table], attitude: Series) -> tuple[Series, tuple
     """Body rates: with the attitude (bias removed by the filter), or from a much faster gyro."""
     table = tables[attitude.source]
     x = codec.body_vector(table["rollspeed"], table["pitchspeed"], table["yawspeed"])
-    own = series(table["t"], x, f"{attitude.source} rates")
-    assert own is not None  # as many samples as the attitude itself
+    own = series(table["t"], x, f"{attitude.source} rates", "rate")
+    if own is None:
+        raise UserError(f"{attitude.source}: its body rates are no numbers; log them again")
     for name in ("RAW_IMU", "SCALED_IMU"):
         imu = tables.get(name)
         if imu is None:
             continue
         gyro = series(
-            imu["t"], codec.imu_angular_rate(imu["xgyro"], imu["ygyro"], imu["zgyro"]), name
+            imu["t"], codec.imu_angular_rate(imu["xgyro"], imu["ygyro"], imu["zgyro"]), name, "rate"
         )
         if gyro is not None and gyro.rate > 3 * own.rate:
             return gyro, (f"Body rates are those of {name}, with the gyro's bias left in.",)
@@ -132,7 +139,7 @@ def _specific_force(
     for name in ("RAW_IMU", "SCALED_IMU"):
         if (imu := tables.get(name)) is not None:
             x = codec.imu_specific_force(imu["xacc"], imu["yacc"], imu["zacc"])
-            found = series(imu["t"], x, name)
+            found = series(imu["t"], x, name, "specific force")
             return (None, []) if found is None else undelayed(found, known, "INS_ACCEL_FILTER")
     return None, []
 
@@ -152,7 +159,8 @@ def _motion(
         v = np.stack([lacking, lacking, codec.climb_from_vz(glob["vz"])])
     else:
         return None, None
-    return in_water(series(t, p, name), series(t, v, name), known, density)
+    position, velocity = series(t, p, name, "position"), series(t, v, name, "velocity")
+    return in_water(position, velocity, known, density)
 
 
 def _aiding(tables: Mapping[str, Table]) -> dict[str, Spans]:
@@ -206,7 +214,7 @@ def _pressure_depth(
         surface = known.get(parameter, 0.0) / 100.0
         surface = surface if 800 < surface < 1200 else codec.SURFACE_PRESSURE_HPA
         depth = codec.depth_from_pressure(table["press_abs"], surface, gradient)
-        return series(table["t"], depth, name)
+        return series(table["t"], depth, name, "depth")
     return None
 
 
@@ -215,13 +223,13 @@ def _voltage(tables: Mapping[str, Table]) -> Series | None:
         main = battery["id"] == 0
         volts = np.asarray(codec.pack_voltage(battery["voltages"][main].T.astype(float)))
         known = np.isfinite(volts)
-        found = series(battery["t"][main][known], volts[known], "BATTERY_STATUS")
+        found = series(battery["t"][main][known], volts[known], "BATTERY_STATUS", "voltage")
         if found is not None:
             return found
     if (status := tables.get("SYS_STATUS")) is not None:
         volts = np.asarray(codec.volts(status["voltage_battery"]))
         known = np.isfinite(volts)
-        return series(status["t"][known], volts[known], "SYS_STATUS")
+        return series(status["t"][known], volts[known], "SYS_STATUS", "voltage")
     return None
 
 
@@ -229,14 +237,5 @@ def _rc(tables: Mapping[str, Table]) -> Series | None:
     if (table := tables.get("RC_CHANNELS")) is None:
         return None
     channels = np.stack([table[f"chan{n}_raw"] for n in range(1, 9)]).astype(float)
-    return series(table["t"], np.where(channels == codec.UINT16_MAX, 0, channels), "RC_CHANNELS")
-
-
-def _parameters(tables: Mapping[str, Table]) -> list[Parameter]:
-    table = tables.get("PARAM_VALUE")
-    if table is None:
-        return []
-    return [
-        Parameter(float(t), name.decode("ascii", "replace"), float(value))
-        for t, name, value in zip(table["t"], table["param_id"], table["param_value"], strict=True)
-    ]
+    channels = np.where(channels == codec.UINT16_MAX, 0, channels)
+    return series(table["t"], channels, "RC_CHANNELS", "channel")

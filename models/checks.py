@@ -1,8 +1,9 @@
 """Checks that configuration dataclasses make of themselves when they are constructed."""
 
 import dataclasses
-import math
-from typing import Any, get_args, get_origin
+import sys
+from dataclasses import dataclass
+from typing import Annotated, Any, get_args, get_origin
 
 import jax
 
@@ -10,6 +11,36 @@ from .errors import UserError
 
 Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Within:
+    """The range of an option's numbers, ends included; without `low` itself if `above`.
+
+    It stands in the annotation of the field: `rate: Annotated[float, Within(1, 400)] = 20.0`.
+    """
+
+    low: float | int
+    high: float | int
+    above: bool = False
+
+    def holds(self, value: float | int) -> bool:
+        """Whether a number lies within; NaN does not."""
+        return (self.low < value if self.above else self.low <= value) and value <= self.high
+
+    def __str__(self) -> str:
+        """What to give."""
+        if self.above:
+            return f"above {self.low:g}, at most {self.high:.10g}"
+        return f"from {self.low:g} to {self.high:.10g}"
+
+
+SEED = Within(0, 2**32 - 1)
+COUNT = Within(1, 1_000_000)
+WORKERS = Within(0, 1024)
+RATE_OF_ALARMS = Within(0.0, 0.499, above=True)
+SECONDS = Within(0.0, 86400.0, above=True)
+WATER_DENSITY = Within(900.0, 1100.0)
 
 
 def require(condition: bool, config: Any, field: str, remedy: str) -> None:
@@ -26,14 +57,16 @@ def require_rate(value: float, named: str) -> None:
 
 
 def check_numbers(config: Any) -> None:
-    """Check that every number of a dataclass is finite and every fixed-size tuple has its size.
+    """Check the numbers of a dataclass: finite, within what their annotations state, and in number.
 
     Raises:
         UserError: naming kind, field, value and remedy.
     """
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        sizes = get_args(field.type) if get_origin(field.type) is tuple else ()
+        kind = get_args(field.type)[0] if get_origin(field.type) is Annotated else field.type
+        sizes = get_args(kind) if get_origin(kind) is tuple else ()
+        limit = range_of(field.type)
         if sizes and Ellipsis not in sizes:
             require(
                 isinstance(value, tuple) and len(value) == len(sizes),
@@ -43,7 +76,10 @@ def check_numbers(config: Any) -> None:
             )
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, float | int):
-                require(math.isfinite(number), config, field.name, "give finite numbers")
+                finite = abs(number) <= sys.float_info.max
+                require(finite, config, field.name, "give finite numbers")
+                within = limit is None or limit.holds(number)
+                require(within, config, field.name, f"give numbers {limit}")
 
 
 def require_double(who: str, before: str) -> None:
@@ -57,3 +93,11 @@ def require_double(who: str, before: str) -> None:
             f"{who} in double precision: call "
             f'jax.config.update("jax_enable_x64", True) before {before}'
         )
+
+
+def range_of(hint: Any) -> Within | None:
+    """The range that stands in an annotation, at any depth."""
+    if get_origin(hint) is Annotated:
+        found = next((part for part in hint.__metadata__ if isinstance(part, Within)), None)
+        return found or range_of(get_args(hint)[0])
+    return next((found for part in get_args(hint) if (found := range_of(part))), None)

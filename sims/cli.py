@@ -94,7 +94,9 @@ def _run(given: list[str]) -> None:
     import jax
 
     from .compile_cache import keep_compiled
+    from .options import check_options
 
+    check_options(command)
     keep_compiled()
     jax.config.update("jax_enable_x64", True)
     # Small programs then run in line: a call from a diagram costs 10 µs instead of up to 40.
@@ -105,7 +107,11 @@ def _run(given: list[str]) -> None:
 
 
 def _parsed(given: list[str]) -> _Command:
-    from typing import Annotated
+    import contextlib
+    import io
+    from functools import reduce
+    from operator import or_
+    from typing import Annotated, Any
 
     import tyro
 
@@ -118,19 +124,31 @@ def _parsed(given: list[str]) -> _Command:
     from .commands.run import Run
     from .commands.study import Study
     from .commands.train import Train
+    from .options import misread
 
-    commands = (
-        Annotated[Import, tyro.conf.subcommand("import")]
-        | Annotated[Generate, tyro.conf.subcommand("generate")]
-        | Annotated[Train, tyro.conf.subcommand("train")]
-        | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-        | Annotated[Run, tyro.conf.subcommand("run")]
-        | Annotated[Diagnose, tyro.conf.subcommand("diagnose")]
-        | Annotated[Check, tyro.conf.subcommand("check")]
-        | Annotated[Study, tyro.conf.subcommand("study")]
-        | Annotated[Demo, tyro.conf.subcommand("demo")]
-    )
-    return tyro.cli(commands, args=given, prog="spinndrift", description=_DESCRIPTION)
+    classes: dict[str, Any] = {
+        "import": Import,
+        "generate": Generate,
+        "train": Train,
+        "evaluate": Evaluate,
+        "run": Run,
+        "diagnose": Diagnose,
+        "check": Check,
+        "study": Study,
+        "demo": Demo,
+    }
+    subcommands = [Annotated[cls, tyro.conf.subcommand(name)] for name, cls in classes.items()]
+    command: Any = reduce(or_, subcommands)
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(command, args=given, prog="spinndrift", description=_DESCRIPTION)
+    except SystemExit as end:
+        if end.code:
+            raise UserError(misread(given, said.getvalue())) from None
+        if given[0] in classes:  # its help was shown
+            print("examples:", *classes[given[0]].EXAMPLES, sep="\n  ")  # noqa: T201
+        raise
 
 
 def _fail(message: str, code: int) -> None:

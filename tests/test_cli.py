@@ -100,10 +100,13 @@ def test_every_option_is_explained(command, capsys):
         (("generate", "--maneuvers", "loop"), ("loop", "surge")),
         (("diagnose", EMBEDDED, "--out", "/proc/nope"), ("--out /proc/nope", "written")),
         (("diagnose", EMBEDDED, "--out", "empty.tlog"), ("--out empty.tlog", "is a file")),
-        (("diagnose", EMBEDDED, "--alpha", "2"), ("--alpha 2", "below 0.5")),
-        (("check", "diagnosis", "--alpha", "2"), ("--alpha 2", "below 0.5")),
+        (("diagnose", EMBEDDED, "--alpha", "2"), ("--alpha 2", "at most 0.499")),
+        (("check", "diagnosis", "--alpha", "2"), ("--alpha 2", "at most 0.499")),
         (("diagnose", EMBEDDED, "--alpha", "nan"), ("--alpha nan",)),
-        (("diagnose", EMBEDDED, "--diffusion", "nan", *"11111"), ("--diffusion", "finite")),
+        (
+            ("diagnose", EMBEDDED, "--diffusion", "nan", *"11111"),
+            ("--diffusion nan", "give a number from 0"),
+        ),
         (("train", EMBEDDED, "--out", "empty.tlog/deep"), ("--out", "empty.tlog is no folder")),
     ],
 )

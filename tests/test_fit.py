@@ -186,7 +186,7 @@ def test_a_checkpoint_of_other_data_or_settings_is_refused(windows, validation, 
         fit(replace(CONFIG, batch=5), START, windows, tmp_path, resume=True)
     whole = (tmp_path / "checkpoint.npz").read_bytes()
     (tmp_path / "checkpoint.npz").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(UserError, match="not a whole checkpoint"):
+    with pytest.raises(UserError, match="not a whole spinndrift checkpoint"):
         fit(CONFIG, START, windows, tmp_path, resume=True)
 
 

@@ -1,14 +1,14 @@
 """Simulated data: maneuvers under noise and disturbances, as a `Recording`."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..models.checks import Vector6, check_numbers, require
+from ..models.checks import SECONDS, SEED, Vector6, Within, check_numbers, require
 from ..models.disturbances.base import Disturbance
 from ..models.dynamics import Dynamics, Flow
 from ..models.integrate import step
@@ -23,34 +23,28 @@ class GenerateConfig:
     """What to simulate; the defaults make the paper's sparse regime."""
 
     maneuvers: tuple[str, ...] = tuple(MANEUVERS)
-    trajectories: int = 20
+    trajectories: Annotated[int, Within(1, 100_000)] = 20
     """Trajectories of each maneuver."""
-    duration: float = 10.0
+    duration: Annotated[float, SECONDS] = 10.0
     """Seconds of each trajectory."""
-    rate: float = 20.0
+    rate: Annotated[float, Within(0.1, 1000)] = 20.0
     """Samples a second."""
-    substeps: int = 10
+    substeps: Annotated[int, Within(1, 1000)] = 10
     """Integration steps a sample."""
-    effort: float = 0.3
+    effort: Annotated[float, Within(0, 1, above=True)] = 0.3
     """Share of the largest wrench in each maneuver's direction."""
-    diffusion: Vector6 = (2.0, 2.0, 2.0, 0.2, 0.2, 0.2)
+    diffusion: Annotated[Vector6, Within(0, 1e6)] = (2.0, 2.0, 2.0, 0.2, 0.2, 0.2)
     """Diffusion b of the simulated vehicle (N√s, N·m√s), where none is given with the model."""
-    depth: float = 5.0
+    depth: Annotated[float, Within(0, 11_000)] = 5.0
     """Depth of the start (m)."""
-    start_spread: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    start_spread: Annotated[Vector6, Within(0, 100)] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """Standard deviation of the twist at the start (m/s, rad/s)."""
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
+    """Seed of all noise."""
 
     def __post_init__(self) -> None:
         check_numbers(self)
-        for name in ("trajectories", "substeps"):
-            require(getattr(self, name) >= 1, self, name, "give at least 1")
-        for name in ("duration", "rate"):
-            require(getattr(self, name) > 0, self, name, "give a positive number")
-        require(0 < self.effort <= 1, self, "effort", "give more than 0, at most 1")
         require(len(self.maneuvers) > 0, self, "maneuvers", "give at least one")
-        for name in ("diffusion", "start_spread"):
-            require(min(getattr(self, name)) >= 0, self, name, "give numbers of zero or more")
 
 
 def generate(

@@ -4,10 +4,11 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from tyro.conf import OmitArgPrefixes, subcommand
 
+from ...models.checks import RATE_OF_ALARMS, WORKERS
 from ...models.errors import UserError
 from ..progress import console, progress_bar
 from .check_estimator import CheckEstimator
@@ -25,9 +26,9 @@ class CheckDiagnosis:
     """Folder of cases, such as `make blind` writes."""
     only: tuple[str, ...] = ()
     """Patterns of the names of cases or of causes to take (`'lag-*' net_buoyancy`)."""
-    alpha: float = 0.01
+    alpha: Annotated[float, RATE_OF_ALARMS] = 0.01
     """Rate of false alarms that is promised."""
-    workers: int = 0
+    workers: Annotated[int, WORKERS] = 0
     """Worker processes on this machine; 0 judges all cases in this one."""
     rivals: bool = False
     """Judge sparse regression (pysindy: STLSQ and weak form) and random features on the same files
@@ -52,7 +53,6 @@ class CheckDiagnosis:
 
     def run(self) -> None:
         """Diagnose, judge, tell."""
-        from ...models.checks import require_rate
         from ..check.cases import find_cases
         from ..check.pages import write_page
         from ..check.run import run_cases
@@ -60,7 +60,6 @@ class CheckDiagnosis:
 
         if self.docs is not None and self.docs.suffix != ".md":
             raise UserError(f"--docs {self.docs}: end the name in .md")
-        require_rate(self.alpha, "--alpha")
         cases = find_cases(self.cases, self.only)
         with progress_bar(f"{len(cases)} cases") as update:
             rows, failed = run_cases(cases, self.out, self.alpha, update, self.rivals, self.workers)
@@ -81,6 +80,11 @@ class CheckDiagnosis:
 @dataclass(frozen=True)
 class Check:
     """Measure what this package promises, on cases whose answer is known."""
+
+    EXAMPLES: ClassVar = (
+        "spinndrift check estimator --only calm --runs 2 --seconds 10",
+        "spinndrift check diagnosis --cases runs/blind  # after: make blind",
+    )
 
     what: Annotated[
         Annotated[CheckDiagnosis, subcommand("diagnosis", prefix_name=False)]

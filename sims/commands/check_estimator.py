@@ -4,8 +4,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+from ...models.checks import WORKERS, Within
 from ...models.errors import UserError
 from ..progress import console, progress_bar
 
@@ -26,17 +27,17 @@ class CheckEstimator:
     only: tuple[str, ...] = ()
     """Patterns of the names of settings to fly (`calm 'dvl_*'`), or `consistency` or `faults` for
     all of one kind; by default both."""
-    runs: int = 60
+    runs: Annotated[int, Within(1, 10_000)] = 60
     """Runs of each setting with healthy sensors."""
-    seconds: float = 60.0
+    seconds: Annotated[float, Within(1, 86400)] = 60.0
     """Time of each of these runs."""
-    fault_runs: int = 50
+    fault_runs: Annotated[int, Within(1, 10_000)] = 50
     """Runs of each fault."""
-    fault_seconds: float = 30.0
+    fault_seconds: Annotated[float, Within(1, 86400)] = 30.0
     """Time of each of these runs; the fault begins after a third of it."""
     model: Path | None = None
     """Learned model (.spinn) to fly as the plant; by default the demo's, which is trained first."""
-    workers: int = 0
+    workers: Annotated[int, WORKERS] = 0
     """Worker processes on this machine; 0 flies all settings in this one."""
     out: Path = Path("runs/estimator")
     """Folder for what was found in each setting."""
@@ -86,14 +87,6 @@ class CheckEstimator:
     def _check_options(self) -> None:
         if self.docs is not None and self.docs.suffix != ".md":
             raise UserError(f"--docs {self.docs}: end the name in .md")
-        for name, count in (("--runs", self.runs), ("--fault-runs", self.fault_runs)):
-            if count < 1:
-                raise UserError(f"{name} {count}: give at least 1")
-        for name, time in (("--seconds", self.seconds), ("--fault-seconds", self.fault_seconds)):
-            if not 1 <= time < float("inf"):
-                raise UserError(f"{name} {time:g}: give a time of at least 1 s")
-        if self.workers < 0:
-            raise UserError(f"--workers {self.workers}: give 0 or more")
 
     def _settings(self) -> list["Setting"]:
         """What is to be flown; the model is trained first if one is needed and none is named."""

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, ClassVar
+
+from ...models.checks import COUNT
 
 
 @dataclass(frozen=True)
@@ -13,6 +16,11 @@ class Demo:
     report.html. An interrupted demo goes on where it was.
     """
 
+    EXAMPLES: ClassVar = (
+        "spinndrift demo",
+        "spinndrift demo --log dive.nc --steps 100 --out runs/short",
+    )
+
     log: Path | None = None
     """Your own log (.tlog, .BIN), recording (.nc) or CSV folder; by default the one that comes
     along."""
@@ -23,7 +31,7 @@ class Demo:
     """Preset name or YAML file to start from; by default what the data name, or bluerov2_heavy."""
     scenario: str = "pylon_crossing_calm"
     """The dive to fly: a shipped scenario's name or a YAML file."""
-    steps: int | None = None
+    steps: Annotated[int | None, COUNT] = None
     """Training steps, for a shorter or a longer look."""
 
     def run(self) -> None:

@@ -3,9 +3,11 @@
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, ClassVar
 
 from tyro.conf import Positional
 
+from ...models.checks import SECONDS
 from ...models.errors import UserError
 from ..progress import console, progress_bar
 
@@ -18,13 +20,18 @@ class Evaluate:
     writes them against the horizon. All of DATA is used: give data that training has not seen.
     """
 
+    EXAMPLES: ClassVar = (
+        "spinndrift evaluate runs/mine/model.spinn sea.nc",
+        "spinndrift evaluate runs/tank/model.spinn harbour.nc --length 2 --out errors.csv",
+    )
+
     model: Positional[Path]
     """Model file (.spinn)."""
     data: Positional[Path]
     """Recording (.nc), log (.tlog, .BIN) or CSV folder."""
     out: Path | None = None
     """File for the results: .csv (tidy), .json (overall) or .nc."""
-    length: float = 4.0
+    length: Annotated[float, SECONDS] = 4.0
     """Seconds of each window."""
     vehicle: str | None = None
     """Preset name or YAML file to compare with; by default what the model names."""

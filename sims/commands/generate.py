@@ -3,7 +3,7 @@
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from tyro.conf import OmitArgPrefixes
 
@@ -13,11 +13,24 @@ from ..progress import console, progress_bar
 
 
 @dataclass(frozen=True)
+class Settings(GenerateConfig):
+    """What to simulate."""
+
+    def __post_init__(self) -> None:
+        """Leave it to `sims.options`, which names options as they are given."""
+
+
+@dataclass(frozen=True)
 class Generate:
     """Simulate maneuvers of a vehicle under noise and disturbances, as a Recording.
 
     The defaults make the paper's sparse regime: ten maneuvers, 20 trajectories each, 10 s at 20 Hz.
     """
+
+    EXAMPLES: ClassVar = (
+        "spinndrift generate --trajectories 4 --out tank.nc",
+        "spinndrift generate --maneuvers yaw-left --disturbances harbour --out harbour.nc",
+    )
 
     out: Path = Path("generated.nc")
     """File to write (.nc)."""
@@ -27,7 +40,7 @@ class Generate:
     """Simulate this learned model (.spinn) instead of the preset with `--diffusion`."""
     disturbances: str = "still"
     """Named set of disturbances: still, calm, harbour, slack_tide, flood_tide."""
-    config: Annotated[GenerateConfig, OmitArgPrefixes] = field(default_factory=GenerateConfig)
+    config: Annotated[Settings, OmitArgPrefixes] = field(default_factory=Settings)
 
     def place(self) -> AbstractContextManager[Path]:
         """Hold what is to be written."""
@@ -49,7 +62,9 @@ class Generate:
         disturbance = preset(self.disturbances)
         dynamics = None if self.model is None else load_model(self.model, dtype=float)[0]
         with progress_bar("simulating"):
-            recording = generate(self.config, vehicle, (disturbance,), dynamics)
+            recording = generate(
+                GenerateConfig(**vars(self.config)), vehicle, (disturbance,), dynamics
+            )
         recording.save(self.out)
         shown = console()
         shown.print(recording.summary())

@@ -3,10 +3,11 @@
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from tyro.conf import FlagCreatePairsOff, Positional
 
+from ...models.checks import WATER_DENSITY, Within
 from ...models.errors import UserError
 from ..progress import console, progress_bar
 
@@ -20,24 +21,29 @@ class Import:
     rate, and the summary says what the log lacks and what can therefore not be learned from it.
     """
 
+    EXAMPLES: ClassVar = (
+        "spinndrift import sims/data/sitl_dive.tlog.xz --out dive.nc",
+        "spinndrift import sims/data/sitl_dive.tlog.xz --rate 50 --water-density 1025 --out sea.nc",
+    )
+
     log: Positional[Path]
     """The log file or CSV folder."""
     out: Path | None = None
     """File to write (.nc); by default the log's name in the current folder."""
-    rate: float = 20.0
+    rate: Annotated[float, Within(1, 400)] = 20.0
     """Samples a second."""
     vehicle: str | None = None
     """Preset name or YAML file of the vehicle; by default what the data name, or bluerov2_heavy."""
 
-    minimum: float = 5.0
+    minimum: Annotated[float, Within(0.5, 3600)] = 5.0
     """Shortest stretch of a log that is kept (s)."""
-    gap: float = 0.5
+    gap: Annotated[float, Within(0.01, 60)] = 0.5
     """Longest pause between samples of one of a log's signals (s); a longer one parts a stretch."""
-    water_density: float | None = None
+    water_density: Annotated[float | None, WATER_DENSITY] = None
     """kg/m³, where a log's autopilot took the sea for fresh water: corrects depth and climb."""
     disarmed: Annotated[bool, FlagCreatePairsOff] = False
     """Keep a log's disarmed stretches too."""
-    system: int | None = None
+    system: Annotated[int | None, Within(1, 255)] = None
     """MAVLink system id, where a log holds several autopilots."""
 
     def place(self) -> AbstractContextManager[Path]:

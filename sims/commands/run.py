@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from ...models.checks import SECONDS, SEED
 from ..progress import console, progress_bar, tell_code
 
 
@@ -25,9 +26,14 @@ class Run:
     look at that code first if the file comes from elsewhere.
     """
 
+    EXAMPLES: ClassVar = (
+        "spinndrift run station_keeping_calm --duration 10",
+        "spinndrift run pylon_crossing_harbour --model runs/mine/model.spinn --seed 3",
+    )
+
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
     """Name of a shipped scenario, or a YAML file."""
-    seed: int | None = None
+    seed: Annotated[int | None, SEED] = None
     """Seed of everything random; by default that of the scenario."""
     out: Path | None = None
     """Folder to write, which must not exist yet; by default runs/<name>-<seed>."""
@@ -38,7 +44,7 @@ class Run:
     engine: Literal["auto", "drake", "compiled"] = "auto"
     """Who steps the diagram: Drake, or one compiled loop, which is faster but needs systems that
     tell what they compute (no planner, no system of one's own without `pure`)."""
-    duration: float | None = None
+    duration: Annotated[float | None, SECONDS] = None
     """Longest simulated time (s); by default that of the scenario."""
     report: bool = True
     """Write report.html and meshcat.html."""

@@ -4,10 +4,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from ...models.checks import WORKERS, Within
 from ...models.errors import UserError
 from ..progress import console, progress_bar
 
@@ -21,12 +22,17 @@ class Study:
     report.html, ablation.md, figures and tables are written from all runs found.
     """
 
+    EXAMPLES: ClassVar = (
+        "spinndrift study --scale tiny --seeds 1 --methods pinn --out runs/tiny",
+        "spinndrift study --regime sparse --scale small --workers 2",
+    )
+
     name: Annotated[Positional[Literal["ablation"]], arg(metavar="ablation")] = "ablation"
     """The study: `ablation`, the paper's simulation experiments."""
     regime: tuple[Literal["rich", "sparse"], ...] = ("rich", "sparse")
     """Data to learn from: `rich` (one maneuver, 100 trajectories), `sparse` (ten maneuvers,
     20 trajectories each)."""
-    seeds: int = 5
+    seeds: Annotated[int, Within(1, 10_000)] = 5
     """Number of seeds; each has data and training of its own."""
     methods: tuple[str, ...] = ()
     """Methods to train, by name; by default all."""
@@ -40,11 +46,11 @@ class Study:
     shows all."""
     out: Path = Path("runs/ablation")
     """Folder of all runs, tables and pages."""
-    workers: int = 0
+    workers: Annotated[int, WORKERS] = 0
     """Worker processes on this machine; 0 runs all in this one."""
     cluster: str | None = None
     """Address of a Dask scheduler (tcp://host:port) whose workers see `--out` too."""
-    together: int = 1
+    together: Annotated[int, Within(1, 10_000)] = 1
     """Seeds that one task trains."""
     docs: Path | None = None
     """Markdown file to write the verdicts into as well, such as docs/ablation.md."""

@@ -3,9 +3,11 @@
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, ClassVar
 
 from tyro.conf import Positional
 
+from ...models.checks import COUNT, SEED
 from ...models.errors import UserError
 from ..progress import console, progress_bar
 
@@ -18,6 +20,11 @@ class Train:
     summary and report.html compare preset and learned model on it. Ctrl-C leaves a checkpoint;
     the same command with `--resume` goes on to the same bits.
     """
+
+    EXAMPLES: ClassVar = (
+        "spinndrift train dive.nc --out runs/mine",
+        "spinndrift train tank.nc --method fdm-geodesic --steps 200 --out runs/tank",
+    )
 
     data: Positional[Path]
     """Recording (.nc), log (.tlog, .BIN) or CSV folder."""
@@ -37,9 +44,9 @@ class Train:
     """Model file (.spinn) to start from in place of the preset: what `spinndrift diagnose` wrote as
     extended/model.spinn, whose effects stay as they are while a SPINN learns the rest, or a trained
     model, which is trained on. Of a trained one the architecture stays."""
-    steps: int | None = None
+    steps: Annotated[int | None, COUNT] = None
     """Number of training steps, instead of the settings' own."""
-    seed: int | None = None
+    seed: Annotated[int | None, SEED] = None
     """Seed of the start and of all noise, instead of the settings' own."""
     resume: bool = False
     """Continue the run in `--out`."""

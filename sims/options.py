@@ -1,0 +1,68 @@
+"""Numbers among the options of a command, checked in one place before anything is computed."""
+
+import dataclasses
+import itertools
+import math
+import re
+from collections.abc import Sequence
+from typing import Any, get_type_hints
+
+from ..models.checks import range_of
+from ..models.errors import UserError
+
+_KINDS = {"FLOAT": "a number", "INT": "a whole number"}
+
+
+def check_options(command: Any) -> None:
+    """Refuse numbers of a command's options that are not finite, or beyond what the option takes.
+
+    Raises:
+        UserError: naming option, value and remedy.
+    """
+    hints = get_type_hints(type(command), include_extras=True)
+    for field in dataclasses.fields(command):
+        value = getattr(command, field.name)
+        if dataclasses.is_dataclass(value):
+            check_options(value)
+            continue
+        option = f"--{field.name.replace('_', '-')}"
+        limit = range_of(hints[field.name])
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, bool) or not isinstance(number, int | float):
+                continue
+            if limit is None:
+                if not math.isfinite(number):
+                    raise UserError(f"{option} {number:g}: give a finite number")
+            elif not limit.holds(number):
+                told = f"{number:.10g}" if isinstance(number, float) else str(number)
+                shown = told if len(told) < 30 else f"{told[:20]}…"
+                raise UserError(f"{option} {shown}: give a number {limit}")
+
+
+def misread(given: Sequence[str], told: str) -> str:
+    """One sentence of what the parser of options told about what was given."""
+    lines = _inside(told)
+    text = " ".join(lines).replace("{None}|", "")
+    command = given[0] if given and not given[0].startswith("-") else "COMMAND"
+    see = f"see spinndrift {command} --help"
+    wrong = re.search(r"Error parsing (?:argument )?(--[\w-]+)", text)
+    if wrong is not None:
+        option = wrong[1]
+        form = re.search(rf"helptext: *(?:-\w, )?{option} ([^a-z]*)", text)
+        kinds = re.findall(r"FLOAT|INT", form[1]) if form else []
+        many = {"FLOAT": f"{len(kinds)} numbers"} if len(kinds) > 1 else _KINDS
+        wanted = f"give {many.get(kinds[0], kinds[0])}" if kinds else "give another value"
+        at = [i for i, word in enumerate(given) if word == option][-1:]
+        value = "".join(f" {given[i + 1]}" for i in at if i + 1 < len(given))
+        return f"{option}{value}: {wanted}; {see}"
+    groups = [" ".join(group) for filled, group in itertools.groupby(lines, bool) if filled]
+    said = next((group for group in groups if re.search(r"[:.'{]", group)), text)  # not a title
+    meant = re.search(r"Perhaps you meant: *(--[\w-]+)", text)
+    hint = f"did you mean {meant[1]}? " if meant else ""
+    return f"{said.rstrip('.')}; {hint}{see}"
+
+
+def _inside(told: str) -> list[str]:
+    """Lines of a message without the box around it, whose sides may lack; empty for its rules."""
+    plain = [re.sub(r"^\s*[│|+╭╰]?\s*|\s*[│|+╮╯]?\s*$", "", line) for line in told.splitlines()]
+    return ["" if re.search(r"[─-]{4}$", line) else line for line in plain]

@@ -151,8 +151,8 @@ def _page(
     better = all(r < 1 for r in ratio.values())
     page = Page("From a log to a dive", f"`{source.name}`, from the preset `{vehicle.name}`")
     page.verdict(
-        f"On motion it has not seen the learned model misses position by {ratio['position']:.0%} "
-        f"and velocity by {ratio['linear_velocity']:.0%} of the preset's error. {outcome['words']}",
+        f"On motion it has not seen, {_compared(overall, 'position', 'm')}, "
+        f"{_compared(overall, 'linear_velocity', 'm/s')}. {outcome['words']}",
         better and outcome["success"],
     )
     page.tiles(
@@ -165,9 +165,9 @@ def _page(
     add_evaluation(add_training(add_data(page, recording), learned), learned)
     page.section(
         "The dive",
-        "The learned model is the vehicle, and MPPI plans with it: from (0, 0, −1.5) m to the goal "
-        "between the pylons, on estimates of a Kalman filter, at 5 plans a second. The run's own "
-        "[report](dive/report.html) and [3-D replay](dive/meshcat.html) show more.",
+        f"The learned model is the vehicle, and MPPI plans with it: {_task(run.scenario)}, on "
+        "estimates of a Kalman filter. The run's own [report](dive/report.html) and "
+        "[3-D replay](dive/meshcat.html) show more.",
     )
     around = scene(run.scenario)
     page.figure(path_figure(run.log, around), "Planned, flown and estimated path.")
@@ -181,6 +181,25 @@ def _page(
         if figure is not None:
             page.figure(figure, caption)
     return page
+
+
+def _task(scenario: Scenario) -> str:
+    """Where from, where to, how often it is planned."""
+
+    def place(p: Any) -> str:
+        return f"({', '.join(f'{x:g}' for x in p)}) m"
+
+    start = place(scenario.station.initial_state()[0][4:])
+    to = "" if scenario.goal is None else f" to {place(scenario.goal)}"
+    assert isinstance(scenario.controller, MppiImpedance)
+    return f"from {start}{to}, with {1 / scenario.controller.planner.period:g} plans a second"
+
+
+def _compared(overall: dict[str, dict[str, float]], norm: str, unit: str) -> str:
+    """A learned model's error beside the preset's, which it is a share of."""
+    learned, preset = (overall[model][f"rmse_{norm}"] for model in ("learned", "preset"))
+    share = f"{100 * learned / preset:.0f} % of the preset's {preset:.2f} {unit}"
+    return f"{norm.replace('_', ' ')} error {learned:.2f} {unit}, {share}"
 
 
 def _summary(learned: Learned, values: dict[str, Any], seconds: float) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """Figures of data, training and held-out errors."""
 
+import itertools
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -53,27 +55,53 @@ def recording_figure(recording: Recording) -> Figure:
 
 
 @styled
-def learning_figure(metrics: dict[str, np.ndarray]) -> Figure:
-    """Training and validation loss and their parts over the steps."""
+def learning_figure(
+    metrics: dict[str, np.ndarray], refits: tuple[int, ...] = (), taken: int | None = None
+) -> Figure:
+    """Training and validation loss and their parts over the steps done.
+
+    Curves are parted at `refits`, after which losses are of another scale; a ring marks the
+    validation of the step `taken`.
+    """
     figure, axes = panels(1, 2, 3.0)
-    step = metrics["step"]
+    done = metrics["step"] + 1
     left, right = axes[0]
-    left.plot(step, _smooth(metrics["loss"]), color=FLOWN, label="training")
-    validated = np.isfinite(metrics["validation"])
-    if validated.any():
-        left.plot(
-            step[validated], metrics["validation"][validated], "o-", ms=3, color=PLANNED,
-            label="validation",
-        )  # fmt: skip
-    left.set_title("Loss")
     known = {"step", "loss", "gradient_norm", "rate", "ok", "validation", "seconds"}
-    for name in sorted(set(metrics) - known):
-        right.plot(step, _smooth(metrics[name]), label=name)
+    parts = {name: f"C{i}" for i, name in enumerate(sorted(set(metrics) - known))}
+    for number, part in enumerate(stretches(metrics["step"], refits)):
+        first = "" if number == 0 else "_"  # what starts so stands in no legend
+        left.plot(done[part], _smooth(metrics["loss"][part]), color=FLOWN, label=f"{first}training")
+        values = metrics["validation"][part]
+        known_at = np.isfinite(values)
+        if known_at.any():
+            left.plot(
+                done[part][known_at], values[known_at], "o-", ms=3, color=PLANNED,
+                label=f"{first}validation",
+            )  # fmt: skip
+        for name, color in parts.items():
+            smooth = _smooth(metrics[name][part])
+            right.plot(done[part], smooth, color=color, label=f"{first}{name}")
+    at = np.flatnonzero((done == taken) & np.isfinite(metrics["validation"]))
+    if at.size:
+        left.plot(
+            done[at], metrics["validation"][at], "o", ms=9, mfc="none", color=INK, label="taken"
+        )
+    left.set_title("Loss")
     right.set_title("Its parts")
+    for ax in (left, right):
+        for refit in refits:
+            ax.axvline(refit, color=QUIET, lw=0.8, ls=":")
     for ax in (left, right):
         ax.set_xlabel("step")
         legend(ax)
     return figure
+
+
+def stretches(step: np.ndarray, refits: tuple[int, ...]) -> list[np.ndarray]:
+    """Which rows of the metrics lie between one refit and the next, as masks."""
+    edges = [-np.inf, *refits, np.inf]
+    masks = [(step >= low) & (step < high) for low, high in itertools.pairwise(edges)]
+    return [mask for mask in masks if mask.any()]
 
 
 def _smooth(values: np.ndarray, width: int = 15) -> np.ndarray:

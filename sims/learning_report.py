@@ -1,10 +1,13 @@
 """What training found, as sections of a page."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 
 from ..models.dynamics import Dynamics
 from ..models.recording import Recording
+from ..training.fit import TrainingResult
 from .figures_learning import (
     bands_figure,
     coverage_figure,
@@ -16,6 +19,7 @@ from .learning import FINE_SUBSTEPS, Learned
 from .pages import Page
 
 _LEFT_OUT = ("rmse_geodesic", "rmse_velocity", "finite")
+_SPEED = 0.5
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
 
@@ -40,17 +44,24 @@ def add_training(page: Page, learned: Learned) -> Page:
     page.section(
         "Training",
         f"{result.steps} steps on {len(parts.learn)} windows of {parts.learn.length:g} s in "
-        f"{result.seconds:.0f} s; the best of {validation} validation windows was reached at step "
-        f"{result.best_step}. The other {len(parts.held_out)} windows were held out.",
+        f"{result.seconds:.0f} s. {taken_words(result, validation)} The other "
+        f"{len(parts.held_out)} windows were held out.",
     )
-    page.figure(learning_figure(result.metrics), "Loss against steps (running median).")
+    caption = "Loss against steps (running median)."
+    if result.refits:
+        caption += (
+            " At dotted lines bandwidths were fitted anew: losses before and after one are of "
+            "different scales."
+        )
+    page.figure(learning_figure(result.metrics, result.refits, result.best_step), caption)
+    rows = coefficient_rows(learned.preset, learned.model)
     page.table(
-        coefficient_rows(learned.preset, learned.model),
+        rows,
         ("axis", "M preset", "M learned", "D preset", "D learned", "D^f preset", "D^f learned",
          "b preset", "b learned"),
         "Diagonals at rest: mass with added mass (kg, kg·m²), viscous and fluid drag, diffusion "
-        "(N√s, N·m√s). The preset's diffusion is estimated from its own errors. Thrust that the "
-        "preset overrates shows up as too much mass and drag.",
+        "(N√s, N·m√s). The preset's diffusion is estimated from its own errors. "
+        + scale_words(rows),
     )  # fmt: skip
     for event in result.events:
         page.text(f"Step {event['step']}: {event['text']}")
@@ -87,6 +98,39 @@ def add_evaluation(page: Page, learned: Learned, window: int | None = None) -> P
         "where it leaves the panel).",
     )
     return page
+
+
+def taken_words(result: TrainingResult, validation: int) -> str:
+    """Which step's model was taken and why; `validation` is the number of windows that chose."""
+    windows = f"{validation} validation window{'s' * (validation != 1)}"
+    step, last = result.best_step, max(result.refits, default=0)
+    if validation == 0:
+        return f"No windows could be spared to choose a step by, so step {step} is taken, the last."
+    if step == 0:
+        return f"No step was better on {windows} than the start, which is taken."
+    if step <= last:
+        return (
+            f"Step {step} is taken: on {windows} none was better, also by the bandwidths that were "
+            f"fitted anew at step {last}."
+        )
+    since = f" since bandwidths were fitted anew at step {last}" if last else ""
+    return f"Step {step} is taken, whose loss on {windows} is the lowest{since}."
+
+
+def scale_words(rows: Sequence[tuple[object, ...]]) -> str:
+    """What mass and drag have in common with thrust, whose scale motion alone doesn't tell."""
+    table = np.array([[float(str(cell)) for cell in row[1:]] for row in rows])
+    mass = float(np.median(table[:, 1] / table[:, 0]))
+    drag = [table[:, 2 + k] + _SPEED * table[:, 4 + k] for k in (0, 1)]
+    ratio = float(np.median(drag[1] / np.maximum(drag[0], np.finfo(float).tiny)))
+    told = (
+        f"In the median of the axes mass is {mass:.2f} times and drag at {_SPEED:g} m/s or rad/s "
+        f"{ratio:.2f} times the preset's."
+    )
+    if (mass - 1) * (ratio - 1) <= 0:
+        return told
+    does, shows = ("overrates", "much") if mass > 1 else ("underrates", "little")
+    return f"{told} A preset that {does} thrust shows up as too {shows} of both."
 
 
 def coefficient_rows(preset: Dynamics, learned: Dynamics) -> list[tuple[object, ...]]:

@@ -58,6 +58,8 @@ class TrainingResult:
         events: recoveries, each with its step and what happened.
         seconds: time spent in training.
         stopped_early: whether `patience` ended it.
+        refits: steps before which bandwidths were fitted anew; losses before and after one are of
+            different scales.
     """
 
     model: Dynamics
@@ -68,6 +70,7 @@ class TrainingResult:
     events: tuple[dict[str, Any], ...]
     seconds: float
     stopped_early: bool
+    refits: tuple[int, ...] = ()
 
 
 def fit(
@@ -180,7 +183,7 @@ class Run:
     def plan(self) -> tuple[Any, ...]:
         """What the compiled step takes for the step at hand."""
         state, config = self.state, self.config
-        if state.step in {round(f * config.steps) for f in config.refit_at}:
+        if state.step in self._refits():
             state.objective = state.objective.refit(self._model(state.params), self._usable())
             state.best_value = self._score(state.best)  # of another scale than before
         usable = np.setdiff1d(np.arange(len(self.windows)), state.excluded)
@@ -319,6 +322,10 @@ class Run:
     def _model(self, params: Any) -> Dynamics:
         return eqx.combine(params, self.static)
 
+    def _refits(self) -> tuple[int, ...]:
+        """Steps before which the objective fits its constants anew."""
+        return tuple(sorted({round(f * self.config.steps) for f in self.config.refit_at}))
+
     def _usable(self) -> Windows:
         return self.windows.take(np.setdiff1d(np.arange(len(self.windows)), self.state.excluded))
 
@@ -345,6 +352,9 @@ class Run:
             events=tuple(state.events),
             seconds=state.seconds,
             stopped_early=stopped,
+            refits=tuple(r for r in self._refits() if 0 < r < state.step)
+            if type(state.objective).refit is not Objective.refit
+            else (),
         )
 
 

@@ -98,7 +98,7 @@ def test_a_step_that_stays_is_a_motion():
     samples = noisy()
     samples[100:, 0] += 30.0
     samples[100:, 4] += 3.0
-    out = left_out(rows(samples)).any(axis=1)
+    out = np.asarray(left_out(rows(samples)).any(axis=1))
     assert 0 < out.sum() <= 10
     assert not out[120:].any()
 

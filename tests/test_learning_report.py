@@ -30,7 +30,7 @@ def ring(found):
     """Step and loss that the figure rings."""
     figure = learning_figure(found.metrics, found.refits, found.best_step)
     lines = [line for line in figure.axes[0].lines if line.get_label() == "taken"]
-    return [(float(line.get_xdata()[0]), float(line.get_ydata()[0])) for line in lines]
+    return [(np.asarray(line.get_xdata())[0], np.asarray(line.get_ydata())[0]) for line in lines]
 
 
 def test_the_step_taken_is_the_lowest_of_its_stretch_and_ringed():
@@ -42,8 +42,8 @@ def test_the_step_taken_is_the_lowest_of_its_stretch_and_ringed():
     )
     assert ring(found) == [(150.0, 0.5)]
     figure = learning_figure(found.metrics, found.refits, found.best_step)
-    drawn = [line for line in figure.axes[0].lines if line.get_label().endswith("validation")]
-    assert [line.get_xdata().tolist() for line in drawn] == [[50, 100], [150, 200]]
+    drawn = [line for line in figure.axes[0].lines if str(line.get_label()).endswith("validation")]
+    assert [np.asarray(line.get_xdata()).tolist() for line in drawn] == [[50, 100], [150, 200]]
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ def test_a_chance_constraint_that_could_not_hold_is_told():
     drawn = figures_time.planner_figure(log)
     assert drawn is not None
     allowed = [line for line in drawn.axes[1].lines if line.get_label() == "allowed"]
-    assert [line.get_ydata()[0] for line in allowed] == [5.0]
+    assert [np.asarray(line.get_ydata())[0] for line in allowed] == [5.0]
 
 
 def test_figures_do_not_change_matplotlib():

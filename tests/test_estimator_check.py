@@ -183,9 +183,6 @@ def test_the_command_flies_and_tells(tmp_path):
     ("options", "message"),
     [
         ({"only": ("sonar*",)}, r"--only sonar\*: fits none of consistency, faults, calm"),
-        ({"runs": 0}, "--runs 0: give at least 1"),
-        ({"fault_seconds": float("nan")}, "--fault-seconds nan: give a time"),
-        ({"workers": -1}, "--workers -1"),
         ({"docs": "page.txt"}, "--docs"),
     ],
 )

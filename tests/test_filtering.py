@@ -144,7 +144,7 @@ def test_an_update_is_the_conditional_gaussian(used):
         for each in _innovations(x)
     ]
     gates = [np.inf] * 3
-    after, P_after, nis, accepted = measurement.update(x, P, found, jnp.array(used), gates)
+    after, P_after, nis, accepted, _ = measurement.update(x, P, found, jnp.array(used), gates)
     np.testing.assert_array_equal(accepted, used)
     r, H, R = measurement.together([f for f, use in zip(found, used, strict=True) if use])
     S = H @ P @ H.T + R
@@ -163,7 +163,7 @@ def test_a_gated_reading_changes_nothing():
     found = _innovations(x)
     found[1] = found[1]._replace(residual=jnp.array([1e3]))
     used, gates = jnp.array([False, True, False]), [float(chi2.ppf(0.999, 1))] * 3
-    after, P_after, nis, accepted = measurement.update(x, P, found, used, gates)
+    after, P_after, nis, accepted, _ = measurement.update(x, P, found, used, gates)
     assert not np.any(accepted)
     assert nis[1] > 1e3
     np.testing.assert_allclose(P_after, P, rtol=1e-12)

@@ -10,6 +10,7 @@ applying the waiting samples' preintegrated increment (Khosravian et al. 2015 gi
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import equinox as eqx
@@ -25,7 +26,7 @@ from ...models.sensors import Compass, DepthSensor, Dvl, Imu
 from . import error_state, inertial, measurement
 from .error_state import Navigation
 from .inertial import Motion, Samples
-from .trust import SIZES, Shown, Trust, counted, imu_off, judged
+from .trust import SIZES, Shown, Trust, counted, imu_off, judged, suspected, with_doubt
 
 SLOT = 22
 """Has sample, force 3, mean rate 3 | has dvl, v 3 | has depth, depth | has compass, yaw | rate at
@@ -310,7 +311,8 @@ class DelayedFilter(eqx.Module):
         self, state: FilterState, slot: Float[Array, "22"], k: Float[Array, ""]
     ) -> FilterState:
         """Bring P up to date and use the readings of the slot that left with sample number k."""
-        x, P, trust = state.nominal, self.covariance(state), state.trust
+        x, trust = state.nominal, state.trust
+        F, P = self._covariance(state, x, state.since[:_SINCE])
         plain = (
             measurement.dvl_innovation(self.dvl, x, slot[_RATE:_OPEN], slot[_DVL + 1 : _DEPTH]),
             measurement.depth_innovation(self.depth, x, slot[_DEPTH + 1 : _COMPASS]),
@@ -321,33 +323,59 @@ class DelayedFilter(eqx.Module):
         used = jnp.stack([slot[flag] > 0 for flag in (_DVL, _DEPTH, _COMPASS)])
         time = (k - self.slots) * self.period
 
-        sizes = jnp.stack([jnp.linalg.norm(each.residual) for each in plain])
-        spreads = jnp.stack([jnp.trace(each.H @ P @ each.H.T) for each in plain])
-        trust, left_out, follow = judged(
-            trust,
-            used,
-            sizes,
-            imu_off(self.imu, self.dvl, self.depth, self.compass),
-            self.config.patience,
-            self._vouched_for(state, time),
-            spreads,
-        )
-        for i, each in enumerate(plain):
-            P = self._unknown(P, i, each.H, jnp.where(follow[i], each.residual**2, 0))
+        off = imu_off(self.imu, self.dvl, self.depth, self.compass)
+        well = self._vouched_for(state, time)
+        trust, (left_out, follow) = judged(trust, used, off, self.config.patience, well)
+        own = (error_state.VELOCITY, error_state.POSITION, error_state.ROTATION)
+        for i, (each, part) in enumerate(zip(plain, own, strict=True)):
+            # what is followed counts as unknown until it is read
+            H, unknown = each.H[:, part], jnp.where(follow[i], each.residual**2, 0)
+            P = P.at[part, part].add(H.T @ (unknown[:, None] * H))
         gates = tuple(float(chi2.ppf(self.config.gate, size)) for size in SIZES)
+        together = measurement.together(plain)
+        S = jnp.diag(together.H @ P @ together.H.T + together.R)
         plain_nis = measurement.normalized_squares(P, plain)
-        x, P, nis, accepted = measurement.update(x, P, found, used & ~left_out, gates)
-        for i, each in enumerate(plain):
-            lacks = trust.doubt[i] - jnp.diag(each.H @ P @ each.H.T)
-            P = self._unknown(P, i, each.H, jnp.maximum(lacks, 0))
-        elapsed = state.since[0]
-        trust = counted(trust, used, accepted, nis, plain_nis, gates, sizes, time, elapsed)
+        done = measurement.update(x, P, found, used & ~left_out, gates)
+
+        innovations = (together.residual, jnp.sqrt(S))
+        trust = counted(trust, used, done.accepted, done.nis, plain_nis, gates, innovations, time)
+        pulled = self._pulled(trust.pulled @ F.T, done, together, used)
+        trust = suspected(
+            trust,
+            left_out | follow,
+            state.shown.stuck,
+            used,
+            done.accepted,
+            pulled,
+            time,
+            state.since[0],
+        )
         return state._replace(
-            nominal=x,
-            P=P,
-            since=jnp.concatenate([jnp.zeros(_SINCE, P.dtype), x.v_B]),
+            nominal=done.nominal,
+            P=done.P,
+            since=jnp.concatenate([jnp.zeros(_SINCE, P.dtype), done.nominal.v_B]),
             trust=trust,
         )
+
+    @staticmethod
+    def _pulled(
+        pulled: Float[Array, "3 18"],
+        done: measurement.Update,
+        found: measurement.Innovation,
+        used: Bool[Array, "3"],
+    ) -> Float[Array, "3 18"]:
+        """The pulls after an update: each sensor's own adds, the others' correct."""
+        ends = np.cumsum([0, *SIZES])
+        parts = [slice(a, b) for a, b in pairwise(ends)]
+        after = []
+        for i, own in enumerate(parts):
+            d = pulled[i]
+            for j, part in enumerate(parts):
+                if j != i:
+                    d = d - done.gain[:, part] @ (found.H[part] @ pulled[i])
+            back = done.gain[:, own] @ found.residual[own]
+            after.append(d - jnp.where(used[i], back, 0))
+        return jnp.stack(after)
 
     def _vouched_for(self, state: FilterState, time: Float[Array, ""]) -> Bool[Array, "3"]:
         """For each sensor, whether the IMU and another sensor are well."""
@@ -357,35 +385,28 @@ class DelayedFilter(eqx.Module):
         others = jnp.sum(well) - well.astype(int)
         return (others > 0) & (state.samples.calm > c.silence)
 
-    @staticmethod
-    def _unknown(
-        P: Float[Array, "18 18"], sensor: int, H: Float[Array, "m 18"], variance: Float[Array, "m"]
-    ) -> Float[Array, "18 18"]:
-        """P with what a sensor measures less known, by a variance in each of its values."""
-        part = (error_state.VELOCITY, error_state.POSITION, error_state.ROTATION)[sensor]
-        own = H[:, part]
-        return P.at[part, part].add(own.T @ (variance[:, None] * own))
-
     def covariance(self, state: FilterState) -> Float[Array, "18 18"]:
         """P at the horizon."""
-        return self._covariance(state, state.nominal, state.since[:_SINCE])
+        return self._covariance(state, state.nominal, state.since[:_SINCE])[1]
 
     def _covariance(
         self, state: FilterState, after: Navigation, gone: Float[Array, "9"]
-    ) -> Float[Array, "18 18"]:
-        """P after `gone`: what `FilterState.since` sums."""
+    ) -> tuple[Float[Array, "18 18"], Float[Array, "18 18"]]:
+        """F and P after `gone`: what `FilterState.since` sums."""
         time = gone[0]
         some = jnp.maximum(time, self.period)
         before = state.nominal._replace(v_B=state.since[_SINCE:])
         F, Q = error_state.transition(
             before, after, gone[1:4] / some, gone[4:7] / some, time, self._noisy_imu, self.compass
         )
+        moves = slice(0, error_state.VELOCITY.stop)
+        Q = Q.at[moves, moves].multiply(state.trust.imu_factor)
         P = F @ state.P @ F.T + Q
         open_ = jnp.zeros_like(jnp.diag(P)).at[error_state.VELOCITY].set(gone[7])
         P = P + jnp.diag(open_.at[error_state.ROTATION].set(gone[8]))
         if not self.imu.integrating:
             P = P + time / self.period * self._between_samples(state)
-        return (P + P.T) / 2
+        return F, (P + P.T) / 2
 
     def _between_samples(self, state: FilterState) -> Float[Array, "18 18"]:
         """What one sample of an IMU that does not integrate leaves open about its interval T.
@@ -414,10 +435,10 @@ class DelayedFilter(eqx.Module):
         c, variance, trust = self.config, jnp.diag(P), state.trust
         age = jnp.maximum(k - self.slots, 0) * self.period - trust.accepted_at
         fit = (age <= c.silence) & (trust.rejected < c.patience) & (trust.distrusted < 1)
-        # a doubt of what a reading may be off anyway is none
-        small = jnp.asarray([self.dvl.noise, self.depth.noise, self.compass.noise], P.dtype)
-        fit = fit & ~state.shown.stuck & (trust.doubt <= small**2) & (trust.noise_factor <= 1)
-        fit = jnp.concatenate([(state.samples.calm > 1)[None], fit])
+        time = jnp.maximum(k - self.slots, 0) * self.period
+        fit = fit & ~state.shown.stuck & ~trust.suspect(time, c.silence) & (trust.noise_factor <= 1)
+        imu = (state.samples.calm > 1) & (trust.imu_factor < 2)
+        fit = jnp.concatenate([imu[None], fit])
         lost = jnp.any(variance[error_state.VELOCITY] > c.lost_velocity**2)
         lost = lost | jnp.any(variance[error_state.ROTATION] > c.lost_attitude**2)
         overall = jnp.where(lost, 2.0, jnp.where(jnp.all(fit), 0.0, 1.0))
@@ -443,12 +464,14 @@ class DelayedFilter(eqx.Module):
         waiting = jnp.concatenate(
             [time[:, None], force.T * time[:, None], omega.T * time[:, None], left_open], 1
         )
-        P = self._covariance(state, now, state.since[:_SINCE] + jnp.sum(waiting, axis=0))
+        _, P = self._covariance(state, now, state.since[:_SINCE] + jnp.sum(waiting, axis=0))
         foreseen = state.samples.foreseen - jnp.concatenate([x.accel_bias, x.gyro_bias])
         rate = foreseen[3:]
         beyond = error_state.sample_increment(foreseen[:3], rate, ahead * ring[-1, 0])
         now = error_state.apply(now, beyond, self.imu.gravity)
         P = P + self._foreseen(state, now, ahead)
+        time = (state.samples.count - 1 - self.slots) * self.period
+        P = with_doubt(P, state.trust.pulled, state.trust.suspect(time))
         return now.X_WB, jnp.concatenate([now.v_B, rate]), P
 
     def _foreseen(

@@ -136,16 +136,28 @@ def normalized_squares(P: Float[Array, "18 18"], found: Sequence[Innovation]) ->
     return jnp.stack(scores)
 
 
+class Update(NamedTuple):
+    """What readings make of a state."""
+
+    nominal: Navigation
+    P: Float[Array, "18 18"]
+    nis: Float[Array, " n"]
+    """Of each sensor."""
+    accepted: Bool[Array, " n"]
+    """Whether a sensor's reading was used and passed its gate."""
+    gain: Float[Array, "18 m"]
+    """K, with columns of zeros for what was not used."""
+
+
 def update(
     nominal: Navigation,
     P: Float[Array, "18 18"],
     found: Sequence[Innovation],
     used: Bool[Array, " n"],
     gates: Sequence[float],
-) -> tuple[Navigation, Float[Array, "18 18"], Float[Array, " n"], Bool[Array, " n"]]:
+) -> Update:
     """Correct with the readings `used` of n sensors unless a sensor's NIS exceeds its gate.
 
-    Returns the state, each sensor's NIS and whether its reading was used and passed.
     NIS = rᵀ S⁻¹ r with S = H P Hᵀ + R is chi-square with m degrees of freedom (Bar-Shalom et al.
     2001, section 5.4). The covariance takes Joseph's form (I − K H) P (I − K H)ᵀ + K R Kᵀ and
     moves to the corrected state with Γ = I − ½ ad(δ) on the pose's error.
@@ -174,4 +186,4 @@ def update(
     GK = gamma @ K
     P = L @ P @ L.T + GK @ R @ GK.T
     accepted = jnp.stack([each[0] for each in marks])
-    return retract(nominal, delta), (P + P.T) / 2, jnp.stack(scores), accepted
+    return Update(retract(nominal, delta), (P + P.T) / 2, jnp.stack(scores), accepted, K)

@@ -6,12 +6,16 @@ the question is what:
 - A sensor that *jumped*, by more than the IMU can have been off since its reading before, while the
   IMU and another sensor are well, is at fault. It is left out until `patience` readings in a row
   pass the gate again.
-- Otherwise filter and sensor drifted apart and nothing here can tell which of them is wrong. The
-  readings are followed, and the covariance keeps the square of the disagreement as a *doubt*, which
-  fades within minutes.
+- Otherwise filter and sensor drifted apart and nothing here can tell which of them is wrong: its
+  readings are followed.
 
-A sensor whose readings scatter more than the gate's law says, though they pass it, has its noise
-raised by their mean NIS (covariance matching; Mehra 1970).
+A sensor is *suspect* if it is at fault, stuck or followed, or if its innovations have a mean: those
+of a consistent filter have none (Mehra 1970). For each sensor the filter keeps how far its readings
+have pulled the estimate from where it would be without them. Where a suspect pulled the estimate
+from, the covariance that is told must not rule out; the filter's gains stay those of its own.
+
+A sensor whose readings scatter more than the gate's law says has its noise raised by their mean NIS
+(covariance matching; Mehra 1970); if several scatter so, it is the IMU's noise that is raised.
 """
 
 from typing import NamedTuple
@@ -20,17 +24,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ...models.sensors import Compass, DepthSensor, Dvl, Imu
+from .measurement import small_inverse
 
 SIZES = (3, 1, 1)
 """Values in a reading of DVL, depth gauge and compass."""
 
 _PARTS = (slice(0, 3), slice(3, 4), slice(4, 5))
 _STUCK_TOGETHER = 2  # repeats of all three velocities
-_STUCK_ALONE = 8  # repeats of one value, whose steps may be as coarse as its noise
+_STUCK_ALONE = (4, 8, 4)  # repeats of one value; a gauge's steps may be as coarse as its noise
 _BEYOND = 1.1  # times the highest speed is no velocity
 _OFF = 20.0  # times the deviation of its bias is more than the IMU can be off
-_FADING = 60.0  # s: time constant of a doubt
+_SUSPECT = 60.0  # s for which a sensor is suspect at least
+_RECENT = 20.0  # readings of a sensor without suspicion whose pulls are kept
+_ALONE = (10.0, 60.0, 60.0)
+"""For how long (s) the IMU alone knows velocity, depth and yaw well enough to doubt a sensor by."""
+_BIASED = 0.8  # mean of normalised innovations: white ones have a deviation of 0.16 over `_RECENT`
 _MATCHED = 50.0  # readings over which NIS are averaged
+_CLIPPED = 8.0  # times what is usual is the most that one reading counts: outliers are rare
+_GROWTH = 1.05  # of the IMU's variances, by reading while several sensors scatter
 _UNUSUAL = 1.6  # mean NIS a value that chance does not bring about over `_MATCHED` readings
 
 
@@ -51,7 +62,8 @@ class Shown(NamedTuple):
     @property
     def stuck(self) -> Bool[Array, "3"]:
         """Whether a sensor's values stand still, to the last bit, though readings come."""
-        alone = jnp.stack([self.repeats[part].max() >= _STUCK_ALONE for part in _PARTS])
+        longest = jnp.stack([self.repeats[part].max() for part in _PARTS])
+        alone = longest >= jnp.asarray(_STUCK_ALONE, longest.dtype)
         zeros = jnp.all(self.values[:3] == 0)  # lock lost, shown as a velocity
         return alone.at[0].set(alone[0] | (self.repeats[:3].min() >= _STUCK_TOGETHER) | zeros)
 
@@ -92,21 +104,38 @@ class Trust(NamedTuple):
     """Size of the residual with which the present rejections began."""
     distrusted: Float[Array, "3"]
     """1 where a sensor is at fault and left out."""
-    doubt: Float[Array, "3"]
-    """Variance of what the sensor measures below which the covariance must not say it is."""
     scatter: Float[Array, "3"]
     """Mean NIS of a value, at the sensor's own noise."""
+    mean: Float[Array, "5"]
+    """Mean of the innovations divided by their standard deviations."""
+    suspected_at: Float[Array, "3"]
+    """When a sensor was last found suspect (s)."""
+    pulled: Float[Array, "3 18"]
+    """Error that the estimate without a sensor's readings would have, of that with them."""
+    imu_factor: Float[Array, ""]
+    """By what the variances of the IMU's noises are raised."""
 
     @classmethod
     def start(cls, dtype: jnp.dtype) -> "Trust":
         """All is well."""
         zero, one = jnp.zeros(3, dtype), jnp.ones(3, dtype)
-        return cls(zero, zero, zero, zero, zero, zero, zero, one)
+        never = jnp.full(3, -1e9, dtype)
+        five, pulled = jnp.zeros(5, dtype), jnp.zeros((3, 18), dtype)
+        return cls(zero, zero, zero, zero, zero, zero, one, five, never, pulled, one[0])
+
+    @property
+    def _scattered(self) -> Bool[Array, "3"]:
+        return self.scatter > _UNUSUAL
 
     @property
     def noise_factor(self) -> Float[Array, "3"]:
         """By what the variances of the sensors' noises are raised."""
-        return jnp.where(self.scatter > _UNUSUAL, self.scatter, 1)
+        alone = jnp.sum(self._scattered) < 2
+        return jnp.where(self._scattered & alone, self.scatter, 1)
+
+    def suspect(self, time: Float[Array, ""], within: float = _SUSPECT) -> Bool[Array, "3"]:
+        """Whether a sensor was found suspect `within` the last seconds before a time (s)."""
+        return time - self.suspected_at < within
 
 
 def imu_off(imu: Imu, dvl: Dvl, depth: DepthSensor, compass: Compass) -> tuple[float, float, float]:
@@ -115,37 +144,33 @@ def imu_off(imu: Imu, dvl: Dvl, depth: DepthSensor, compass: Compass) -> tuple[f
     return a / dvl.rate, a / depth.rate**2 / 2, w / compass.rate
 
 
+class Verdict(NamedTuple):
+    """On the sensors, before their readings are used."""
+
+    left_out: Bool[Array, "3"]
+    follow: Bool[Array, "3"]
+
+
 def judged(
     trust: Trust,
     used: Bool[Array, "3"],
-    residuals: Float[Array, "3"],
     off: tuple[float, float, float],
     patience: int,
     well: Bool[Array, "3"],
-    spreads: Float[Array, "3"],
-) -> tuple[Trust, Bool[Array, "3"], Bool[Array, "3"]]:
-    """Before an update: the trust, the sensors to leave out, those to follow in doubt.
+) -> tuple[Trust, Verdict]:
+    """Before an update: which sensors to leave out and which to follow whatever their NIS.
 
-    `residuals` are the sizes of the residuals of the readings `used`, `spreads` the variances of
-    what they measure according to the filter, and `well` says where IMU and another sensor are
-    well.
+    `used` says which readings came, `well` where IMU and another sensor are well.
     """
+    dtype = trust.nis.dtype
     back = (trust.distrusted > 0) & (trust.passed >= patience)
     limit = used & (trust.rejected >= patience) & ~back
-    jumped = trust.jump > jnp.asarray(off, residuals.dtype)
-    fault = limit & jumped & well
-    # Where the filter itself has become that unsure, agreement says little.
-    unsure = back & (spreads > trust.jump**2 / 9)
+    fault = limit & (trust.jump > jnp.asarray(off, dtype)) & well
     distrusted = (fault | (trust.distrusted > 0)) & ~back
-    follow = limit & ~distrusted
-    doubt = jnp.where(follow, jnp.maximum(trust.doubt, residuals**2), trust.doubt)
-    doubt = jnp.where(unsure, jnp.maximum(doubt, trust.jump**2), doubt)
     after = trust._replace(
-        distrusted=distrusted.astype(residuals.dtype),
-        doubt=doubt,
-        rejected=jnp.where(back, 0, trust.rejected),
+        distrusted=distrusted.astype(dtype), rejected=jnp.where(back, 0, trust.rejected)
     )
-    return after, distrusted, follow
+    return after, Verdict(distrusted, limit & ~distrusted)
 
 
 def counted(
@@ -155,26 +180,80 @@ def counted(
     nis: Float[Array, "3"],
     plain_nis: Float[Array, "3"],
     gates: tuple[float, float, float],
-    residuals: Float[Array, "3"],
+    innovations: tuple[Float[Array, "5"], Float[Array, "5"]],
     time: Float[Array, ""],
-    elapsed: Float[Array, ""],
 ) -> Trust:
     """After an update: the trust with these readings counted.
 
-    `nis` are those of the update, `plain_nis` those without raised noise; `elapsed` is the time
-    since the update before (s).
+    `nis` are those of the update, `plain_nis` those without raised noise; `innovations` are all
+    residuals and their standard deviations.
     """
+    residuals, deviations = innovations
+    sizes = jnp.stack([jnp.linalg.norm(residuals[part]) for part in _PARTS])
     passes = used & (nis <= jnp.asarray(gates, nis.dtype))
     fails = used & ~passes
     begins = fails & (trust.rejected < 1)
-    value = jnp.minimum(plain_nis, jnp.asarray(gates, nis.dtype)) / jnp.asarray(SIZES, nis.dtype)
+    value = plain_nis / jnp.asarray(SIZES, nis.dtype)
+    value = jnp.minimum(value, _CLIPPED * jnp.maximum(trust.scatter, 1))
     matched = trust.scatter + (value - trust.scatter) / _MATCHED
+    normal = jnp.clip(residuals / deviations, -5, 5)
+    came = jnp.repeat(used, jnp.array(SIZES), total_repeat_length=5)
+    mean = jnp.where(came, trust.mean + (normal - trust.mean) / _RECENT, trust.mean)
+    several = jnp.sum(trust._scattered) > 1
+    factor = jnp.where(several, trust.imu_factor * _GROWTH, trust.imu_factor / _GROWTH)
     return trust._replace(
         nis=jnp.where(used, nis, trust.nis),
         rejected=jnp.where(accepted, 0, trust.rejected + fails.astype(nis.dtype)),
         passed=jnp.where(passes, trust.passed + 1, jnp.where(fails, 0, trust.passed)),
         accepted_at=jnp.where(accepted, time, trust.accepted_at),
-        jump=jnp.where(begins, residuals, trust.jump),
-        doubt=trust.doubt * jnp.exp(-elapsed / _FADING),
+        jump=jnp.where(begins, sizes, trust.jump),
         scatter=jnp.where(used & (trust.distrusted < 1), matched, trust.scatter),
+        mean=mean,
+        imu_factor=jnp.where(used.any(), jnp.clip(factor, 1, 1e4), trust.imu_factor),
     )
+
+
+def suspected(
+    trust: Trust,
+    found: Bool[Array, "3"],
+    stuck: Bool[Array, "3"],
+    came: Bool[Array, "3"],
+    accepted: Bool[Array, "3"],
+    pulled: Float[Array, "3 18"],
+    time: Float[Array, ""],
+    elapsed: Float[Array, ""],
+) -> Trust:
+    """The trust with those suspect who are `found` at fault or followed, stuck or biased.
+
+    `pulled` holds the pulls with those of the readings that came. Of a sensor without suspicion
+    only those of the last readings are kept; of a suspect what it pulled while the IMU alone would
+    have known better, and all while it is not read. `elapsed` is the time since the update before
+    (s).
+    """
+    biased = jnp.stack([jnp.abs(trust.mean[part]).max() > _BIASED for part in _PARTS])
+    at = jnp.where(found | stuck | biased, time, trust.suspected_at)
+    trust = trust._replace(suspected_at=at)
+    alone = jnp.exp(-elapsed / jnp.asarray(_ALONE, pulled.dtype))[:, None]
+    # a horizontal position that went wrong stays wrong
+    fades = jnp.broadcast_to(jnp.where(accepted[:, None], alone, 1), pulled.shape)
+    fades = fades.at[0, :3].set(1)
+    of_others = jnp.where(came, 1 - 1 / _RECENT, 1)[:, None]
+    fades = jnp.where(trust.suspect(time)[:, None], fades, of_others)
+    return trust._replace(pulled=pulled * fades)
+
+
+def with_doubt(
+    P: Float[Array, "18 18"], pulled: Float[Array, "3 18"], suspect: Bool[Array, "3"]
+) -> Float[Array, "18 18"]:
+    """P that rules out nothing a suspect pulled the estimate from.
+
+    With s = dᵀ B⁻¹ d > 1 of a pull d and the block B of position, attitude, velocity or a bias, B
+    grows by s: the pull is then of one standard deviation.
+    """
+    scales = []
+    for own in (slice(k, k + 3) for k in range(0, 15, 3)):
+        d = pulled[:, own]
+        s = jnp.sum((d @ small_inverse(P[own, own])) * d, axis=1)
+        scales.append(jnp.sqrt(jnp.maximum(jnp.max(jnp.where(suspect, s, 1)), 1)))
+    scales = jnp.concatenate([jnp.repeat(jnp.stack(scales), 3), jnp.ones(3, P.dtype)])
+    return scales[:, None] * P * scales[None]

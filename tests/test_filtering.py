@@ -364,7 +364,7 @@ def still_readings(k: int, late: int, lost: bool = False) -> Readings:
     """At rest; every tenth sample a DVL reading that shows up `late` samples after its time."""
     shown = (k - late) // 10 * 10
     valid = 1.0 if shown >= 0 and not lost else 0.0
-    v = jnp.array([0.02 * np.sin(shown), 0.01 * np.cos(shown), 0.0])
+    v = jnp.array([0.02 * np.sin(shown), 0.01 * np.cos(shown), 0.01 * np.sin(2 * shown)])
     dvl = jnp.concatenate([v, jnp.array([valid, max(shown, 0) * 0.01])])
     never = jnp.array([0.0, 0, 0])
     return Readings(jnp.array([0.01, 0.02, 9.80665, 0.001, 0, 0]), dvl, never, never)

@@ -104,5 +104,5 @@ def test_errors_are_told_with_their_sizes():
 
 def test_the_dive_is_told_as_its_scenario_has_it():
     assert _task(load_scenario("pylon_crossing_calm", "controller: {planner: {period: 0.5}}")) == (
-        "from (0, 0, -1.5) m to (10, 0, -1.5) m, with 2 plans a second"
+        "from (0, 0, -1.5) m to (4.5, -2, -1.5) m, with 2 plans a second"
     )

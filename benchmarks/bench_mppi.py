@@ -1,11 +1,13 @@
 """One planner call, 1000 rollouts of 80 steps among pylons: physics and SPINN (`make bench`).
 
-What is timed is what the system `Mppi` does every 0.2 s, on two processors.
+What is timed is what the system `Mppi` does every 0.2 s, on two processors. The reference has
+nothing of this package in it: times over it compare states of the code (`baseline.py`).
 """
 
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -29,6 +31,19 @@ def model(kind: str):
         return physics
     config = SpinnConfig(constant_mass=kind == "spinn, constant mass")
     return Spinn.create(config, physics, jax.random.key(0))
+
+
+def test_reference(benchmark):
+    """A recurrent network of 64 units, 80 steps of 1000 states in single precision."""
+    weights = jax.random.normal(jax.random.key(0), (64, 64), jnp.float32) / 8
+    states = jax.random.normal(jax.random.key(1), (64, 1000), jnp.float32)
+
+    def step(x, _):
+        return jnp.tanh(weights @ x), x[0]
+
+    roll = jax.jit(lambda x: jax.lax.scan(step, x, length=80))
+    jax.block_until_ready(roll(states))  # compiles
+    benchmark(lambda: jax.block_until_ready(roll(states)))
 
 
 @pytest.mark.parametrize("substeps", [1, 2])

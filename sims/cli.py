@@ -137,6 +137,10 @@ def _parsed(given: list[str]) -> _Command:
         "study": Study,
         "demo": Demo,
     }
+    if given and not given[0].startswith("-") and given[0] not in classes:
+        raise UserError(
+            f"{given[0]} is no command: give one of {', '.join(classes)}; see spinndrift --help"
+        )
     subcommands = [Annotated[cls, tyro.conf.subcommand(name)] for name, cls in classes.items()]
     command: Any = reduce(or_, subcommands)
     said = io.StringIO()

@@ -63,3 +63,11 @@ def test_the_copy_under_test_is_the_one_asked_for():
 def test_version_is_the_installed_one():
     assert spinndrift.__version__[0].isdigit()
     assert spinndrift.__version__ != "0+unknown"
+
+
+def test_the_package_runs_as_the_command():
+    told = run_python(
+        "import runpy, sys; sys.argv[1:] = ['--version']; "
+        "runpy.run_module('spinndrift', run_name='__main__')"
+    )
+    assert told.strip() == spinndrift.__version__

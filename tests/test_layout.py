@@ -48,7 +48,7 @@ def test_every_folder_of_modules_is_a_package():
 
 def test_the_wheel_holds_every_module_and_every_data_file(wheel: zipfile.Path):
     names = set(wheel.root.namelist())
-    expected = {"spinndrift/__init__.py", "spinndrift/py.typed"}
+    expected = {f"spinndrift/{name}" for name in ("__init__.py", "__main__.py", "py.typed")}
     for room in ROOMS:
         for path in (ROOT / room).rglob("*"):
             if path.suffix == ".py" or path.suffix in DATA_SUFFIXES:

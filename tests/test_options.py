@@ -95,6 +95,7 @@ def test_there_are_options_of_all_commands():
         ("run calm --sed 3", "--sed, 3; did you mean --seed? see spinndrift run --help"),
         ("study --scale big", "invalid choice 'big' for argument '--scale'"),
         ("evaluate a.spinn", "Missing"),
+        ("simulate calm", "simulate is no command: give one of import, generate, train"),
     ],
 )
 def test_what_is_given_wrongly_is_told_in_one_line(arguments, words, capsys):

@@ -19,6 +19,7 @@ from ..systems.controllers import MppiImpedance
 from ..systems.mavlink.logs import load_data
 from ..training.config import TrainingConfig
 from ..training.run_folder import TRAINING, CheckpointError
+from .estimate import nees_words
 from .figures_path import path_figure, samples_figure
 from .figures_time import progress_figure, tracking_figure
 from .learning import Learned, learn
@@ -26,6 +27,7 @@ from .learning_report import add_data, add_evaluation, add_training
 from .metrics import clearance
 from .pages import Page
 from .progress import progress_bar
+from .report import consistency
 from .run_folder import RUN, scene, write_files
 from .run_loop import Run, simulate
 from .run_signals import log_periods
@@ -166,8 +168,8 @@ def _page(
     page.section(
         "The dive",
         f"The learned model is the vehicle, and MPPI plans with it: {_task(run.scenario)}, on "
-        "estimates of a Kalman filter. The run's own [report](dive/report.html) and "
-        "[3-D replay](dive/meshcat.html) show more.",
+        f"estimates of a Kalman filter.{consistency(values['estimate'])} The run's own "
+        "[report](dive/report.html) and [3-D replay](dive/meshcat.html) show more.",
     )
     around = scene(run.scenario)
     page.figure(path_figure(run.log, around), "Planned, flown and estimated path.")
@@ -207,6 +209,7 @@ def _summary(learned: Learned, values: dict[str, Any], seconds: float) -> dict[s
         "held_out": learned.evaluation.overall(),
         "training": {"steps": learned.result.steps, "seconds": learned.result.seconds},
         "dive": values["outcome"] | {"min_clearance_m": values["path"].get("min_clearance_m")},
+        "estimate": values["estimate"],
         "seconds": seconds,
     }
 
@@ -223,5 +226,10 @@ def _words(found: dict[str, Any], out: Path) -> str:
         f"{inside['coverage_0.9']:.0%} in the 90 % band"
     )
     lines.append(f"dive: {found['dive']['words']}")
+    consistent = nees_words(found["estimate"])
+    if consistent is not None:
+        lines.append(
+            f"its estimator's NEES (3 on average if its covariance is right): {consistent}"
+        )
     lines.append(f"{found['seconds']:.0f} s in all; open {out / 'report.html'}")
     return "\n".join(lines)

@@ -1,7 +1,9 @@
 """What the filter said of itself against the truth: errors, consistency, health."""
 
+import math
 from collections.abc import Mapping
 from functools import cache
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -73,6 +75,24 @@ def average_bound(freedom: int, count: int = 1) -> tuple[float, float]:
     tail = (1 - _CONFIDENCE) / 2
     low, high = chi2.ppf([tail, 1 - tail], count * freedom) / count
     return float(low), float(high)
+
+
+def nees_words(estimate: Mapping[str, Any]) -> str | None:
+    """A run's NEES: `position 2.1, attitude 3.4, velocity 12 (outside), bounds 0.22 to 9.3`.
+
+    None where a block has none. `estimate` are the metrics of `sims.metrics`.
+    """
+    told = {name: estimate.get(f"{name}_nees") for name in BLOCKS}
+    known = {name: x for name, x in told.items() if x is not None and math.isfinite(x)}
+    if len(known) < len(BLOCKS):
+        return None
+    low, high = estimate["nees_low"], estimate["nees_high"]
+    inside = {name: low <= x <= high for name, x in known.items()}
+    listed = ", ".join(
+        f"{name} {x:.2g}{'' if inside[name] else ' (outside)'}" for name, x in known.items()
+    )
+    all_in = "all inside the " if all(inside.values()) else ""
+    return f"{listed}, {all_in}bounds {low:.2g} to {high:.2g}"
 
 
 def health_shares(log: RunLog) -> dict[str, dict[str, float]]:

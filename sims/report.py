@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..training.provenance import revision
-from .estimate import BLOCKS
+from .estimate import nees_words
 from .figures_path import Scene, path_figure, samples_figure
 from .figures_time import (
     disturbance_figure,
@@ -163,22 +163,19 @@ def _errors_section(page: Page, log: RunLog, values: dict[str, Any]) -> None:
         text = "How far the estimate was from the truth, and how far it thought it could be."
         if within is not None:
             text += f" {100 * within:.0f} % of the position errors lie within 3σ."
-        text += _consistency(values["estimate"])
+        text += consistency(values["estimate"])
         page.section("Estimate", text)
         page.figure(estimate, "Truth minus estimate in B, and three standard deviations.")
 
 
-def _consistency(estimate: dict[str, Any]) -> str:
-    """Sentences on the filter's covariance and health."""
-    told = [(name, estimate.get(f"{name}_nees")) for name in BLOCKS]
-    text = ""
-    if all(value is not None for _, value in told):
-        listed = ", ".join(f"{name} {value:.2g}" for name, value in told)
+def consistency(estimate: dict[str, Any]) -> str:
+    """Sentences on a run's covariance and health of the filter."""
+    told, text = nees_words(estimate), ""
+    if told is not None:
         text = (
             " NEES, the squared error by the claimed covariance, is 3 on average if that is "
-            f"right: {listed} over this run. A single moment lies between "
-            f"{estimate['nees_low']:.2g} and {estimate['nees_high']:.2g} with 95 %; errors of one "
-            "run correlate in time, so its mean is worth few such moments."
+            f"right. Over this run: {told}, between which a single moment lies with 95 %. Errors "
+            "of one run correlate in time, so its mean is worth few such moments."
         )
     if "health" in estimate:
         text += f" Estimator health: {estimate['health']}."

@@ -7,6 +7,7 @@ from test_cli import TINY
 
 from spinndrift.models.owned import MARKER
 from spinndrift.sims.demo import DEMO, EMBEDDED, demo, demo_folder
+from spinndrift.sims.estimate import nees_words
 from spinndrift.sims.run_folder import RUN
 from spinndrift.sims.run_loop import simulate
 from spinndrift.sims.scenario import load_scenario
@@ -40,11 +41,15 @@ def test_demo_tells_the_whole_story(tmp_path, monkeypatch):
     assert "preset" in told
     assert "dive:" in told
     found = json.loads((out / "summary.json").read_text())
+    consistent = nees_words(found["estimate"])
+    assert consistent is not None
+    assert f"its covariance is right): {consistent}" in told
     assert set(found["held_out"]) == {"preset", "learned"}
     assert found["training"]["steps"] == tiny.steps
     report = (out / "report.html").read_text()
     for section in ("The data", "Training", "Held-out error", "The dive"):
         assert section in report
+    assert f"Over this run: {consistent}" in report
     assert (out / "dive" / "meshcat.html").stat().st_size > 1e6
     for folder, kind in ((out, DEMO), (out / "training", TRAINING), (out / "dive", RUN)):
         assert {p.name for p in folder.iterdir() if p.is_file()} <= {*kind.files, MARKER}

@@ -9,7 +9,7 @@ from run_example import ESTIMATE_ERROR, GOAL, example_log
 
 from spinndrift.models.vehicle import load_vehicle
 from spinndrift.sims.criteria import FollowPath, Outcome, ReachGoal
-from spinndrift.sims.estimate import average_bound, estimate_error, mahalanobis
+from spinndrift.sims.estimate import average_bound, estimate_error, mahalanobis, nees_words
 from spinndrift.sims.metrics import clearance, metrics, tracking_error
 from spinndrift.sims.run_log import RunLog
 from spinndrift.systems.obstacles import Pylon
@@ -71,6 +71,20 @@ def test_share_within_three_sigma_of_gaussian_errors():
     # 12003 Gaussians: 99.73 % ± 0.05 %, mean of 4001 sums of three squares 3 ± 0.04
     assert found["position_within_3_sigma"] == pytest.approx(0.9973, abs=0.002)
     assert found["position_nees"] == pytest.approx(3.0, abs=0.16)
+
+
+def test_what_is_said_of_nees_follows_from_its_bounds():
+    low, high = average_bound(3)
+    own = {"position_nees": 3.0, "attitude_nees": low, "velocity_nees": high}
+    bounds = {"nees_low": low, "nees_high": high}
+    said = "position 3, attitude 0.22, velocity 9.3, all inside the bounds 0.22 to 9.3"
+    assert nees_words(own | bounds) == said
+    said = "position 3, attitude 0.21 (outside), velocity 9.4 (outside), bounds 0.22 to 9.3"
+    off = {"attitude_nees": 0.21, "velocity_nees": 9.4}
+    assert nees_words(own | bounds | off) == said
+    assert nees_words(own | bounds | {"attitude_nees": None}) is None
+    assert nees_words(own | bounds | {"attitude_nees": math.nan}) is None
+    assert nees_words({}) is None
 
 
 def test_nees_of_a_block_counts_how_its_axes_correlate():

@@ -41,6 +41,8 @@ WORKERS = Within(0, 1024)
 RATE_OF_ALARMS = Within(0.0, 0.499, above=True)
 SECONDS = Within(0.0, 86400.0, above=True)
 WATER_DENSITY = Within(900.0, 1100.0)
+LARGEST = 1e12
+"""No quantity of a vehicle or its water comes near; what is computed of it stays finite."""
 
 
 def require(condition: bool, config: Any, field: str, remedy: str) -> None:
@@ -78,6 +80,8 @@ def check_numbers(config: Any) -> None:
             if isinstance(number, float | int):
                 finite = abs(number) <= sys.float_info.max
                 require(finite, config, field.name, "give finite numbers")
+                small = abs(number) <= LARGEST
+                require(small, config, field.name, f"give numbers of at most {LARGEST:g}")
                 within = limit is None or limit.holds(number)
                 require(within, config, field.name, f"give numbers {limit}")
 

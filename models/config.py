@@ -9,9 +9,10 @@ several dataclasses may stand, the file names it by a tag, as Drake's typed YAML
     disturbances:
       - !OrnsteinUhlenbeckWrench {time_constant: 3.0}
 
-Unknown, missing and duplicate keys are refused, every float must be finite, and an int may stand
-for a float but not the reverse. What one field's type can't express belongs in the dataclass'
-`__post_init__` as a ValueError; the loader adds file, line and field to its message.
+Unknown, missing and duplicate keys are refused, every float must be finite and no larger than
+`checks.LARGEST`, and an int may stand for a float but not the reverse. What one field's type can't
+express belongs in the dataclass' `__post_init__` as a ValueError; the loader adds file, line and
+field to its message.
 """
 
 import dataclasses
@@ -39,6 +40,7 @@ from cattrs.errors import (
 )
 from cattrs.gen import make_dict_structure_fn
 
+from .checks import LARGEST
 from .errors import UserError
 from .yaml_text import Tagged, emit, line_of, parse
 
@@ -167,6 +169,8 @@ def _float(value: Any, _: Any) -> float:
         raise _fault(value, "a number")
     if abs(value) > sys.float_info.max or math.isnan(value):
         raise _fault(value, "a finite number")
+    if abs(value) > LARGEST:
+        raise _fault(value, f"a number of at most {LARGEST:g}")
     return float(value)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..models import config
-from ..models.checks import check_numbers, require
+from ..models.checks import SECONDS, check_numbers, require
 from ..models.errors import UserError
 from ..models.yaml_text import parse
 from ..systems.controllers import ControllerKind, MppiImpedance
@@ -67,7 +67,9 @@ class Scenario:
         check_numbers(self)
         word = re.fullmatch(r"[A-Za-z0-9][\w.-]*", self.name)
         require(word is not None, self, "name", "give one word of letters, digits, _ . -")
-        require(self.duration > 0, self, "duration", "give a time above zero")
+        require(
+            SECONDS.holds(self.duration), self, "duration", f"give a number of seconds {SECONDS}"
+        )
         steps = 1 / (self.log.rate * self.station.period)
         require(
             abs(steps - round(steps)) < 1e-6 and round(steps) >= 1,

@@ -79,7 +79,7 @@ class StationConfig:
         """Check numbers and the name of the disturbance set."""
         check_numbers(self)
         require(min(self.diffusion) >= 0, self, "diffusion", "give six numbers of zero or more")
-        require(self.period > 0, self, "period", "give a time above zero")
+        require(1e-4 <= self.period <= 1, self, "period", "give a time from 0.0001 to 1")
         require(self.substeps >= 1, self, "substeps", "give 1 or more")
         require(0 <= self.seed < 2**32, self, "seed", "give a whole number from 0 to 4294967295")
         require(self.voltage is None or self.voltage > 0, self, "voltage", "give a voltage above 0")

@@ -141,6 +141,10 @@ def test_drake_reads_the_same_text():
         ("name: a\nmaybe: true", "2: maybe: found `true` (a boolean); write a number"),
         ("name: a\nmaybe: 1_0", "2: maybe: found `1_0` (text); write a number"),
         ("name: a\nmaybe: .nan", "2: maybe: found `nan` (a number); write a finite number"),
+        (
+            "name: a\nmaybe: -1e300",
+            "2: maybe: found `-1e+300` (a number); write a number of at most",
+        ),
         ("name: a\nmaybe: 1e999", "2: maybe: found `inf` (a number); write a finite number"),
         (f"name: a\nmaybe: 1{'0' * 400}", "2: maybe: found `1000"),
         ("name: a\ninner: {count: 2.0}", "2: inner.count: found `2.0` (a number); write a whole"),

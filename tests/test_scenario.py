@@ -103,6 +103,12 @@ def test_changes():
         ("{station: {disturbance_set: storm}}", "storm.*unknown"),
         ("[1, 2]", "give a mapping"),
         ("{duration: -1}", "duration"),
+        (
+            "{duration: 5e9}",
+            "duration is 5000000000.0: give a number of seconds above 0, at most 86400",
+        ),
+        ("{station: {period: 1e-12}}", "period is 1e-12: give a time from 0.0001 to 1"),
+        ("{success: !ReachGoal {goal: [1e300, 0, -1]}}", "at most 1e\\+12"),
         ("{name: a b}", "one word"),
         ("{log: {rate: 30}}", "multiple of 0.01"),
         ("success: !ReachGoal {}", "needs `goal`"),

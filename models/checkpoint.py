@@ -68,13 +68,15 @@ def describe(dynamics: Dynamics) -> dict[str, Any]:
     return {"kind": type(dynamics).__name__, "config": kind.describe(dynamics)}
 
 
-def template(description: dict[str, Any]) -> Dynamics:
+def template(description: Any) -> Dynamics:
     """A model of the structure that `describe` told, with arbitrary numbers.
 
     Raises:
-        UserError: the kind is unknown, or there is no configuration.
+        UserError: it is no mapping, the kind is unknown, or there is no configuration.
         ValueError: the configuration is wrong (LookupError and TypeError likewise).
     """
+    if not isinstance(description, dict):
+        raise UserError("it is described by no mapping")
     name = description.get("kind")
     if not isinstance(name, str) or name not in _KINDS:
         raise UserError(f"kind {str(name)[:40]!r} is none of {', '.join(sorted(_KINDS))}")
@@ -123,7 +125,7 @@ def load_model(
         model = template(header)
     except UserError as error:
         raise UserError(f"{path}: not a model this version can make ({error}).") from error
-    except (LookupError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, RecursionError) as error:
         raise UserError(
             f"{path}: not a model this version can make (its description is damaged, or another "
             "version's); save it again."

@@ -5,6 +5,7 @@ magnitudes, diagonal, of the SNAME derivatives (X_u̇ and so on, whose own sign 
 diagonal is the same in forward-left-up and in forward-starboard-down axes.
 """
 
+import os
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -159,6 +160,11 @@ def load_vehicle(name_or_path: str | Path) -> Vehicle:
         UserError: there is no such preset or file, or its content is no vehicle.
     """
     if isinstance(name_or_path, Path) or Path(name_or_path).suffix:
+        if not os.path.exists(name_or_path):  # its name may come from data, so say what it is
+            raise UserError(
+                f"vehicle `{name_or_path}`: there is no such file; name a preset or the path of a "
+                ".yaml file"
+            )
         return load(Vehicle, name_or_path)
     if name_or_path not in vehicle_names():
         raise UserError(

@@ -42,6 +42,7 @@ def check_options(command: Any) -> None:
 def misread(given: Sequence[str], told: str) -> str:
     """One sentence of what the parser of options told about what was given."""
     lines = _inside(told)
+    lines = [re.sub(r" \(applied to [^)]*\)", "", line) for line in lines]  # it stands in `see`
     text = " ".join(lines).replace("{None}|", "")
     command = given[0] if given and not given[0].startswith("-") else "COMMAND"
     see = f"see spinndrift {command} --help"
@@ -58,7 +59,7 @@ def misread(given: Sequence[str], told: str) -> str:
     groups = [" ".join(group) for filled, group in itertools.groupby(lines, bool) if filled]
     said = next((group for group in groups if re.search(r"[:.'{]", group)), text)  # not a title
     meant = re.search(r"Perhaps you meant: *(--[\w-]+)", text)
-    hint = f"did you mean {meant[1]}? " if meant else ""
+    hint = f"did you mean {meant[1]}? " if meant and meant[1] not in given else ""
     return f"{said.rstrip('.')}; {hint}{see}"
 
 

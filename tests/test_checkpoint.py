@@ -58,12 +58,13 @@ def stored(tmp_path_factory):
 
 
 def rewritten(stored, change):
-    """Return the file's bytes with its header changed by `change(header)`."""
+    """The file's bytes with its header changed by `change(header)`, or to the text it returns."""
     with np.load(io.BytesIO(stored)) as archive:
         arrays = {name: archive[name] for name in archive.files}
     header = json.loads(arrays["header"].tobytes())
-    change(header)
-    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    told = change(header)
+    text = told if isinstance(told, str) else json.dumps(header)
+    arrays["header"] = np.frombuffer(text.encode(), np.uint8)
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     return buffer.getvalue()
@@ -187,6 +188,30 @@ def test_a_header_that_does_not_fit_is_refused(stored, tmp_path, change, message
     with pytest.raises(UserError, match=message) as caught:
         load_model(path)
     assert "m.spinn" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("base", "message"), [(1.5, "no mapping"), ([], "no mapping"), ({"kind": []}, "kind")]
+)
+def test_a_base_that_is_no_model_is_refused(stored, tmp_path, base, message):
+    config = {"effects": [], "thrusters": 1, "base": base}
+    path = tmp_path / "m.spinn"
+    path.write_bytes(rewritten(stored, lambda h: h.update(kind="Extended", config=config)))
+    with pytest.raises(UserError, match=f"m.spinn.*{message}"):
+        load_model(path)
+
+
+@pytest.mark.parametrize("depth", [300, 5000])
+def test_models_about_models_without_end_are_refused(stored, tmp_path, depth):
+    def change(h):
+        part = '{"kind": "Extended", "config": {"effects": [], "thrusters": 1, "base": '
+        h.update(kind="Extended", config={"effects": [], "thrusters": 1, "base": "BASE"})
+        return json.dumps(h).replace('"BASE"', part * depth + "1" + "}}" * depth)
+
+    path = tmp_path / "m.spinn"
+    path.write_bytes(rewritten(stored, change))
+    with pytest.raises(UserError, match=r"m\.spinn"):
+        load_model(path)
 
 
 @pytest.mark.parametrize("fault", [OSError("no space left"), KeyboardInterrupt()])

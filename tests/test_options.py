@@ -93,6 +93,7 @@ def test_there_are_options_of_all_commands():
         ("train a.nc --steps 1.5", "--steps 1.5: give a whole number; see spinndrift train --help"),
         ("diagnose a.nc --diffusion 1", "--diffusion 1: give 6 numbers; see"),
         ("run calm --sed 3", "--sed, 3; did you mean --seed? see spinndrift run --help"),
+        ("demo --workers 2", "options: --workers 2; see spinndrift demo --help"),
         ("study --scale big", "invalid choice 'big' for argument '--scale'"),
         ("evaluate a.spinn", "Missing"),
         ("simulate calm", "simulate is no command: give one of import, generate, train"),

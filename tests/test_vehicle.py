@@ -214,7 +214,7 @@ def test_own_file(tmp_path):
     path.write_text(dump(dataclasses.replace(VEHICLES["bluerov2_heavy"], mass=14.0)))
     assert load_vehicle(path).mass == 14.0
     assert load_vehicle(str(path)).mass == 14.0
-    with pytest.raises(UserError, match=r"other\.yaml: there is no such file"):
+    with pytest.raises(UserError, match=r"vehicle `\S*other\.yaml`: there is no such file"):
         load_vehicle(tmp_path / "other.yaml")
     with pytest.raises(UserError, match="`bluerov3` is no preset; take one of ardusub_sitl"):
         load_vehicle("bluerov3")

@@ -23,8 +23,8 @@ FOREIGN = re.compile(
 )
 """What no sentence for a user says: names of Python's types, another library's advice."""
 
-_PLACE = re.compile(r"(--[\w-]+|/\S*)[: ]")
-"""How a refusal begins: with the option or the file that is at fault."""
+_PLACE = re.compile(r"(--[\w-]+|/\S*)[: ]|vehicle `")
+"""How a refusal begins: with the option, the file or the vehicle that is at fault."""
 
 
 @dataclass(frozen=True)

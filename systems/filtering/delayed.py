@@ -10,7 +10,6 @@ applying the waiting samples' preintegrated increment (Khosravian et al. 2015 gi
 
 import math
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import equinox as eqx
@@ -334,11 +333,11 @@ class DelayedFilter(eqx.Module):
             P = P.at[part, part].add(H.T @ (unknown[:, None] * H))
         gates = tuple(float(chi2.ppf(self.config.gate, size)) for size in SIZES)
         together = measurement.together(plain)
-        S = jnp.diag(together.H @ P @ together.H.T + together.R)
-        plain_nis = measurement.normalized_squares(P, plain)
+        S = together.H @ (P @ together.H.T) + together.R
+        plain_nis = measurement.normalized_squares(S, together.residual, SIZES)
         done = measurement.update(x, P, found, used & ~left_out, gates)
 
-        innovations = (together.residual, jnp.sqrt(S))
+        innovations = (together.residual, jnp.sqrt(jnp.diag(S)))
         trust = counted(trust, used, done.accepted, done.nis, plain_nis, gates, innovations, time)
         pulled = self._pulled(trust.pulled @ F.T, done, together, used)
         trust = suspected(
@@ -366,17 +365,9 @@ class DelayedFilter(eqx.Module):
         used: Bool[Array, "3"],
     ) -> Float[Array, "3 18"]:
         """The pulls after an update: each sensor's own adds, the others' correct."""
-        ends = np.cumsum([0, *SIZES])
-        parts = [slice(a, b) for a, b in pairwise(ends)]
-        after = []
-        for i, own in enumerate(parts):
-            d = pulled[i]
-            for j, part in enumerate(parts):
-                if j != i:
-                    d = d - done.gain[:, part] @ (found.H[part] @ pulled[i])
-            back = done.gain[:, own] @ found.residual[own]
-            after.append(d - jnp.where(used[i], back, 0))
-        return jnp.stack(after)
+        own = np.repeat(np.eye(len(SIZES), dtype=bool), SIZES, axis=1)
+        read = jnp.where(used[:, None], found.residual[None], 0)
+        return pulled - jnp.where(own, read, pulled @ found.H.T) @ done.gain.T
 
     def _vouched_for(self, state: FilterState, time: Float[Array, ""]) -> Bool[Array, "3"]:
         """For each sensor, whether the IMU and another sensor are well."""

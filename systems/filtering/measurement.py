@@ -127,12 +127,14 @@ def together(found: Sequence[Innovation]) -> Innovation:
     return Innovation(jnp.concatenate(residuals), jnp.concatenate(rows), R)
 
 
-def normalized_squares(P: Float[Array, "18 18"], found: Sequence[Innovation]) -> Float[Array, " n"]:
-    """Each sensor's NIS by itself."""
+def normalized_squares(
+    S: Float[Array, "m m"], residual: Float[Array, "m"], sizes: Sequence[int]
+) -> Float[Array, " n"]:
+    """Each sensor's NIS by itself, of sensors with so many components each."""
     scores = []
-    for each in found:
-        S = each.H @ P @ each.H.T + each.R
-        scores.append(each.residual @ small_inverse(S) @ each.residual)
+    for size, end in zip(sizes, accumulate(sizes), strict=True):
+        own = slice(end - size, end)
+        scores.append(residual[own] @ small_inverse(S[own, own]) @ residual[own])
     return jnp.stack(scores)
 
 
@@ -165,16 +167,10 @@ def update(
     r, H, R = together(found)
     PH = P @ H.T
     S = H @ PH + R
-    scores, marks = [], []
-    for i, (each, end) in enumerate(
-        zip(found, accumulate(each.residual.size for each in found), strict=True)
-    ):
-        own = slice(end - each.residual.size, end)
-        nis = each.residual @ small_inverse(S[own, own]) @ each.residual
-        accepted = used[i] & (nis <= gates[i])
-        scores.append(nis)
-        marks.append(jnp.broadcast_to(accepted, each.residual.shape))
-    mark = jnp.concatenate(marks)
+    sizes = [each.residual.size for each in found]
+    nis = normalized_squares(S, r, sizes)
+    accepted = used & (nis <= jnp.asarray(gates, nis.dtype))
+    mark = jnp.repeat(accepted, jnp.array(sizes), total_repeat_length=r.size)
     both = mark[:, None] & mark[None]
     S_inverse = small_inverse(jnp.where(both, S, jnp.eye(r.size, dtype=P.dtype)))
     # Rows that don't count have no gain: the inverse holds them apart from the others.
@@ -185,5 +181,4 @@ def update(
     L = gamma @ (eye - K @ H)
     GK = gamma @ K
     P = L @ P @ L.T + GK @ R @ GK.T
-    accepted = jnp.stack([each[0] for each in marks])
-    return Update(retract(nominal, delta), (P + P.T) / 2, jnp.stack(scores), accepted, K)
+    return Update(retract(nominal, delta), (P + P.T) / 2, nis, accepted, K)

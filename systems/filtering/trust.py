@@ -20,6 +20,7 @@ A sensor whose readings scatter more than the gate's law says has its noise rais
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -250,10 +251,10 @@ def with_doubt(
     With s = dᵀ B⁻¹ d > 1 of a pull d and the block B of position, attitude, velocity or a bias, B
     grows by s: the pull is then of one standard deviation.
     """
-    scales = []
-    for own in (slice(k, k + 3) for k in range(0, 15, 3)):
-        d = pulled[:, own]
-        s = jnp.sum((d @ small_inverse(P[own, own])) * d, axis=1)
-        scales.append(jnp.sqrt(jnp.maximum(jnp.max(jnp.where(suspect, s, 1)), 1)))
-    scales = jnp.concatenate([jnp.repeat(jnp.stack(scales), 3), jnp.ones(3, P.dtype)])
+    starts = range(0, 15, 3)
+    inverses = jax.vmap(small_inverse)(jnp.stack([P[k : k + 3, k : k + 3] for k in starts]))
+    d = pulled[:, :15].reshape(3, 5, 3)
+    s = jnp.sum(jnp.sum(d[:, :, None] * inverses[None], axis=3) * d, axis=2)
+    s = jnp.maximum(jnp.max(jnp.where(suspect[:, None], s, 1), axis=0), 1)
+    scales = jnp.concatenate([jnp.repeat(jnp.sqrt(s), 3), jnp.ones(3, P.dtype)])
     return scales[:, None] * P * scales[None]

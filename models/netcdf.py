@@ -1,7 +1,9 @@
 """NetCDF-4 files: whole or not at all, and damage told."""
 
 import io
+import mmap
 import os
+import struct
 import warnings
 from collections.abc import Hashable, Mapping
 from pathlib import Path
@@ -18,6 +20,10 @@ from .files import atomic_path
 _DENSEST = 2000
 """Bytes of data from one of a file, at most: deflate makes up to 1032 of one."""
 _SMALL = 1 << 24
+_HEAP = b"GCOL\x01\0\0\0"
+"""How a global heap of HDF5 begins."""
+_HEADER = 16
+"""Bytes of the header of a global heap, and of each object in it."""
 
 
 def save_netcdf(
@@ -57,6 +63,7 @@ def load_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of xarray, about attributes that it can't decode
         try:
+            _check_heaps(path)
             with h5py.File(path, "r") as raw:
                 size = _promised(raw)
             if size > _SMALL + _DENSEST * path.stat().st_size:
@@ -72,6 +79,42 @@ def load_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:
             raise UserError(
                 f"{path}: can't be read as NetCDF-4 ({_first_line(error)}); write it again"
             ) from error
+
+
+def _check_heaps(path: Path) -> None:
+    """Refuse a file in whose global heaps a step from one object to the next leads nowhere.
+
+    They hold text and the links between dimensions, and no checksums: HDF5 would walk on the spot
+    for ever. Layout: HDF5 file format specification 3.0, section III.E.
+
+    Raises:
+        UserError: a heap is damaged.
+    """
+    if path.stat().st_size == 0:  # nothing that could be mapped
+        return
+    with path.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        begin = data.find(_HEAP)
+        while begin >= 0:
+            if not _walks(data, begin):
+                raise UserError(f"{path}: a heap in it is damaged; copy or write it again")
+            begin = data.find(_HEAP, begin + len(_HEAP))
+
+
+def _walks(data: mmap.mmap, begin: int) -> bool:
+    """Whether the objects of the heap at `begin` follow each other to its end."""
+    if begin + _HEADER > len(data):
+        return False
+    at = begin + _HEADER
+    end = begin + struct.unpack_from("<Q", data, begin + 8)[0]
+    if not at <= end <= len(data):
+        return False
+    while end - at >= _HEADER:  # less is left over
+        index, size = struct.unpack_from("<H6xQ", data, at)
+        step = size if index == 0 else _HEADER + (size + 7) // 8 * 8  # 0 is what is free
+        if not _HEADER <= step <= end - at:
+            return False
+        at += step
+    return True
 
 
 def _promised(file: h5py.File) -> int:

@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from ..models.dynamics import Dynamics
 from ..models.files import atomic_path
-from ..models.netcdf import save_netcdf
+from ..models.netcdf import load_netcdf, save_netcdf
 from .metrics import AXES, BANDS, GROUPS, coverage, displacement, energy_score, norms
 from .objective import Batch
 from .predict import predict
@@ -126,8 +126,7 @@ def is_evaluation(path: Path) -> bool:
     """Whether a file is what `Evaluation.save` writes."""
     try:
         if path.suffix == ".nc":
-            with xr.open_dataset(path, engine="h5netcdf") as opened:
-                return {"rmse", "coverage", "energy_score"} <= set(opened.data_vars)
+            return {"rmse", "coverage", "energy_score"} <= set(load_netcdf(path).data_vars)
         if path.suffix == ".json":
             found = json.loads(path.read_text(encoding="utf-8"))
             return all("rmse_position" in row for row in found.values()) and bool(found)

@@ -400,6 +400,15 @@ def test_damaged_logs_lose_only_what_is_damaged(tmp_path, kind):
             assert max(errors(run, recording.dt)) < 0.01
 
 
+def test_records_whose_time_is_no_number_are_left_out():
+    """As a damaged FMT record has it; their length may still be right."""
+    log = dataflash(duration=1.0).bytes()
+    assert log.count(b"BAT\0QBf\0") == 1
+    read = read_bin(log.replace(b"BAT\0QBf\0", b"BAT\0nBf\0"), {"BAT", "RCOU"})
+    assert set(read.tables) == {"RCOU"}
+    assert read.notes == ("Records of unknown layout were left out: BAT.",)
+
+
 def test_compressed_logs_and_cut_off_ones(tmp_path):
     data = dive().bytes()
     for suffix, compress in ((".xz", lzma.compress), (".gz", gzip.compress)):

@@ -38,6 +38,9 @@ _TYPES: dict[str, tuple[str, float | None]] = {
     "Z": ("S64", None),
 }
 
+_NO_NUMBER = "anNZ"
+"""Types of an array and of text."""
+
 
 @dataclass(frozen=True)
 class BinLog:
@@ -57,11 +60,14 @@ class _Format:
     def dtype(self) -> np.dtype | None:
         """Layout of a record, of the length that its FMT record tells; None if it has none.
 
-        So it is where a column has no name or another's, or the columns are longer than a record.
+        So it is where a column has no name or another's, the time is no number, or the columns are
+        longer than a record.
         """
         columns = list(zip(self.columns, self.codes, strict=False))
         names = [column for column, _ in columns]
         if "" in names or len(set(names)) < len(names):
+            return None
+        if dict(columns).get("TimeUS", "Q") in _NO_NUMBER:
             return None
         types = [np.dtype(_TYPES[code][0]) for _, code in columns]
         offsets = np.cumsum([3, *(kind.itemsize for kind in types)]).tolist()

@@ -225,13 +225,7 @@ def test_the_health_names_the_sensor_that_fails_and_no_other(fault):
 
 
 @by_name(PASSING)
-def test_a_sensor_is_believed_again_after_a_fault_that_passes(fault):
-    np.testing.assert_array_equal(told(fault).health[:, -1, HEALTH.index(PASSING[fault])], 1)
-
-
-@by_name(fault for fault in PASSING if fault in BESIDE)
 def test_all_is_good_again_after_a_fault_that_passes(fault):
-    """Of others than the DVL, whose pulls stay doubted for longer (`systems.filtering.trust`)."""
     np.testing.assert_array_equal(told(fault).health[:, -1, 0], GOOD)
 
 

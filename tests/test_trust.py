@@ -152,6 +152,15 @@ def test_innovations_with_a_mean_make_a_suspect():
     np.testing.assert_allclose(trust.pulled[2], np.exp(-0.1 / 60))
 
 
+def test_a_sensor_that_was_stuck_is_suspect_for_a_short_time_alone():
+    """Until its values stood still it was right, and what repeats is not used."""
+    trust, time = Trust.start(jnp.dtype("float64")), jnp.asarray(10.0)
+    stuck = jnp.array([True, False, False])
+    trust = suspected(trust, NONE, stuck, ALL, ALL, jnp.ones((3, 18)), time, jnp.asarray(0.1))
+    np.testing.assert_array_equal(trust.suspect(time + 2), [True, False, False])
+    assert not trust.suspect(time + 4).any()
+
+
 def test_a_pull_of_a_suspect_is_one_deviation_and_the_shape_stays():
     A = np.random.default_rng(3).standard_normal((18, 18)) * 0.1
     P = A @ A.T

@@ -10,7 +10,8 @@ the question is what:
   readings are followed.
 
 A sensor is *suspect* if it is at fault, stuck or followed, or if its innovations have a mean: those
-of a consistent filter have none (Mehra 1970). For each sensor the filter keeps how far its readings
+of a consistent filter have none (Mehra 1970). It stays so for a minute; one that was stuck only for
+some seconds, for it was right until then. For each sensor the filter keeps how far its readings
 have pulled the estimate from where it would be without them. Where a suspect pulled the estimate
 from, the covariance that is told must not rule out; the filter's gains stay those of its own.
 
@@ -36,6 +37,7 @@ _STUCK_ALONE = (4, 8, 4)  # repeats of one value; a gauge's steps may be as coar
 _BEYOND = 1.1  # times the highest speed is no velocity
 _OFF = 20.0  # times the deviation of its bias is more than the IMU can be off
 _SUSPECT = 60.0  # s for which a sensor is suspect at least
+_MOVES_AGAIN = 3.0  # s for which one that was stuck still is: what it showed before was right
 _RECENT = 20.0  # readings of a sensor without suspicion whose pulls are kept
 _ALONE = (10.0, 60.0, 60.0)
 """For how long (s) the IMU alone knows velocity, depth and yaw well enough to doubt a sensor by."""
@@ -111,6 +113,8 @@ class Trust(NamedTuple):
     """Mean of the innovations divided by their standard deviations."""
     suspected_at: Float[Array, "3"]
     """When a sensor was last found suspect (s)."""
+    stuck_at: Float[Array, "3"]
+    """When its values last stood still (s)."""
     pulled: Float[Array, "3 18"]
     """Error that the estimate without a sensor's readings would have, of that with them."""
     imu_factor: Float[Array, ""]
@@ -122,7 +126,7 @@ class Trust(NamedTuple):
         zero, one = jnp.zeros(3, dtype), jnp.ones(3, dtype)
         never = jnp.full(3, -1e9, dtype)
         five, pulled = jnp.zeros(5, dtype), jnp.zeros((3, 18), dtype)
-        return cls(zero, zero, zero, zero, zero, zero, one, five, never, pulled, one[0])
+        return cls(zero, zero, zero, zero, zero, zero, one, five, never, never, pulled, one[0])
 
     @property
     def _scattered(self) -> Bool[Array, "3"]:
@@ -136,7 +140,8 @@ class Trust(NamedTuple):
 
     def suspect(self, time: Float[Array, ""], within: float = _SUSPECT) -> Bool[Array, "3"]:
         """Whether a sensor was found suspect `within` the last seconds before a time (s)."""
-        return time - self.suspected_at < within
+        stuck = time - self.stuck_at < min(within, _MOVES_AGAIN)
+        return stuck | (time - self.suspected_at < within)
 
 
 def imu_off(imu: Imu, dvl: Dvl, depth: DepthSensor, compass: Compass) -> tuple[float, float, float]:
@@ -232,8 +237,10 @@ def suspected(
     (s).
     """
     biased = jnp.stack([jnp.abs(trust.mean[part]).max() > _BIASED for part in _PARTS])
-    at = jnp.where(found | stuck | biased, time, trust.suspected_at)
-    trust = trust._replace(suspected_at=at)
+    trust = trust._replace(
+        suspected_at=jnp.where(found | biased, time, trust.suspected_at),
+        stuck_at=jnp.where(stuck, time, trust.stuck_at),
+    )
     alone = jnp.exp(-elapsed / jnp.asarray(_ALONE, pulled.dtype))[:, None]
     # a horizontal position that went wrong stays wrong
     fades = jnp.broadcast_to(jnp.where(accepted[:, None], alone, 1), pulled.shape)

@@ -47,6 +47,8 @@ from .yaml_text import Tagged, emit, line_of, parse
 T = TypeVar("T")
 _LARGEST_INT = 2**53
 """Whole numbers up to here are the same in floating point."""
+_SHOWN = 60
+"""Characters of what was found that a sentence shows."""
 FieldPath = tuple[str | int, ...]
 
 
@@ -130,20 +132,23 @@ def _show(value: Any) -> str:
         case bool():
             return f"`{str(value).lower()}` (a boolean)"
         case str():
-            return f"`{value}` (text)"
+            return f"`{_short(value)}` (text)"
         case int() if abs(value) > 10**30:
             return f"`{str(value)[:30]}…` (a number)"
         case int() | float():
             return f"`{value}` (a number)"
-        case str() if len(value) > 60:
-            return f"`{value[:60]}…` (text)"
         case list():
             return f"a list of {len(value)}"
         case dict():
-            return "a mapping" + (f" with {', '.join(map(str, value))}" if value else "")
+            return "a mapping" + (f" with {_short(', '.join(map(str, value)))}" if value else "")
         case Tagged():
-            return f"`!{value.tag}`"
-    return repr(value)
+            return f"`!{_short(value.tag)}`"
+    return _short(repr(value))
+
+
+def _short(text: str) -> str:
+    """As much of a text as a sentence bears."""
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
 def _fault(value: Any, remedy: str) -> ValueError:
@@ -433,5 +438,6 @@ def _unknown(key: Any, known: list[str]) -> str:
 
 
 def _dotted(path: FieldPath) -> str:
-    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
+    parts = (f"[{part}]" if isinstance(part, int) else f".{_short(str(part))}" for part in path)
+    text = "".join(parts)
     return text.removeprefix(".")

@@ -49,6 +49,18 @@ def test_good_samples_go_through_as_they_are():
     assert not found[:, -LEFT_OPEN:].any()
 
 
+def test_a_spike_is_a_fault_and_a_hard_start_is_a_motion():
+    spike, start = noisy(), noisy()
+    spike[100, 0] += 50
+    start[100:, 0] += 20  # more than was ever seen, and it stays
+    for samples, calm in ((spike, (N - 102) * T), (start, 1e3 + N * T)):
+        memory, found = taken(jnp.asarray(samples))
+        assert left_out(np.asarray(found))[100, 0]
+        np.testing.assert_allclose(memory.calm, calm, rtol=1e-12)
+    memory, _ = taken(jnp.asarray(start[:104]))
+    assert memory.calm > 1e3
+
+
 def test_what_is_not_finite_or_out_of_range_is_left_out():
     for value in (np.nan, np.inf, -np.inf, 1000.0, -IMU.accelerometer_range):
         samples = noisy()

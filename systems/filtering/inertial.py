@@ -46,7 +46,7 @@ class Samples(NamedTuple):
     odd: Float[Array, ""]
     """Odd samples in a row."""
     calm: Float[Array, ""]
-    """Time since a sample was last left out (s)."""
+    """Time since a sample was last bad or a spike (s); what begins a motion is neither."""
     count: Float[Array, ""]
     """Samples until now."""
     forces: Float[Array, "few 3"]
@@ -155,6 +155,7 @@ def take(
     far = (jnp.abs(step) > bound) & jnp.repeat(good, 3) & (memory.count > FEW)
     odd = jnp.where(far.any(), memory.odd + 1, 0.0).astype(dtype)
     refused = jnp.stack([far[:3].any(), far[3:].any()]) & (odd <= _ODD_RUN)
+    spike = (odd < 1) & (memory.odd > 0) & (memory.odd <= _ODD_RUN)  # and no motion
     squares = jnp.stack([jnp.sum(step[:3] ** 2), jnp.sum(step[3:] ** 2)])
     believed = good & ~refused
 
@@ -172,7 +173,7 @@ def take(
         repeats=repeats,
         missing=missing,
         odd=odd,
-        calm=jnp.where(believed.all(), memory.calm + T, 0.0),
+        calm=jnp.where(good.all() & ~spike, memory.calm + T, 0.0),
         count=memory.count + 1,
     )
     row = jnp.concatenate([(number >= 1).astype(dtype)[None], force, mean, left_open])

@@ -15,12 +15,12 @@ sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))
 from hidden.draw import draw
 from hidden.scenarios import Plan
 
-from spinndrift.models.recording import Recording
-from spinndrift.models.recording_csv import read_csv
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.training.diagnosis.diagnose import Diagnoser
-from spinndrift.training.diagnosis.innovations import predict
-from spinndrift.training.diagnosis.search import Found, Search
+from spinndrift.models.recordings.csv import read_csv
+from spinndrift.models.recordings.store import Recording
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.diagnosis.filter.innovations import predict
+from spinndrift.training.diagnosis.pipeline import Diagnoser
+from spinndrift.training.diagnosis.selection.search import Found, Search
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 DIFFUSION = np.array([1.0, 1.0, 1.0, 0.03, 0.03, 0.03])

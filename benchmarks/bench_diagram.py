@@ -9,12 +9,12 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import RandomSource
 
 from spinndrift.models.disturbances import preset
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.systems.allocation import ThrustAllocation
-from spinndrift.systems.disturbance_source import DisturbanceSource
-from spinndrift.systems.ekf import Ekf
-from spinndrift.systems.learned_plant import LearnedPlant
-from spinndrift.systems.sensor_suite import SensorSuite
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.systems.estimation.ekf import Ekf
+from spinndrift.systems.plant.allocation import ThrustAllocation
+from spinndrift.systems.plant.disturbance_source import DisturbanceSource
+from spinndrift.systems.plant.learned_plant import LearnedPlant
+from spinndrift.systems.plant.sensor_suite import SensorSuite
 
 SIMULATED = 2.0
 

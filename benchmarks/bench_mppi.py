@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from spinndrift.models.spinn import Spinn, SpinnConfig
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.systems.impedance import ImpedanceGains
-from spinndrift.systems.mppi import Mppi
-from spinndrift.systems.mppi_config import MppiConfig
-from spinndrift.systems.mppi_core import MppiPlanner
-from spinndrift.systems.obstacles import Cylinders, Pylon, SphereHull
-from spinndrift.systems.paths import PoseConfig
-from spinndrift.systems.wrench_limits import ThrusterLimits
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.systems.controllers.impedance import ImpedanceGains
+from spinndrift.systems.planning.mppi import Mppi
+from spinndrift.systems.planning.mppi_config import MppiConfig
+from spinndrift.systems.planning.mppi_core import MppiPlanner
+from spinndrift.systems.planning.obstacles import Cylinders, Pylon, SphereHull
+from spinndrift.systems.planning.paths import PoseConfig
+from spinndrift.systems.plant.wrench_limits import ThrusterLimits
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 PYLONS = [Pylon(1.5, y) for y in (-2.25, -0.65, 0.95)] + [Pylon(3.1, y) for y in (-3.0, -1.4, 0.2)]

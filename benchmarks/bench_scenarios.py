@@ -3,9 +3,9 @@
 import jax
 import pytest
 
-from spinndrift.sims.run_folder import run_metrics
-from spinndrift.sims.run_loop import simulate
-from spinndrift.sims.scenario import load_scenario
+from spinndrift.sims.run.folder import run_metrics
+from spinndrift.sims.run.loop import simulate
+from spinndrift.sims.scenarios.scenario import load_scenario
 
 SEEDS = range(1, 21)
 

@@ -20,7 +20,7 @@ import pytest
 from spinndrift.models import integrate, se3, spd, symmetric
 from spinndrift.models.rigid_body import FossenDynamics
 from spinndrift.models.spinn import Spinn, SpinnConfig
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 
 STEPS, DT = 80, 0.05
 VARIANTS: dict[str, dict[str, Any]] = {

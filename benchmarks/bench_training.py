@@ -20,13 +20,11 @@ import pytest
 
 from spinndrift.models.rigid_body import FossenDynamics
 from spinndrift.models.spinn import Spinn, SpinnConfig
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.cores import share_cores
 from spinndrift.training.config import TrainingConfig
-from spinndrift.training.losses import Fdm, Mse
-from spinndrift.training.objective import Batch
-from spinndrift.training.predict import predict
-from spinndrift.training.step import (
+from spinndrift.training.data.windows import Windows
+from spinndrift.training.fitting.step import (
     QUICK_COMPILE,
     TrainStep,
     first_moments,
@@ -34,7 +32,9 @@ from spinndrift.training.step import (
     partition,
     usable_devices,
 )
-from spinndrift.training.windows import Windows
+from spinndrift.training.losses.base import Batch
+from spinndrift.training.losses.matching import Fdm, Mse
+from spinndrift.training.predict import predict
 
 SCENARIOS, SAMPLES, STEPS, DT = 10, 64, 80, 0.05
 

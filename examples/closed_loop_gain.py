@@ -20,19 +20,19 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from spinndrift.models.checkpoint import save_model
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects import Extended, kind
-from spinndrift.models.errors import UserError
-from spinndrift.models.files import atomic_path
-from spinndrift.models.recording_csv import read_csv
-from spinndrift.models.vehicle import Vehicle, load_vehicle
-from spinndrift.sims.check.tables import share
+from spinndrift.models.files.atomic import atomic_path
+from spinndrift.models.files.checkpoint import save_model
+from spinndrift.models.recordings.csv import read_csv
+from spinndrift.models.vehicles.vehicle import Vehicle, load_vehicle
 from spinndrift.sims.compile_cache import keep_compiled
-from spinndrift.sims.run_folder import run_metrics, scene
-from spinndrift.sims.run_loop import Run, simulate_seeds
-from spinndrift.sims.scenario import Scenario, load_scenario
-from spinndrift.systems.controllers import MppiImpedance
-from spinndrift.training.diagnosis.diagnose import diagnose
+from spinndrift.sims.diagnosis_benchmark.tables import share
+from spinndrift.sims.run.folder import run_metrics, scene
+from spinndrift.sims.run.loop import Run, simulate_seeds
+from spinndrift.sims.scenarios.scenario import Scenario, load_scenario
+from spinndrift.systems.controllers.kinds import MppiImpedance
+from spinndrift.training.diagnosis.pipeline import diagnose
 
 VEHICLE = "bluerov2_heavy"
 PLANNERS = ("belief", "extended", "truth")
@@ -285,7 +285,7 @@ def draw(flights: Flights, scenario: Scenario, path: Path) -> None:
     """Paths from above and depths, planned with the belief and with the extended model."""
     import matplotlib.pyplot as plt
 
-    from spinndrift.sims.figures_path import draw_above
+    from spinndrift.sims.reports.figures_path import draw_above
 
     shown = {name: f for name, f in flights.items() if "extended" in f}
     figure, axes = plt.subplots(

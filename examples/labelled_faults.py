@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from spinndrift.models.errors import UserError
-from spinndrift.sims.check.tables import interval
+from spinndrift.models.config.errors import UserError
+from spinndrift.sims.diagnosis_benchmark.tables import interval
 
 STEP = 0.05  # s between rows; the file's own time counts whole seconds
 COLUMNS = ("pwm1", "depth", "press", "voltage", "roll", "pitch", "w_yaw")

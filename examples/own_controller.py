@@ -12,10 +12,10 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
 
-from spinndrift.models.vehicle import Vehicle
+from spinndrift.models.vehicles.vehicle import Vehicle
 from spinndrift.systems.closed_loop import build_diagram, logged, seeded
-from spinndrift.systems.controllers import Own
-from spinndrift.systems.station_config import StationConfig
+from spinndrift.systems.controllers.kinds import Own
+from spinndrift.systems.station.config import StationConfig
 
 PERIOD = 0.02  # s
 

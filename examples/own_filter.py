@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from spinndrift.models.sensors import Imu
 from spinndrift.systems.closed_loop import build_diagram, logged, seeded
-from spinndrift.systems.controllers import TrackReference
+from spinndrift.systems.controllers.kinds import TrackReference
 from spinndrift.systems.own import OwnFilter
-from spinndrift.systems.paths import FigureEight, PoseConfig
-from spinndrift.systems.station_config import Sensing, StationConfig
+from spinndrift.systems.planning.paths import FigureEight, PoseConfig
+from spinndrift.systems.station.config import Sensing, StationConfig
 
 
 class DeadReckoning(LeafSystem):

@@ -19,18 +19,19 @@ import scipy.optimize
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from spinndrift.models.csv_table import read_table
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects.base import AXES
 from spinndrift.models.effects.library import Library, kind
 from spinndrift.models.effects.thrust import AxisThrust
-from spinndrift.models.errors import UserError
 from spinndrift.models.frames import pose_to_enu, twist_frd_to_flu
-from spinndrift.models.recording import Recording
-from spinndrift.models.recording_build import Trajectory
-from spinndrift.models.recording_csv import read_csv, write_csv
-from spinndrift.models.resample import continuous, geodesic, grid, hold, linear
-from spinndrift.models.vehicle import Vehicle, load_vehicle
-from spinndrift.training.diagnosis.horizon import (
+from spinndrift.models.recordings.build import Trajectory
+from spinndrift.models.recordings.csv import read_csv, write_csv
+from spinndrift.models.recordings.csv_table import read_table
+from spinndrift.models.recordings.resample import continuous, geodesic, grid, hold, linear
+from spinndrift.models.recordings.store import Recording
+from spinndrift.models.vehicles.vehicle import Vehicle, load_vehicle
+from spinndrift.training.diagnosis.filter.problem import Bench
+from spinndrift.training.diagnosis.selection.multi_step_fit import (
     HorizonFit,
     Windows,
     fit_forecasts,
@@ -38,7 +39,6 @@ from spinndrift.training.diagnosis.horizon import (
     rmse,
     windows,
 )
-from spinndrift.training.diagnosis.looking import Bench
 
 RATE = 10.0  # Hz
 POSITION, EULER = ("x_m", "y_m", "z_m"), ("roll_rad", "pitch_rad", "yaw_rad")

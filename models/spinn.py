@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .checks import Vector6, check_numbers, require
+from .config.checks import Vector6, check_numbers, require
 from .distance_aware import DiffusionKind, DistanceAware
 from .dynamics import Coefficients, Dynamics
 from .mean_reverting import MeanReverting

@@ -9,8 +9,8 @@ from contextlib import contextmanager, nullcontext
 from types import FrameType
 from typing import Protocol, runtime_checkable
 
-from ..models.errors import UserError
-from ..models.files import DISK_ERRORS
+from ..models.config.errors import UserError
+from ..models.files.atomic import DISK_ERRORS
 
 _DESCRIPTION = """Learned stochastic dynamics and control for underwater vehicles.
 

@@ -10,8 +10,8 @@ _MOST = 8  # a batch has some ten to a hundred windows: shares of one or two are
 def share_cores() -> None:
     """Let JAX count each core that this process may use, up to eight, as a device of its own.
 
-    Training then shares each batch among them (`training.step`); all else runs on the first. A
-    number chosen before (`JAX_NUM_CPU_DEVICES`) stays, and so does one already in use.
+    Training then shares each batch among them (`training.fitting.step`); all else runs on the
+    first. A number chosen before (`JAX_NUM_CPU_DEVICES`) stays, and so does one already in use.
     """
     if jax.config.jax_num_cpu_devices >= 0:  # pyright: ignore[reportAttributeAccessIssue]
         return

@@ -9,29 +9,29 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..models.errors import UserError
-from ..models.files import atomic_path
-from ..models.owned import FolderKind, ForeignError, run_folder
-from ..models.recording import Recording
-from ..models.vehicle import Vehicle, load_vehicle
+from ..models.config.errors import UserError
+from ..models.files.atomic import atomic_path
+from ..models.files.owned import FolderKind, ForeignError, run_folder
+from ..models.recordings.store import Recording
+from ..models.vehicles.vehicle import Vehicle, load_vehicle
 from ..systems.closed_loop import build_diagram
-from ..systems.controllers import MppiImpedance
-from ..systems.mavlink.logs import load_data
+from ..systems.controllers.kinds import MppiImpedance
+from ..systems.logs.load import load_data
 from ..training.config import TrainingConfig
-from ..training.run_folder import TRAINING, CheckpointError
-from .estimate import nees_words
-from .figures_path import path_figure, samples_figure
-from .figures_time import progress_figure, tracking_figure
+from ..training.fitting.run_folder import TRAINING, CheckpointError
 from .learning import Learned, learn
-from .learning_report import add_data, add_evaluation, add_training
-from .metrics import clearance
-from .pages import Page
 from .progress import progress_bar
-from .report import consistency
-from .run_folder import RUN, scene, write_files
-from .run_loop import Run, simulate
-from .run_signals import log_periods
-from .scenario import Scenario
+from .reports.figures_path import path_figure, samples_figure
+from .reports.figures_time import progress_figure, tracking_figure
+from .reports.learning_report import add_data, add_evaluation, add_training
+from .reports.pages import Page
+from .reports.run_report import consistency
+from .run.estimate import nees_words
+from .run.folder import RUN, scene, write_files
+from .run.loop import Run, simulate
+from .run.metrics import clearance
+from .run.signals import log_periods
+from .scenarios.scenario import Scenario
 
 EMBEDDED = Path(__file__).with_name("data") / "sitl_dive.tlog.xz"
 """The log that comes along."""

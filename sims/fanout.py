@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, TypeVar
 
-from ..models.errors import UserError
+from ..models.config.errors import UserError
 from .progress import Update
 
 T = TypeVar("T")

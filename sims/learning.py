@@ -8,21 +8,21 @@ from typing import Any
 import jax.numpy as jnp
 import xarray as xr
 
-from ..models.checkpoint import load_model, save_model
+from ..models.config.errors import UserError
 from ..models.dynamics import Dynamics
 from ..models.effects.extended import Extended, core
-from ..models.errors import UserError
+from ..models.files.checkpoint import load_model, save_model
+from ..models.files.owned import claim
 from ..models.integrate import cast
-from ..models.owned import claim
-from ..models.recording import Recording
+from ..models.recordings.store import Recording
 from ..models.rigid_body import FossenDynamics
-from ..models.vehicle import Vehicle
+from ..models.vehicles.vehicle import Vehicle
 from ..training.config import TrainingConfig, WindowConfig
-from ..training.evaluate import Evaluation, evaluate
-from ..training.fit import TrainingResult, fit
-from ..training.run_folder import TRAINING
-from ..training.start import begun_with, estimate_diffusion, starting_model, with_diffusion
-from ..training.windows import Normalisation, Windows, make_windows
+from ..training.data.windows import Normalisation, Windows, make_windows
+from ..training.evaluation.evaluate import Evaluation, evaluate
+from ..training.fitting.fit import TrainingResult, fit
+from ..training.fitting.run_folder import TRAINING
+from ..training.fitting.start import begun_with, estimate_diffusion, starting_model, with_diffusion
 
 FINE_SUBSTEPS = 5
 """Steps a sample for models that were not trained at a step of their own, such as presets."""
@@ -161,8 +161,8 @@ def learn(
 ) -> Learned:
     """Train a SPINN from a preset, or another `start`, and judge them on the held-out part.
 
-    Writes into `out` what `training.fit` writes, `evaluation.csv`, `evaluation.json`, the model
-    that training starts from as `start.spinn`, and the preset with its estimated diffusion as
+    Writes into `out` what `training.fitting.fit` writes, `evaluation.csv`, `evaluation.json`, the
+    model that training starts from as `start.spinn`, and the preset with its estimated diffusion as
     `preset.spinn`. With `resume` a run that has a checkpoint goes on from both.
 
     Raises:

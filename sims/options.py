@@ -7,8 +7,8 @@ import re
 from collections.abc import Sequence
 from typing import Any, get_type_hints
 
-from ..models.checks import range_of
-from ..models.errors import UserError
+from ..models.config.checks import range_of
+from ..models.config.errors import UserError
 
 _KINDS = {"FLOAT": "a number", "INT": "a whole number"}
 

@@ -9,11 +9,11 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import VectorLogSink
 
-from .controllers import INPUTS, TOLD, Controller, Goal
-from .network import Port, flatten, holders
-from .signal_log import SignalLog, add_log
-from .station import CHEATS, check_stand_in, make_station
-from .station_config import StationConfig
+from .compiled.network import Port, flatten, holders
+from .compiled.signal_log import SignalLog, add_log
+from .controllers.kinds import INPUTS, TOLD, Controller, Goal
+from .station.config import StationConfig
+from .station.simulated import CHEATS, check_stand_in, make_station
 
 LOG_PERIODS: Mapping[str, float] = {
     "X_WB": 0.05,
@@ -58,9 +58,9 @@ def build_diagram(
 ) -> Diagram:
     """Close the loop: subsystems `station`, `controller`, and a log `log_<port>` of each port.
 
-    A row of the logs is one instant, whichever ports they are of (`systems.signal_log`): what the
-    updates of t make stands at t, and beside it the truth of t. The truth is what a system shows
-    that holds the state behind one of the station's ports `CHEATS`.
+    A row of the logs is one instant, whichever ports they are of (`systems.compiled.signal_log`):
+    what the updates of t make stands at t, and beside it the truth of t. The truth is what a system
+    shows that holds the state behind one of the station's ports `CHEATS`.
 
     `extend(builder, station, controller)` may add more, a visualiser say, before the diagram is
     built. The diagram has no input ports; its randomness comes from sources inside (`seeded`).

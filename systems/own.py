@@ -14,7 +14,7 @@ from typing import Any
 
 from pydrake.systems.framework import InputPort, OutputPort, System
 
-from ..models.errors import UserError
+from ..models.config.errors import UserError
 
 Offered = Mapping[str, Callable[[], Any]]
 """What a constructor is given if it has an argument of that name, each as a function that makes
@@ -87,10 +87,10 @@ class OwnFilter(OwnSystem):
 
     It has the outputs `X_WB` and `V_WB_B`, and any of the station's `covariance`, `status` and
     `health`; where it lacks one, the station shows NaN there, and good health. It is connected to
-    those of `imu`, `dvl`, `depth`, `compass` (`systems.sensor_suite`), `pwm` and `initial_noise`
-    that are among its inputs. Its constructor is given, if it has arguments of these names, the
-    station's `vehicle`, its sensors' configurations `imu`, `dvl`, `depth`, `compass`, the start
-    `X0_WB` and `V0_WB_B`, and all of the `station`'s configuration.
+    those of `imu`, `dvl`, `depth`, `compass` (`systems.plant.sensor_suite`), `pwm` and
+    `initial_noise` that are among its inputs. Its constructor is given, if it has arguments of
+    these names, the station's `vehicle`, its sensors' configurations `imu`, `dvl`, `depth`,
+    `compass`, the start `X0_WB` and `V0_WB_B`, and all of the `station`'s configuration.
     """
 
 

@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from spinndrift.models import checkpoint, se3
+from spinndrift.models import se3
 from spinndrift.models.dynamics import Coefficients, Dynamics
+from spinndrift.models.files import checkpoint
 from spinndrift.models.spd import ConstantOperator, Operator, Spd
+from spinndrift.training.data.windows import Windows
 from spinndrift.training.predict import predict
-from spinndrift.training.windows import Windows
 
 
 class DiagonalSpd(Spd):

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spinndrift.sims.run_log import Plans, RunLog
+from spinndrift.sims.run.log import Plans, RunLog
 
 GOAL = (4.5, -2.0, -1.5)
 ESTIMATE_ERROR = (0.03, -0.04, 0.0)  # m, in W

@@ -4,7 +4,7 @@ import pytest
 from diagrams import read
 from thruster_examples import prompt_thrusters
 
-from spinndrift.systems.allocation import ThrustAllocation
+from spinndrift.systems.plant.allocation import ThrustAllocation
 
 THRUSTERS = prompt_thrusters()
 

@@ -12,17 +12,23 @@ from hidden.effects import CAUSES
 from hidden.effects_body import Proximity
 from hidden.scenarios import Plan
 
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects import KINDS, Extended, Library
-from spinndrift.models.errors import UserError
-from spinndrift.models.recording_csv import read_csv
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.sims.check import run as running
-from spinndrift.sims.check.cases import Case, HiddenCause, Truth, find_cases, read_oracle
-from spinndrift.sims.check.judging import Judgement, compare, gain_of
-from spinndrift.sims.check.pages import write_page
-from spinndrift.sims.check.tables import interval, share, tables
-from spinndrift.sims.marked_page import BEGIN, END
-from spinndrift.training.diagnosis import result
+from spinndrift.models.recordings.csv import read_csv
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.sims.diagnosis_benchmark import run as running
+from spinndrift.sims.diagnosis_benchmark.cases import (
+    Case,
+    HiddenCause,
+    Truth,
+    find_cases,
+    read_oracle,
+)
+from spinndrift.sims.diagnosis_benchmark.judging import Judgement, compare, gain_of
+from spinndrift.sims.diagnosis_benchmark.pages import write_page
+from spinndrift.sims.diagnosis_benchmark.tables import interval, share, tables
+from spinndrift.sims.reports.marked_page import BEGIN, END
+from spinndrift.training.diagnosis.findings import result
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(scenarios=2, runs=1, seconds=2.0, h=0.01)

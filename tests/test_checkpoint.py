@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from spinndrift.models import checkpoint, integrate
-from spinndrift.models.checkpoint import load_model, save_model
+from spinndrift.models import integrate
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.dynamics import Dynamics
-from spinndrift.models.errors import UserError
+from spinndrift.models.files import checkpoint
+from spinndrift.models.files.checkpoint import load_model, save_model
 from spinndrift.models.rigid_body import FossenDynamics, spatial_inertia
 from spinndrift.models.spinn import Spinn, SpinnConfig
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from helpers import full_disk, run_python
-from spinndrift.models import config as yaml
-from spinndrift.models.checkpoint import load_model, save_model
+from spinndrift.models.config import typed_yaml as yaml
 from spinndrift.models.effects.extended import Extended, core
 from spinndrift.models.effects.library import kind
-from spinndrift.models.owned import MARKER
-from spinndrift.models.recording import Recording
+from spinndrift.models.files.checkpoint import load_model, save_model
+from spinndrift.models.files.owned import MARKER
+from spinndrift.models.recordings.store import Recording
 from spinndrift.models.spinn import Spinn, SpinnConfig
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.cli import main
 from spinndrift.sims.demo import EMBEDDED
 from spinndrift.training.config import (
@@ -23,8 +23,8 @@ from spinndrift.training.config import (
     TrainingConfig,
     WindowConfig,
 )
-from spinndrift.training.losses import Mse
-from spinndrift.training.run_folder import TRAINING
+from spinndrift.training.fitting.run_folder import TRAINING
+from spinndrift.training.losses.matching import Mse
 
 TINY = TrainingConfig(
     objective=Mse(),

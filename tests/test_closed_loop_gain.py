@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from helpers import load_example
-from spinndrift.models.checkpoint import load_model, save_model
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects.extended import Extended
-from spinndrift.models.errors import UserError
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.sims.scenario import load_scenario
-from spinndrift.systems.controllers import MppiImpedance
+from spinndrift.models.files.checkpoint import load_model, save_model
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.sims.scenarios.scenario import load_scenario
+from spinndrift.systems.controllers.kinds import MppiImpedance
 
 example = load_example("closed_loop_gain")
 VEHICLE = load_vehicle("bluerov2_heavy")

@@ -14,13 +14,13 @@ from pydrake.systems.primitives import (
     VectorLogSink,
 )
 
-from spinndrift.models.errors import UserError
-from spinndrift.sims.run_loop import simulate
-from spinndrift.sims.scenario import load_scenario
-from spinndrift.systems.compiled import CompiledSimulator
-from spinndrift.systems.jit import value_or_zeros
-from spinndrift.systems.network import NotPureError
-from spinndrift.systems.pure import Event, Pure, shown
+from spinndrift.models.config.errors import UserError
+from spinndrift.sims.run.loop import simulate
+from spinndrift.sims.scenarios.scenario import load_scenario
+from spinndrift.systems.compiled.jit import value_or_zeros
+from spinndrift.systems.compiled.network import NotPureError
+from spinndrift.systems.compiled.pure import Event, Pure, shown
+from spinndrift.systems.compiled.simulator import CompiledSimulator
 
 
 class Mixer(LeafSystem):

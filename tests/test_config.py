@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
-from spinndrift.models.config import dump, load, loads
-from spinndrift.models.errors import UserError
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.config.typed_yaml import dump, load, loads
 
 pytestmark = pytest.mark.smoke
 

@@ -8,8 +8,8 @@ import pytest
 
 from spinndrift.models.euclidean import create_spinn
 from spinndrift.models.spinn import SpinnConfig
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.training.constants import constants, without_networks
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.fitting.constants import constants, without_networks
 
 
 @pytest.mark.parametrize("settings", [{}, {"coordinates": "euler"}, {"potential": "pose"}])

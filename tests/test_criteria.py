@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from spinndrift.models.errors import UserError
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.sims.criteria import FollowPath, Monitor, ReachGoal, Safety
-from spinndrift.systems.obstacles import Pylon
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.sims.scenarios.criteria import FollowPath, Monitor, ReachGoal, Safety
+from spinndrift.systems.planning.obstacles import Pylon
 
 GOAL = np.array([4.0, 0.0, -1.5])
 PYLON = Pylon(2.0, 1.0, 0.4, name="the north pylon")

@@ -5,15 +5,15 @@ from dataclasses import replace
 
 from test_cli import TINY
 
-from spinndrift.models.owned import MARKER
+from spinndrift.models.files.owned import MARKER
 from spinndrift.sims.demo import DEMO, EMBEDDED, demo, demo_folder
-from spinndrift.sims.estimate import nees_words
-from spinndrift.sims.run_folder import RUN
-from spinndrift.sims.run_loop import simulate
-from spinndrift.sims.scenario import load_scenario
-from spinndrift.systems.mavlink.logs import load_data
+from spinndrift.sims.run.estimate import nees_words
+from spinndrift.sims.run.folder import RUN
+from spinndrift.sims.run.loop import simulate
+from spinndrift.sims.scenarios.scenario import load_scenario
+from spinndrift.systems.logs.load import load_data
 from spinndrift.training.config import DriftConfig
-from spinndrift.training.run_folder import TRAINING
+from spinndrift.training.fitting.run_folder import TRAINING
 
 SMALL = """
 duration: 0.5

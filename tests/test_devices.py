@@ -11,10 +11,10 @@ from diagonal import Diagonal, simulated
 
 from spinndrift.sims.compile_cache import compiled_environment
 from spinndrift.training.config import TrainingConfig
-from spinndrift.training.distance_aware import DistanceAwareObjective
-from spinndrift.training.fit import fit
-from spinndrift.training.losses import Fdm
-from spinndrift.training.step import usable_devices
+from spinndrift.training.fitting.fit import fit
+from spinndrift.training.fitting.step import usable_devices
+from spinndrift.training.losses.distance_aware_losses import DistanceAwareObjective
+from spinndrift.training.losses.matching import Fdm
 
 CONFIG = TrainingConfig(
     objective=Fdm(
@@ -59,7 +59,7 @@ def test_two_devices_learn_what_one_does(tmp_path):
         "jax.config.update('jax_enable_x64', True); import test_devices as t;"
         "objective = t.CONFIG.objective.build(t.START, t.simulated(t.START, 8));"
         "assert [t.usable_devices(objective, n) for n in (6, 7, 8)] == [2, 1, 2];"
-        "import spinndrift.training.fit as f; made, Step = [], f.TrainStep;"
+        "import spinndrift.training.fitting.fit as f; made, Step = [], f.TrainStep;"
         "f.TrainStep = lambda *given: made.append(Step(*given)) or made[-1];"
         "numpy.save(sys.argv[1], t.learned());"
         "assert [step.traces for step in made] == [1]"

@@ -7,17 +7,17 @@ import pytest
 from killing import killed, litter
 from test_cli import called
 
-from spinndrift.models.owned import MARKER
-from spinndrift.models.recording import Recording, Trajectory
+from spinndrift.models.files.owned import MARKER
+from spinndrift.models.recordings.store import Recording, Trajectory
 
 PREPARE = """
 from types import SimpleNamespace
-import spinndrift.sims.diagnosis_report, spinndrift.training.diagnosis.diagnose
+import spinndrift.sims.reports.diagnosis_report, spinndrift.training.diagnosis.diagnose
 from test_diagnose_command import Told
-spinndrift.training.diagnosis.diagnose.diagnose = lambda recording, vehicle, *_: SimpleNamespace(
+spinndrift.training.diagnosis.pipeline.diagnose = lambda recording, vehicle, *_: SimpleNamespace(
     diagnosis=Told(), extended=vehicle.dynamics()
 )
-spinndrift.sims.diagnosis_report.diagnosis_page = lambda *_: Told()
+spinndrift.sims.reports.diagnosis_report.diagnosis_page = lambda *_: Told()
 """
 FILES = {MARKER, "diagnosis.json", "diagnosis.schema.json", "extended/model.spinn", "report.html"}
 
@@ -49,8 +49,10 @@ def diagnosing(monkeypatch):
             assert vehicle.name == "bluerov2_heavy"
             return SimpleNamespace(diagnosis=told, extended=vehicle.dynamics())
 
-        monkeypatch.setattr("spinndrift.training.diagnosis.diagnose.diagnose", diagnose)
-        monkeypatch.setattr("spinndrift.sims.diagnosis_report.diagnosis_page", lambda *_: told)
+        monkeypatch.setattr("spinndrift.training.diagnosis.pipeline.diagnose", diagnose)
+        monkeypatch.setattr(
+            "spinndrift.sims.reports.diagnosis_report.diagnosis_page", lambda *_: told
+        )
 
     return stand_in
 

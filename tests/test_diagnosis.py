@@ -11,35 +11,38 @@ import scipy.linalg
 from hidden.draw import draw
 from hidden.scenarios import Plan
 
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects import KINDS, Extended, Library
 from spinndrift.models.effects.base import AXES
-from spinndrift.models.errors import UserError
-from spinndrift.models.recording import Recording
-from spinndrift.models.recording_csv import read_csv
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.sims.diagnosis_report import diagnosis_page
-from spinndrift.sims.figures_simulated import at_ends
-from spinndrift.training.diagnosis import looking
-from spinndrift.training.diagnosis.checks import limits
-from spinndrift.training.diagnosis.data import Data
-from spinndrift.training.diagnosis.diagnose import (
-    DiagnoseConfig,
-    Diagnoser,
-    best_gain,
-    coefficients_are_off,
-)
-from spinndrift.training.diagnosis.hypotheses import Fit
-from spinndrift.training.diagnosis.innovations import predict
-from spinndrift.training.diagnosis.laws import find_laws
-from spinndrift.training.diagnosis.naming import admissible, choose, is_itself
-from spinndrift.training.diagnosis.noise import (
+from spinndrift.models.recordings.csv import read_csv
+from spinndrift.models.recordings.store import Recording
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.sims.reports.diagnosis_report import diagnosis_page
+from spinndrift.sims.reports.figures_simulated import at_ends
+from spinndrift.training.data.generate import GenerateConfig, generate
+from spinndrift.training.diagnosis.data.arrays import Data
+from spinndrift.training.diagnosis.data.checks import limits
+from spinndrift.training.diagnosis.disturbance.laws import find_laws
+from spinndrift.training.diagnosis.filter import problem as looking
+from spinndrift.training.diagnosis.filter.innovations import predict
+from spinndrift.training.diagnosis.filter.noise import (
     Noise,
     filtered,
     make_filter,
     process_covariance,
 )
-from spinndrift.training.diagnosis.responses import respond
-from spinndrift.training.diagnosis.result import (
+from spinndrift.training.diagnosis.filter.sensitivities import respond
+from spinndrift.training.diagnosis.filter.transition import Transition
+from spinndrift.training.diagnosis.findings.reported import (
+    CHANNELS,
+    following,
+    noise_words,
+    residual,
+    sentence,
+    verdict,
+    with_coefficients_off,
+)
+from spinndrift.training.diagnosis.findings.result import (
     AxisResidual,
     Cause,
     Diagnosis,
@@ -49,18 +52,15 @@ from spinndrift.training.diagnosis.result import (
     Value,
     schema,
 )
-from spinndrift.training.diagnosis.search import Found, Search
-from spinndrift.training.diagnosis.telling import (
-    CHANNELS,
-    following,
-    noise_words,
-    residual,
-    sentence,
-    verdict,
-    with_coefficients_off,
+from spinndrift.training.diagnosis.pipeline import (
+    DiagnoseConfig,
+    Diagnoser,
+    best_gain,
+    coefficients_are_off,
 )
-from spinndrift.training.diagnosis.transition import Transition
-from spinndrift.training.generate import GenerateConfig, generate
+from spinndrift.training.diagnosis.selection.hypotheses import Fit
+from spinndrift.training.diagnosis.selection.model_selection import admissible, choose, is_itself
+from spinndrift.training.diagnosis.selection.search import Found, Search
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(runs=2, seconds=6.0)
@@ -446,8 +446,8 @@ def test_steps_of_any_length_are_predicted_with_what_thrusters_remember():
 
 def test_structure_without_a_name_is_found_where_it_is(tmp_path):
     """The flow's memory on one axis: seen there, with its time and frequency, and on no other."""
-    from spinndrift.training.diagnosis.candidates import _memory, refined
-    from spinndrift.training.diagnosis.structures import Screen
+    from spinndrift.training.diagnosis.candidates.groups import _memory, refined
+    from spinndrift.training.diagnosis.candidates.structures import Screen
 
     case, recording = recorded(tmp_path, 70002, "unknown", names=("memory",))
     hidden = case.answer()["causes"][0]
@@ -478,8 +478,8 @@ def test_structure_without_a_name_is_found_where_it_is(tmp_path):
 )
 def test_how_thrusters_follow_is_told_with_number_and_place(tmp_path, name, seed, kind, words):
     """One thruster of eight with play, all at a limited rate, two wired to each other's drive."""
-    from spinndrift.training.diagnosis.candidates import described, refined
-    from spinndrift.training.diagnosis.unknowns import screened
+    from spinndrift.training.diagnosis.candidates.groups import described, refined
+    from spinndrift.training.diagnosis.candidates.unknowns import screened
 
     case, recording = recorded(tmp_path, seed, "unknown", names=(name,))
     hidden = case.answer()["causes"][0]
@@ -505,7 +505,7 @@ def test_single_precision_is_refused_with_a_remedy(tmp_path):
 
 def test_a_swaying_mass_ahead_of_the_origin_is_seen_in_yaw(tmp_path):
     """The turning moment remembers the velocity to the side, and rings with the hidden spring."""
-    from spinndrift.training.diagnosis.unknowns import screened
+    from spinndrift.training.diagnosis.candidates.unknowns import screened
 
     case, recording = recorded(tmp_path, 70011, "unknown", names=("appendage",))
     hidden = case.answer()["causes"][0]
@@ -542,7 +542,7 @@ def test_errors_that_follow_each_other_are_not_called_adequate():
 
 def test_an_instrument_slower_than_the_rows_is_told(tmp_path):
     """A DVL of 5 Hz in rows of 20 Hz repeats its samples: its mean delay is no clock's."""
-    from spinndrift.training.diagnosis.checks import problems
+    from spinndrift.training.diagnosis.data.checks import problems
 
     recording = recorded(tmp_path, 3, "null")[1]
     V = recording.dataset["V_WB_B"].to_numpy()
@@ -586,7 +586,7 @@ def test_positions_that_were_not_measured_tell_nothing_and_ask_for_nothing(tmp_p
 def test_axes_that_are_not_driven_and_filled_samples_are_told(tmp_path):
     from hidden.faults import spoil
 
-    from spinndrift.training.diagnosis.checks import problems
+    from spinndrift.training.diagnosis.data.checks import problems
 
     idle = draw(3, "null", plan=Plan(scenarios=2, runs=1, seconds=4.0, idle=(1,)))
     idle.write(tmp_path / "idle")
@@ -610,7 +610,7 @@ def test_a_small_jump_of_the_clock_is_told_and_a_lost_sample_is_none(tmp_path):
     from hidden.faults import change, clock_jump
     from hidden.write import write_folder
 
-    from spinndrift.training.diagnosis.checks import problems
+    from spinndrift.training.diagnosis.data.checks import problems
 
     runs = draw(3, "null", plan=PLAN).logged()
     moving = runs[2]
@@ -630,7 +630,7 @@ def test_a_small_jump_of_the_clock_is_told_and_a_lost_sample_is_none(tmp_path):
 
 @pytest.mark.parametrize("channel", ["v", "w", "q"])
 def test_a_velocity_of_the_wrong_sign_is_refused(tmp_path, channel):
-    from spinndrift.training.diagnosis.checks import problems
+    from spinndrift.training.diagnosis.data.checks import problems
 
     recording = recorded(tmp_path, 3, "null")[1]
     recording.dataset["V_WB_B"][..., "uvwpqr".index(channel)] *= -1
@@ -714,10 +714,10 @@ def test_simulated_states_without_noise_are_no_clock_that_is_off():
 
 def test_bands_hold_what_a_law_of_the_disturbance_adds(tmp_path):
     """Simulated bands are too narrow without the slow pushes that were hidden, not with them."""
-    from spinndrift.training.diagnosis.disturbance import laws_of
-    from spinndrift.training.diagnosis.gain import Contender, judge
-    from spinndrift.training.diagnosis.telling import law_cause
-    from spinndrift.training.metrics import BANDS
+    from spinndrift.training.diagnosis.disturbance.found import laws_of
+    from spinndrift.training.diagnosis.findings.reported import law_cause
+    from spinndrift.training.diagnosis.validation.validation import Contender, judge
+    from spinndrift.training.evaluation.metrics import BANDS
 
     _, recording = recorded(tmp_path, 5, names=("disturbance_colour",))
     bench = Diagnoser(recording, VEHICLE).bench

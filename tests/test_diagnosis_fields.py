@@ -3,9 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from spinndrift.models.errors import UserError
-from spinndrift.sims.diagnosis_fields import page, tables
-from spinndrift.training.diagnosis import result
+from spinndrift.models.config.errors import UserError
+from spinndrift.sims.reports.diagnosis_fields import page, tables
+from spinndrift.training.diagnosis.findings import result
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "diagnosis-json.md"
 
@@ -33,7 +33,7 @@ def test_descriptions_carry_units():
 def test_the_page_has_the_tables_of_the_code():
     text = PAGE.read_text(encoding="utf-8")
     assert tables() in text
-    assert page(text) == text, "run python -m spinndrift.sims.diagnosis_fields"
+    assert page(text) == text, "run python -m spinndrift.sims.reports.diagnosis_fields"
 
 
 def test_a_page_without_marks_is_refused():

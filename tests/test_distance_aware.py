@@ -8,7 +8,7 @@ import pytest
 
 from spinndrift.models.distance_aware import DistanceAware
 from spinndrift.models.spinn import Spinn, SpinnConfig
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 
 Z = jnp.asarray(np.random.default_rng(0).normal(size=(6, 5)))
 NEAR = 1 / (1 + np.exp(7.0))

@@ -9,14 +9,12 @@ from hidden.effects_environment import Waves
 from hidden.scenarios import Plan
 from hidden.simulator import Noise
 
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects import Extended
 from spinndrift.models.effects.drag import LinearDrag
-from spinndrift.models.errors import UserError
-from spinndrift.models.recording_csv import read_csv
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.training.diagnosis.beside import Beside
-from spinndrift.training.diagnosis.diagnose import Diagnoser
-from spinndrift.training.diagnosis.disturbance import (
+from spinndrift.models.recordings.csv import read_csv
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.diagnosis.disturbance.found import (
     SLOW,
     _grown,
     all_laws,
@@ -24,12 +22,14 @@ from spinndrift.training.diagnosis.disturbance import (
     told,
     won_by,
 )
-from spinndrift.training.diagnosis.laws import Law, estimated, impacts
-from spinndrift.training.diagnosis.levels import LEVEL
-from spinndrift.training.diagnosis.noise import estimate, score_of
-from spinndrift.training.diagnosis.search import Found, Search
-from spinndrift.training.diagnosis.transition import Transition
-from spinndrift.training.diagnosis.waves import beside_laws, find_current, find_waves
+from spinndrift.training.diagnosis.disturbance.laws import Law, estimated, impacts
+from spinndrift.training.diagnosis.disturbance.levels import LEVEL
+from spinndrift.training.diagnosis.disturbance.waves import beside_laws, find_current, find_waves
+from spinndrift.training.diagnosis.filter.noise import estimate, score_of
+from spinndrift.training.diagnosis.filter.transition import Transition
+from spinndrift.training.diagnosis.pipeline import Diagnoser
+from spinndrift.training.diagnosis.selection.correlated_noise import Beside
+from spinndrift.training.diagnosis.selection.search import Found, Search
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 LEVELS = np.array([1.0] * 3 + [0.03] * 3)

@@ -14,8 +14,8 @@ from spinndrift.models.disturbances import (
     WhiteWrench,
 )
 from spinndrift.models.rigid_body import FossenDynamics, spatial_inertia
-from spinndrift.systems.disturbance_source import DisturbanceSource
-from spinndrift.systems.learned_plant import LearnedPlant
+from spinndrift.systems.plant.disturbance_source import DisturbanceSource
+from spinndrift.systems.plant.learned_plant import LearnedPlant
 
 SEA = Combined((GaussMarkovCurrent(), JonswapWaves(), WhiteWrench(), OrnsteinUhlenbeckWrench()))
 STEADY = GaussMarkovCurrent(mean_speed=0.3, std_speed=0.0, std_direction=0.0)

@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from spinndrift.models import config, se3
+from spinndrift.models import se3
+from spinndrift.models.config import typed_yaml
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.disturbances import (
     Combined,
     Disturbance,
@@ -24,7 +26,6 @@ from spinndrift.models.disturbances import (
     wave_number,
 )
 from spinndrift.models.dynamics import Flow
-from spinndrift.models.errors import UserError
 
 KEY = jax.random.key(7)
 # Each test that compares a sample moment with its law allows four standard errors.
@@ -105,15 +106,15 @@ class TestContract:
 
     @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: type(kind).__name__)
     def test_text_and_back(self, kind):
-        assert config.loads(type(kind), config.dump(kind)) == kind
-        assert hash(config.loads(type(kind), config.dump(kind))) == hash(kind)
+        assert typed_yaml.loads(type(kind), typed_yaml.dump(kind)) == kind
+        assert hash(typed_yaml.loads(type(kind), typed_yaml.dump(kind))) == hash(kind)
 
     def test_a_scenario_names_kinds_by_tags(self):
         text = (
             "members:\n  - !JonswapWaves {significant_height: 0.3, peak_period: 3}\n  - !Tether\n"
         )
         sea = JonswapWaves(significant_height=0.3, peak_period=3.0)
-        assert config.loads(Combined, text) == Combined((sea, Tether()))
+        assert typed_yaml.loads(Combined, text) == Combined((sea, Tether()))
 
     @pytest.mark.parametrize(
         ("make", "field"),

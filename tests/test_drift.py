@@ -9,11 +9,11 @@ import pytest
 
 from spinndrift.models.euclidean import create_spinn
 from spinndrift.models.spinn import SpinnConfig
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.config import DriftConfig
-from spinndrift.training.drift import fit_drift
+from spinndrift.training.data.windows import Windows
+from spinndrift.training.fitting.drift import fit_drift
 from spinndrift.training.predict import predict_drift
-from spinndrift.training.windows import Windows
 
 SMALL = SpinnConfig(width=4, depth=1, constant_mass=True)
 CONFIG = DriftConfig(iterations=6, length_s=1.0, pieces=40, prior=1e-6)

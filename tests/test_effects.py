@@ -9,17 +9,17 @@ import pytest
 import scipy.linalg
 
 from spinndrift.models import se3
-from spinndrift.models.checkpoint import load_model, save_model
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects import KINDS, Extended, Library
+from spinndrift.models.effects.deterministic_step import advance
 from spinndrift.models.effects.drag import COUPLINGS
 from spinndrift.models.effects.following import FOLLOWERS, ramped, taken_up
-from spinndrift.models.effects.predict import advance
 from spinndrift.models.effects.recent import Recent
 from spinndrift.models.effects.thrust import REFERENCE
 from spinndrift.models.effects.unknown import Unknown
-from spinndrift.models.errors import UserError
+from spinndrift.models.files.checkpoint import load_model, save_model
 from spinndrift.models.integrate import rollout
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 BASE = VEHICLE.dynamics()

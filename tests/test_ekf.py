@@ -9,14 +9,14 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from spinndrift.models import se3
-from spinndrift.models.errors import UserError
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.sensors import DepthSensor, Dvl
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.systems.ekf import Ekf
-from spinndrift.systems.filtering.delayed import STATUS, EkfConfig, Readings
-from spinndrift.systems.filtering.error_state import ERRORS
-from spinndrift.systems.learned_plant import LearnedPlant
-from spinndrift.systems.sensor_suite import SensorSuite
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.systems.estimation.delayed import STATUS, EkfConfig, Readings
+from spinndrift.systems.estimation.ekf import Ekf
+from spinndrift.systems.estimation.error_state import ERRORS
+from spinndrift.systems.plant.learned_plant import LearnedPlant
+from spinndrift.systems.plant.sensor_suite import SensorSuite
 
 X0 = np.array([1.0, 0, 0, 0, 0, 0, -3])
 PORTS = ("imu", "dvl", "depth", "compass")

@@ -9,10 +9,10 @@ import pytest
 from diagonal import Diagonal, simulated
 
 from spinndrift.training.config import TrainingConfig
-from spinndrift.training.ensemble import fit_ensemble
-from spinndrift.training.fit import TrainingResult, fit
-from spinndrift.training.guard import TrainingError
-from spinndrift.training.losses import Mse
+from spinndrift.training.fitting.ensemble import fit_ensemble
+from spinndrift.training.fitting.fit import TrainingResult, fit
+from spinndrift.training.fitting.guard import TrainingError
+from spinndrift.training.losses.matching import Mse
 
 TRUTH = Diagonal.of(mass=10.0, drag=8.0, diffusion=1.0)
 MODELS = [Diagonal.of(mass=14.0, drag=5.0, diffusion=2.0), Diagonal.of(12.0, 6.0, 0.5)]

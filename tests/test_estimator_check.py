@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from run_example import example_log
 
-from spinndrift.models import config
-from spinndrift.models.errors import UserError
+from spinndrift.models.config import typed_yaml
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.sensors.faults import SensorFault
 from spinndrift.sims.commands.check_estimator import CheckEstimator
-from spinndrift.sims.criteria import Outcome
 from spinndrift.sims.estimator_check import run as running
 from spinndrift.sims.estimator_check.run import run_settings
 from spinndrift.sims.estimator_check.scores import (
@@ -28,9 +27,10 @@ from spinndrift.sims.estimator_check.settings import (
     fault_settings,
 )
 from spinndrift.sims.estimator_check.tables import tables
-from spinndrift.sims.run_log import RunLog
-from spinndrift.sims.run_loop import Run, Timing
-from spinndrift.sims.scenario import Scenario
+from spinndrift.sims.run.log import RunLog
+from spinndrift.sims.run.loop import Run, Timing
+from spinndrift.sims.scenarios.criteria import Outcome
+from spinndrift.sims.scenarios.scenario import Scenario
 
 RUNS = {"consistency": 3, "faults": 2}
 
@@ -115,7 +115,7 @@ def test_every_setting_is_a_scenario_that_comes_back_from_its_file():
     ]
     assert {str(s) for s in settings} == set(names) - {"learned"}
     for setting in settings:
-        again = config.loads(Scenario, config.dump(setting.scenario))
+        again = typed_yaml.loads(Scenario, typed_yaml.dump(setting.scenario))
         assert again == setting.scenario
         for fault in setting.scenario.station.sensing.faults:
             assert (fault.start, setting.name.split("_")[0]) == (10.0, fault.sensor)

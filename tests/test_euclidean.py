@@ -11,10 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from spinndrift.models import euclidean, integrate, se3
-from spinndrift.models.checkpoint import load_model, save_model
 from spinndrift.models.euclidean import EuclideanSpinn, coordinates, create_spinn
+from spinndrift.models.files.checkpoint import load_model, save_model
 from spinndrift.models.spinn import Spinn, SpinnConfig
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 SMALL = {"width": 6, "depth": 1, "constant_mass": True, "coordinates": "euler"}

@@ -12,9 +12,9 @@ import xarray as xr
 from diagonal import Diagonal, simulated
 
 from spinndrift.models import se3
-from spinndrift.sims.figures_learning import coverage_figure, error_figure, learning_figure
-from spinndrift.training.evaluate import evaluate
-from spinndrift.training.metrics import AXES, energy_score, order_statistics
+from spinndrift.sims.reports.figures_learning import coverage_figure, error_figure, learning_figure
+from spinndrift.training.evaluation.evaluate import evaluate
+from spinndrift.training.evaluation.metrics import AXES, energy_score, order_statistics
 
 TRUTH = Diagonal.of()
 WRONG = Diagonal.of(mass=13.0, drag=5.0, diffusion=0.4)

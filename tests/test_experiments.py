@@ -7,12 +7,12 @@ import pytest
 from hidden.draw import draw
 from hidden.scenarios import Plan
 
-from spinndrift.models.recording_csv import read_csv
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.training.diagnosis.diagnose import Diagnoser
-from spinndrift.training.diagnosis.experiments import _added, experiments
-from spinndrift.training.diagnosis.naming import Choice
-from spinndrift.training.diagnosis.trials import TRIALS, VARIANTS, simulated
+from spinndrift.models.recordings.csv import read_csv
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.diagnosis.findings.experiments import _added, experiments
+from spinndrift.training.diagnosis.findings.maneuver_library import TRIALS, VARIANTS, simulated
+from spinndrift.training.diagnosis.pipeline import Diagnoser
+from spinndrift.training.diagnosis.selection.model_selection import Choice
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 LAG, DELAY = ("thruster_lag", "all"), ("actuation_delay", "all")

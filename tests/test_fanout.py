@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from spinndrift.models.errors import UserError
+from spinndrift.models.config.errors import UserError
 from spinndrift.sims.fanout import run_on_cluster
 from spinndrift.sims.study.config import scaled
 from spinndrift.sims.study.run import StudyWork
@@ -81,7 +81,7 @@ def test_a_killed_worker_costs_its_task_alone(cluster, tmp_path):
 
 def test_bad_input_on_a_worker_ends_the_study(cluster):
     def work(task):
-        from spinndrift.models.errors import UserError
+        from spinndrift.models.config.errors import UserError
 
         raise UserError(f"{task}: was made with other settings")
 

@@ -2,10 +2,15 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from spinndrift.sims.diagnosis_report import _noise, _probability
-from spinndrift.sims.figures import scaled
-from spinndrift.sims.figures_diagnosis import horizon_figure, panel_top
-from spinndrift.training.diagnosis.result import DataSummary, Diagnosis, Interval, ModelGain
+from spinndrift.sims.reports.diagnosis_report import _noise, _probability
+from spinndrift.sims.reports.figures import scaled
+from spinndrift.sims.reports.figures_diagnosis import horizon_figure, panel_top
+from spinndrift.training.diagnosis.findings.result import (
+    DataSummary,
+    Diagnosis,
+    Interval,
+    ModelGain,
+)
 
 
 def gain(*position):

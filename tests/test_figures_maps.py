@@ -7,9 +7,9 @@ from hidden.draw import draw
 from hidden.scenarios import Plan
 from scipy.spatial.transform import Rotation
 
-from spinndrift.models.recording_csv import read_csv
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.sims.figures_maps import (
+from spinndrift.models.recordings.csv import read_csv
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.sims.reports.figures_maps import (
     binned,
     draw_map,
     error_map,
@@ -18,10 +18,10 @@ from spinndrift.sims.figures_maps import (
     run_times,
     variables,
 )
-from spinndrift.training.diagnosis.data import make_data
-from spinndrift.training.diagnosis.diagnose import Finding
-from spinndrift.training.diagnosis.looking import Bench
-from spinndrift.training.diagnosis.result import DataSummary, Diagnosis
+from spinndrift.training.diagnosis.data.arrays import make_data
+from spinndrift.training.diagnosis.filter.problem import Bench
+from spinndrift.training.diagnosis.findings.result import DataSummary, Diagnosis
+from spinndrift.training.diagnosis.pipeline import Finding
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 

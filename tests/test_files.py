@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spinndrift.models.errors import UserError
-from spinndrift.models.files import atomic_files, atomic_path, check_writable
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.files.atomic import atomic_files, atomic_path, check_writable
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_a_failing_disk_leaves_the_old_file_and_no_litter(target: Path, monkeypa
 def test_a_killed_process_leaves_the_old_file(target: Path):
     script = (
         "import os, signal, sys\n"
-        "from spinndrift.models.files import atomic_path\n"
+        "from spinndrift.models.files.atomic import atomic_path\n"
         "with atomic_path(sys.argv[1]) as partial:\n"
         "    partial.write_text('ne')\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"

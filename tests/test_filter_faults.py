@@ -17,8 +17,8 @@ from jaxtyping import Array
 from spinndrift.models import se3
 from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu, wrap
 from spinndrift.sims.estimator_check.scores import within_three_sigma
-from spinndrift.systems.filtering import error_state
-from spinndrift.systems.filtering.delayed import HEALTH, DelayedFilter, EkfConfig, Readings
+from spinndrift.systems.estimation import error_state
+from spinndrift.systems.estimation.delayed import HEALTH, DelayedFilter, EkfConfig, Readings
 
 SEEDS = 10
 EVERY = 20  # samples from one estimate that is kept to the next

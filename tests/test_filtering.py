@@ -13,9 +13,9 @@ from scipy.stats import chi2
 
 from spinndrift.models import se3
 from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu
-from spinndrift.systems.filtering import error_state as es
-from spinndrift.systems.filtering import measurement
-from spinndrift.systems.filtering.delayed import DelayedFilter, EkfConfig, FilterState, Readings
+from spinndrift.systems.estimation import error_state as es
+from spinndrift.systems.estimation import measurement
+from spinndrift.systems.estimation.delayed import DelayedFilter, EkfConfig, FilterState, Readings
 
 SEEDS, STEPS = 40, 600
 RNG = np.random.default_rng(0)

@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 from diagonal import Diagonal, simulated
 
-from spinndrift.models import config as yaml
-from spinndrift.models.checkpoint import load_model
-from spinndrift.models.errors import UserError
+from spinndrift.models.config import typed_yaml as yaml
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.files.checkpoint import load_model
 from spinndrift.models.spinn import Spinn, SpinnConfig
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.config import PretrainConfig, TrainingConfig
-from spinndrift.training.fit import Run, fit
-from spinndrift.training.groups import batch_indices
-from spinndrift.training.guard import TrainingError
-from spinndrift.training.losses import Fdm, Mse
-from spinndrift.training.objective import Batch
-from spinndrift.training.pretrain import coefficient_error, pretrain
-from spinndrift.training.run_folder import RunFolder
-from spinndrift.training.start import estimate_diffusion
-from spinndrift.training.step import TrainStep, first_moments, learning_rate, partition
+from spinndrift.training.data.groups import batch_indices
+from spinndrift.training.fitting.fit import Run, fit
+from spinndrift.training.fitting.guard import TrainingError
+from spinndrift.training.fitting.pretrain import coefficient_error, pretrain
+from spinndrift.training.fitting.run_folder import RunFolder
+from spinndrift.training.fitting.start import estimate_diffusion
+from spinndrift.training.fitting.step import TrainStep, first_moments, learning_rate, partition
+from spinndrift.training.losses.base import Batch
+from spinndrift.training.losses.matching import Fdm, Mse
 
 TRUTH = Diagonal.of(mass=10.0, drag=8.0, diffusion=1.0)
 START = Diagonal.of(mass=14.0, drag=5.0, diffusion=2.0)

@@ -7,15 +7,15 @@ from test_cli import COMMANDS, called
 from test_owned import held_elsewhere, tree
 
 from helpers import full_disk
-from spinndrift.models.owned import MARKER, run_folder
-from spinndrift.sims.check.run import CHECK
+from spinndrift.models.files.owned import MARKER, run_folder
 from spinndrift.sims.commands.diagnose import DIAGNOSIS
 from spinndrift.sims.demo import DEMO
+from spinndrift.sims.diagnosis_benchmark.run import CHECK
 from spinndrift.sims.estimator_check.run import ESTIMATOR
-from spinndrift.sims.marked_page import BEGIN, END
-from spinndrift.sims.run_folder import RUN
+from spinndrift.sims.reports.marked_page import BEGIN, END
+from spinndrift.sims.run.folder import RUN
 from spinndrift.sims.study.run import STUDY
-from spinndrift.training.run_folder import TRAINING
+from spinndrift.training.fitting.run_folder import TRAINING
 
 FOLDERS = {
     "demo": (("demo", "--log", "missing.tlog"), DEMO),

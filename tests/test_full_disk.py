@@ -8,14 +8,14 @@ import pytest
 from diagonal import Diagonal
 
 from helpers import full_disk
-from spinndrift.models.checkpoint import save_model
-from spinndrift.models.errors import UserError
-from spinndrift.models.files import atomic_files
-from spinndrift.models.recording import Recording, Trajectory
-from spinndrift.sims.pages import Page
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.files.atomic import atomic_files
+from spinndrift.models.files.checkpoint import save_model
+from spinndrift.models.recordings.store import Recording, Trajectory
+from spinndrift.sims.reports.pages import Page
 from spinndrift.sims.study.table import write_csv
 from spinndrift.training.config import TrainingConfig
-from spinndrift.training.run_folder import RunFolder, TrainState
+from spinndrift.training.fitting.run_folder import RunFolder, TrainState
 
 ROOM = 600  # bytes, less than any of these files has
 

@@ -9,7 +9,7 @@ import pytest
 from fuzz.harness import Kind, judge
 from fuzz.kinds import KINDS
 
-from spinndrift.models.errors import UserError
+from spinndrift.models.config.errors import UserError
 
 COUNT = 1000
 

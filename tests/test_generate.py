@@ -4,11 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.disturbances import GaussMarkovCurrent, OrnsteinUhlenbeckWrench
-from spinndrift.models.errors import UserError
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.training.generate import GenerateConfig, generate
-from spinndrift.training.maneuvers import MANEUVERS, maneuver_wrench
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.data.generate import GenerateConfig, generate
+from spinndrift.training.data.maneuvers import MANEUVERS, maneuver_wrench
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 SHORT = GenerateConfig(trajectories=2, duration=1.0, substeps=4)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from diagonal import Diagonal, simulated
 
-from spinndrift.models.errors import UserError
-from spinndrift.training.groups import (
+from spinndrift.models.config.errors import UserError
+from spinndrift.training.data.groups import (
     group_labels,
     group_size,
     members,

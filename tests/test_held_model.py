@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from spinndrift.models.integrate import step
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.systems.held_model import HeldModel
-from spinndrift.systems.mppi_config import MppiConfig
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.systems.planning.mppi_config import MppiConfig
+from spinndrift.systems.plant.frozen_coefficients import HeldModel
 
 RNG = np.random.default_rng(0)
 

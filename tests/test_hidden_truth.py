@@ -25,11 +25,11 @@ from hidden.vehicle import GRAVITY, Vehicle
 from hidden.write import write_folder
 
 from helpers import ROOT, run_python
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.dynamics import Flow
-from spinndrift.models.errors import UserError
-from spinndrift.models.recording_csv import read_csv
+from spinndrift.models.recordings.csv import read_csv
 from spinndrift.models.thruster_curves import RESTING
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 
 SMALL = Plan(scenarios=4, runs=1, seconds=2.0, h=0.01)
 EVERYTHING = [*CAUSES, *UNKNOWN]

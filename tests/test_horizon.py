@@ -6,14 +6,19 @@ import pytest
 
 from spinndrift.models.effects import KINDS, Extended
 from spinndrift.models.effects.thrust import AxisThrust
-from spinndrift.models.recording import Recording
-from spinndrift.models.recording_build import Trajectory
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.training.diagnosis.diagnose import DiagnoseConfig, Diagnoser
-from spinndrift.training.diagnosis.horizon import fit_forecasts, forecast_errors, rmse, windows
-from spinndrift.training.diagnosis.innovations import substeps
-from spinndrift.training.diagnosis.looking import Bench
-from spinndrift.training.diagnosis.search import refitted
+from spinndrift.models.recordings.build import Trajectory
+from spinndrift.models.recordings.store import Recording
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.diagnosis.filter.innovations import substeps
+from spinndrift.training.diagnosis.filter.problem import Bench
+from spinndrift.training.diagnosis.pipeline import DiagnoseConfig, Diagnoser
+from spinndrift.training.diagnosis.selection.multi_step_fit import (
+    fit_forecasts,
+    forecast_errors,
+    rmse,
+    windows,
+)
+from spinndrift.training.diagnosis.selection.search import refitted
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 DT, STEPS, RUNS = 0.1, 160, 4

@@ -22,15 +22,19 @@ from spinndrift.models.effects.thrust import (
     ThrustOffset,
     ThrustTable,
 )
-from spinndrift.models.recording import Recording
-from spinndrift.models.recording_build import Trajectory, assemble
+from spinndrift.models.recordings.build import Trajectory, assemble
+from spinndrift.models.recordings.store import Recording
 from spinndrift.models.thruster_curves import RESTING
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.training.diagnosis.identify import coefficients, identify, with_coefficients
-from spinndrift.training.diagnosis.looking import Bench
-from spinndrift.training.diagnosis.noise import estimate
-from spinndrift.training.diagnosis.ratios import ratios
-from spinndrift.training.diagnosis.transition import Transition
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.diagnosis.filter.noise import estimate
+from spinndrift.training.diagnosis.filter.problem import Bench
+from spinndrift.training.diagnosis.filter.transition import Transition
+from spinndrift.training.diagnosis.findings.ratios import ratios
+from spinndrift.training.diagnosis.selection.refit_all import (
+    coefficients,
+    identify,
+    with_coefficients,
+)
 
 MASS, INERTIA, FULL, ARM = 10.5, 0.2681, 51.48, 0.25
 DRAG = np.array([48.28, 62.08, 68.98, 7.076, 7.076, 7.076])

@@ -9,12 +9,12 @@ from pydrake.systems.primitives import ConstantVectorSource
 from scipy.linalg import logm
 
 from spinndrift.models import se3
-from spinndrift.models.errors import UserError
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.integrate import step
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.systems.impedance import Impedance, ImpedanceGains, ImpedanceLaw
-from spinndrift.systems.plan import Plan, PlanLayout
-from spinndrift.systems.wrench_limits import BoxLimits, ThrusterLimits
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.systems.controllers.impedance import Impedance, ImpedanceGains, ImpedanceLaw
+from spinndrift.systems.planning.plan import Plan, PlanLayout
+from spinndrift.systems.plant.wrench_limits import BoxLimits, ThrusterLimits
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 DYNAMICS = VEHICLE.dynamics()

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from spinndrift.models.sensors import Imu
-from spinndrift.systems.filtering.inertial import FEW, LEFT_OPEN, Motion, Samples, take
+from spinndrift.systems.estimation.inertial import FEW, LEFT_OPEN, Motion, Samples, take
 
 IMU = Imu()
 T = 1 / IMU.rate

@@ -6,16 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.training.generate import GenerateConfig, generate
-from spinndrift.training.innovations import (
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.data.generate import GenerateConfig, generate
+from spinndrift.training.data.windows import make_windows
+from spinndrift.training.fitting.one_step_errors import (
     Steps,
     correlation,
     likely_diffusion,
     whitened,
     whitening,
 )
-from spinndrift.training.windows import make_windows
 
 B = (1.0, 1.5, 0.7, 0.05, 0.08, 0.04)
 SUBSTEPS = 2

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from spinndrift.models import se3
-from spinndrift.training.geodesic import relative_log
-from spinndrift.training.kernels import (
+from spinndrift.training.losses.geodesic import relative_log
+from spinndrift.training.losses.kernels import (
     KERNELS,
     ChordalKernel,
     GeodesicKernel,

@@ -9,10 +9,10 @@ from killing import killed, litter
 from motion import smooth_motion
 from test_cli import TINY, called
 
-from spinndrift.models import config as yaml
-from spinndrift.models.checkpoint import load_model
-from spinndrift.models.owned import MARKER
-from spinndrift.models.recording import Recording, Trajectory
+from spinndrift.models.config import typed_yaml as yaml
+from spinndrift.models.files.checkpoint import load_model
+from spinndrift.models.files.owned import MARKER
+from spinndrift.models.recordings.store import Recording, Trajectory
 from spinndrift.sims import learning
 
 PREPARE = """

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from motion import smooth_motion
 
-from spinndrift.models.kinematics import agreement, contradictions, dead_reckoned
-from spinndrift.models.resample import conjugate, rotate
+from spinndrift.models.recordings.kinematics import agreement, contradictions, dead_reckoned
+from spinndrift.models.recordings.resample import conjugate, rotate
 
 T = np.arange(0.0, 20.0, 0.05)
 

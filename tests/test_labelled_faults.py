@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from helpers import ROOT, load_example, run_script, shared_data
-from spinndrift.models.errors import UserError
+from spinndrift.models.config.errors import UserError
 
 example = load_example("labelled_faults")
 NAMES = ["time", "pwm1", "depth", "press", "voltage", "roll", "pitch", "w_yaw"]

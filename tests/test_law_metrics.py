@@ -8,8 +8,8 @@ from diagonal import Diagonal
 from scipy.optimize import linear_sum_assignment
 
 from spinndrift.models import se3
-from spinndrift.models.errors import UserError
-from spinndrift.training.law_metrics import (
+from spinndrift.models.config.errors import UserError
+from spinndrift.training.evaluation.law_metrics import (
     GroundMetric,
     LawSamples,
     compare_laws,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from helpers import module_files, run_python
+from helpers import ROOMS, module_files, run_python
 
 ALLOWED = {
     "models": {"models"},
@@ -85,3 +85,25 @@ def test_the_check_of_import_statements_sees_every_form(tmp_path: Path):
         "spinndrift.sims.cli.main",
         "pymavlink.mavutil",
     }
+
+
+@pytest.mark.smoke
+def test_modules_import_each_other_in_one_direction():
+    files = {name: path for room in ROOMS for name, path in module_files(room).items()}
+    arrows: dict[str, set[str]] = {}
+    for name, path in files.items():
+        reached = imported(name, path)
+        arrows[name] = {t if t in files else t.rpartition(".")[0] for t in reached}
+        arrows[name] = arrows[name] & files.keys() - {name}
+    done: set[str] = set()
+
+    def visit(name: str, way: tuple[str, ...]) -> None:
+        assert name not in way, " → ".join((*way[way.index(name) :], name))
+        if name not in done:
+            for target in sorted(arrows[name]):
+                visit(target, (*way, name))
+            done.add(name)
+
+    for name in sorted(files):
+        visit(name, ())
+    assert sum(map(len, arrows.values())) > len(files)

@@ -12,7 +12,7 @@ from thruster_examples import prompt_thrusters
 
 from spinndrift.models import integrate, se3
 from spinndrift.models.rigid_body import FossenDynamics, spatial_inertia
-from spinndrift.systems.learned_plant import LearnedPlant
+from spinndrift.systems.plant.learned_plant import LearnedPlant
 
 MASS, COM = 11.5, np.array([0.03, -0.02, 0.05])
 INERTIA = np.diag([0.26, 0.23, 0.37])

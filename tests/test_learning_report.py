@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.demo import _compared, _task
-from spinndrift.sims.figures_learning import learning_figure, stretches
-from spinndrift.sims.learning_report import AXES, scale_words, taken_words
-from spinndrift.sims.scenario import load_scenario
-from spinndrift.training.fit import TrainingResult
+from spinndrift.sims.reports.figures_learning import learning_figure, stretches
+from spinndrift.sims.reports.learning_report import AXES, scale_words, taken_words
+from spinndrift.sims.scenarios.scenario import load_scenario
+from spinndrift.training.fitting.fit import TrainingResult
 
 MODEL = load_vehicle("bluerov2_heavy").dynamics()
 STEPS = np.arange(200)

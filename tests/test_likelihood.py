@@ -11,12 +11,12 @@ from jax.flatten_util import ravel_pytree
 
 from spinndrift.models.euclidean import create_spinn
 from spinndrift.models.spinn import SpinnConfig
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.config import DriftConfig
-from spinndrift.training.constants import constants
-from spinndrift.training.generate import GenerateConfig, generate
-from spinndrift.training.likelihood import fit_innovations
-from spinndrift.training.windows import make_windows
+from spinndrift.training.data.generate import GenerateConfig, generate
+from spinndrift.training.data.windows import make_windows
+from spinndrift.training.fitting.constants import constants
+from spinndrift.training.fitting.likelihood import fit_innovations
 
 B = (1.0, 1.0, 1.0, 0.05, 0.05, 0.05)
 SUBSTEPS = 2

@@ -6,11 +6,10 @@ from hidden.draw import draw
 from hidden.scenarios import Plan
 from hidden.simulator import Noise as Hidden
 
-from spinndrift.models.recording_csv import read_csv
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.training.diagnosis.diagnose import Diagnoser
-from spinndrift.training.diagnosis.likely_noise import beside_pushes
-from spinndrift.training.diagnosis.noise import (
+from spinndrift.models.recordings.csv import read_csv
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.diagnosis.filter.likely_noise import beside_pushes
+from spinndrift.training.diagnosis.filter.noise import (
     Noise,
     estimate,
     filtered,
@@ -18,7 +17,8 @@ from spinndrift.training.diagnosis.noise import (
     process_covariance,
     unit_processes,
 )
-from spinndrift.training.diagnosis.transition import Transition
+from spinndrift.training.diagnosis.filter.transition import Transition
+from spinndrift.training.diagnosis.pipeline import Diagnoser
 
 DT, MASS = 0.05, np.diag([20.0, 20.0, 30.0, 0.4, 0.4, 0.5])
 A = np.eye(12)

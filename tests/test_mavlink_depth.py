@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from spinndrift.systems.logs.depth import CROSSOVER, crossover, in_water
+from spinndrift.systems.logs.signals import Series
 from spinndrift.systems.mavlink import codec
-from spinndrift.systems.mavlink.depth import CROSSOVER, crossover, in_water
-from spinndrift.systems.mavlink.signals import Series
 
 DENSITY = 1024.0
 EXCESS = codec.pascal_per_metre(density=DENSITY) / codec.pascal_per_metre()

@@ -22,9 +22,9 @@ from pymavlink import DFReader, mavutil
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from helpers import ROOT, shared_data
-from spinndrift.models.errors import UserError
-from spinndrift.models.kinematics import agreement
-from spinndrift.models.resample import (
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.recordings.kinematics import agreement
+from spinndrift.models.recordings.resample import (
     conjugate,
     continuous,
     linear,
@@ -34,14 +34,14 @@ from spinndrift.models.resample import (
     slerp,
 )
 from spinndrift.sims.cli import main
+from spinndrift.systems.logs.cut_tlog import cut_tlog
+from spinndrift.systems.logs.dataflash import read_bin
+from spinndrift.systems.logs.load import LogOptions, import_log, load_data, own_rate
+from spinndrift.systems.logs.log_bytes import read_log_bytes
+from spinndrift.systems.logs.packets import scan
+from spinndrift.systems.logs.signals import Series, Signals
+from spinndrift.systems.logs.tlog import read_tlog
 from spinndrift.systems.mavlink import codec
-from spinndrift.systems.mavlink.cut_tlog import cut_tlog
-from spinndrift.systems.mavlink.log_bytes import read_log_bytes
-from spinndrift.systems.mavlink.logs import LogOptions, import_log, load_data, own_rate
-from spinndrift.systems.mavlink.logs_bin import read_bin
-from spinndrift.systems.mavlink.logs_tlog import read_tlog
-from spinndrift.systems.mavlink.packets import scan
-from spinndrift.systems.mavlink.signals import Series, Signals
 
 DEMO = ROOT / "sims" / "data" / "sitl_dive.tlog.xz"
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from spinndrift.models import integrate
-from spinndrift.models.checkpoint import load_model, save_model
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.disturbances import OrnsteinUhlenbeckWrench
-from spinndrift.models.errors import UserError
+from spinndrift.models.files.checkpoint import load_model, save_model
 from spinndrift.models.mean_reverting import MeanReverting
 from spinndrift.models.spinn import Spinn, SpinnConfig
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.systems.station_config import StationConfig
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.systems.station.config import StationConfig
 from spinndrift.training.predict import predict
 
 B = np.array([2.0, 2.0, 2.0, 0.2, 0.2, 0.2])

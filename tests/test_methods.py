@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 
-from spinndrift.models import config as yaml
-from spinndrift.models.errors import UserError
+from spinndrift.models.config import typed_yaml as yaml
+from spinndrift.models.config.errors import UserError
 from spinndrift.sims.commands.train import Train
 from spinndrift.training.config import TrainingConfig
-from spinndrift.training.losses import Fdm, Mse
+from spinndrift.training.losses.matching import Fdm, Mse
 from spinndrift.training.methods import METHODS, method_config
 
 

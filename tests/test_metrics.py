@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from run_example import ESTIMATE_ERROR, GOAL, example_log
 
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.sims.criteria import FollowPath, Outcome, ReachGoal
-from spinndrift.sims.estimate import average_bound, estimate_error, mahalanobis, nees_words
-from spinndrift.sims.metrics import clearance, metrics, tracking_error
-from spinndrift.sims.run_log import RunLog
-from spinndrift.systems.obstacles import Pylon
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.sims.run.estimate import average_bound, estimate_error, mahalanobis, nees_words
+from spinndrift.sims.run.log import RunLog
+from spinndrift.sims.run.metrics import clearance, metrics, tracking_error
+from spinndrift.sims.scenarios.criteria import FollowPath, Outcome, ReachGoal
+from spinndrift.systems.planning.obstacles import Pylon
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 REACHED = Outcome("goal", 20.0, "There.")

@@ -12,10 +12,10 @@ from diagonal import Diagonal, simulated
 
 from spinndrift.models import se3
 from spinndrift.training.config import TrainingConfig
-from spinndrift.training.fit import fit
-from spinndrift.training.groups import whole_groups
-from spinndrift.training.moments import Moments, group_mean, pooled, pose_moments
-from spinndrift.training.objective import Batch
+from spinndrift.training.data.groups import whole_groups
+from spinndrift.training.fitting.fit import fit
+from spinndrift.training.losses.base import Batch
+from spinndrift.training.losses.moments import Moments, group_mean, pooled, pose_moments
 
 TRUTH = Diagonal.of(mass=10.0, drag=8.0, diffusion=2.0)
 mean_of = jax.jit(group_mean)

@@ -15,18 +15,18 @@ from pydrake.systems.primitives import ConstantVectorSource, RandomSource
 from scipy.linalg import solve_discrete_lyapunov
 
 from spinndrift.models import se3
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects import Extended, kind
-from spinndrift.models.errors import UserError
 from spinndrift.models.integrate import rollout
 from spinndrift.models.rigid_body import FossenDynamics
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.systems.impedance import ImpedanceGains
-from spinndrift.systems.mppi import FIGURES, Mppi, key_from_gaussians
-from spinndrift.systems.mppi_config import MppiConfig
-from spinndrift.systems.mppi_core import MppiPlanner, MppiState, command_of_felt
-from spinndrift.systems.obstacles import Cylinders, Pylon, SphereHull
-from spinndrift.systems.plan_samples import SampleLayout
-from spinndrift.systems.wrench_limits import BoxLimits, ThrusterLimits
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.systems.controllers.impedance import ImpedanceGains
+from spinndrift.systems.planning.mppi import FIGURES, Mppi, key_from_gaussians
+from spinndrift.systems.planning.mppi_config import MppiConfig
+from spinndrift.systems.planning.mppi_core import MppiPlanner, MppiState, command_of_felt
+from spinndrift.systems.planning.obstacles import Cylinders, Pylon, SphereHull
+from spinndrift.systems.planning.plan_samples import SampleLayout
+from spinndrift.systems.plant.wrench_limits import BoxLimits, ThrusterLimits
 
 HULL = SphereHull.cover((0.4, 0.4, 0.3), (1, 1))
 MASS = np.diag([20.0, 20.0, 20.0, 1.0, 1.0, 1.0])

@@ -7,13 +7,13 @@ import h5py
 import pytest
 
 from helpers import run_python
-from spinndrift.models.errors import UserError
-from spinndrift.models.netcdf import load_netcdf
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.files.netcdf import load_netcdf
 
 READ = """
 import sys
-from spinndrift.models.errors import UserError
-from spinndrift.models.netcdf import load_netcdf
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.files.netcdf import load_netcdf
 try:
     load_netcdf(sys.argv[1])
 except UserError as error:

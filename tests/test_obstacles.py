@@ -18,9 +18,9 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from spinndrift.models import se3
-from spinndrift.models.config import loads
-from spinndrift.models.errors import UserError
-from spinndrift.systems.obstacles import BoxHull, Cylinders, Pylon, SphereHull
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.config.typed_yaml import loads
+from spinndrift.systems.planning.obstacles import BoxHull, Cylinders, Pylon, SphereHull
 
 SIZE = (0.457, 0.575, 0.254)
 PYLONS = [Pylon(1.5, -0.65), Pylon(3.0, 0.4, diameter=0.5, bottom=-3.0, top=-0.5)]

@@ -9,8 +9,8 @@ from typing import get_args, get_type_hints
 import pytest
 
 from helpers import ROOT
-from spinndrift.models.checks import range_of
-from spinndrift.models.errors import UserError
+from spinndrift.models.config.checks import range_of
+from spinndrift.models.config.errors import UserError
 from spinndrift.sims import cli
 from spinndrift.sims.commands.check import CheckDiagnosis
 from spinndrift.sims.commands.check_estimator import CheckEstimator
@@ -68,7 +68,7 @@ def filled(hint, value):
 @pytest.mark.parametrize(("command", "name", "hint"), OPTIONS)
 def test_numbers_beyond_an_option_are_refused_by_its_name(command, name, hint):
     limit = range_of(hint)
-    assert limit is not None, f"{name} states no range (`models.checks.Within`)"
+    assert limit is not None, f"{name} states no range (`models.config.checks.Within`)"
     for value in WRONG[kind(hint)]:
         changed = dataclasses.replace(command, **{name: filled(hint, value)})
         option = "--" + name.replace("_", "-")

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from spinndrift.models.errors import UserError
-from spinndrift.models.locks import BusyError, locked
-from spinndrift.models.owned import (
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.files.locks import BusyError, locked
+from spinndrift.models.files.owned import (
     MARKER,
     FolderKind,
     ForeignError,
@@ -28,7 +28,7 @@ OTHER = FolderKind("dive", ("log.nc",))
 HOLD = """
 import sys, time
 from pathlib import Path
-from spinndrift.models.owned import FolderKind, run_folder
+from spinndrift.models.files.owned import FolderKind, run_folder
 with run_folder(sys.argv[1], FolderKind(sys.argv[2], ("log.nc",))) as folder:
     (folder / "log.nc").write_text("half")
     print("held", flush=True)

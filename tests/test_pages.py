@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure as Plot
 
-from spinndrift.models.errors import UserError
-from spinndrift.sims.pages import Page, marked, shown
+from spinndrift.models.config.errors import UserError
+from spinndrift.sims.reports.pages import Page, marked, shown
 
 pytestmark = pytest.mark.smoke
 

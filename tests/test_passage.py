@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from spinndrift.systems.obstacles import Pylon
-from spinndrift.systems.passage import Passage, upright_gap, widest_way
+from spinndrift.systems.planning.obstacles import Pylon
+from spinndrift.systems.planning.passage import Passage, upright_gap, widest_way
 
 SIZE = (0.45, 0.6, 0.25)
 HALF = 0.45 / 2  # the hull's narrower side

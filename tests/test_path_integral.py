@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from spinndrift.systems import path_integral
-from spinndrift.systems.path_integral import combine_risk, effective_count, spline_basis
+from spinndrift.systems.planning import path_integral
+from spinndrift.systems.planning.path_integral import combine_risk, effective_count, spline_basis
 
 path_integral_weights = jax.jit(path_integral.path_integral_weights, static_argnums=1)
 chance_violation = jax.jit(path_integral.chance_violation, static_argnums=(1, 2))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from spinndrift.models import se3
-from spinndrift.systems.plan import Plan, PlanLayout
-from spinndrift.systems.plan_samples import SampleLayout
+from spinndrift.systems.planning.plan import Plan, PlanLayout
+from spinndrift.systems.planning.plan_samples import SampleLayout
 
 LAYOUT = PlanLayout(4, 0.5)
 at_time = jax.jit(LAYOUT.at)

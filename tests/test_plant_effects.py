@@ -12,19 +12,19 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 from thruster_examples import prompt_thrusters
 
-from spinndrift.models import config as yaml
 from spinndrift.models import integrate, se3
+from spinndrift.models.config import typed_yaml as yaml
 from spinndrift.models.effects.extended import Extended
 from spinndrift.models.effects.library import kind
 from spinndrift.models.effects.unknown import Unknown
 from spinndrift.models.rigid_body import FossenDynamics
-from spinndrift.systems.compiled import CompiledSimulator
-from spinndrift.systems.learned_plant import LearnedPlant
-from spinndrift.systems.mppi_config import MppiConfig
-from spinndrift.systems.mppi_core import MppiPlanner
-from spinndrift.systems.obstacles import Cylinders, SphereHull
-from spinndrift.systems.station_config import StationConfig
-from spinndrift.systems.wrench_limits import BoxLimits
+from spinndrift.systems.compiled.simulator import CompiledSimulator
+from spinndrift.systems.planning.mppi_config import MppiConfig
+from spinndrift.systems.planning.mppi_core import MppiPlanner
+from spinndrift.systems.planning.obstacles import Cylinders, SphereHull
+from spinndrift.systems.plant.learned_plant import LearnedPlant
+from spinndrift.systems.plant.wrench_limits import BoxLimits
+from spinndrift.systems.station.config import StationConfig
 
 MASS, PUSH, TAU, DELAY = 20.0, 10.0, 0.2, 0.13
 LAG = kind("thruster_lag").of(time_constant=TAU)

@@ -9,8 +9,8 @@ from thruster_examples import prompt_thrusters
 from spinndrift.models import se3
 from spinndrift.models.effects.extended import Extended
 from spinndrift.models.effects.library import kind
-from spinndrift.models.effects.played import Commands, play
 from spinndrift.models.effects.recent import Recent
+from spinndrift.models.effects.recorded_rollout import Commands, play
 from spinndrift.models.rigid_body import FossenDynamics
 from spinndrift.training.predict import predict, predict_drift
 

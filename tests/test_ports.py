@@ -14,15 +14,15 @@ from pydrake.systems.framework import LeafSystem
 from helpers import ROOT, module_files
 from spinndrift.models.disturbances import Combined
 from spinndrift.models.sensors import Imu
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.systems.disturbance_observer import MomentumObserver
-from spinndrift.systems.impedance import ImpedanceLaw
-from spinndrift.systems.mppi_config import MppiConfig
-from spinndrift.systems.mppi_core import MppiPlanner
-from spinndrift.systems.obstacles import Cylinders, SphereHull
-from spinndrift.systems.paths import HoldPose, PoseConfig
-from spinndrift.systems.plan import PlanLayout
-from spinndrift.systems.wrench_limits import ThrusterLimits
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.systems.controllers.impedance import ImpedanceLaw
+from spinndrift.systems.estimation.disturbance_observer import MomentumObserver
+from spinndrift.systems.planning.mppi_config import MppiConfig
+from spinndrift.systems.planning.mppi_core import MppiPlanner
+from spinndrift.systems.planning.obstacles import Cylinders, SphereHull
+from spinndrift.systems.planning.paths import HoldPose, PoseConfig
+from spinndrift.systems.planning.plan import PlanLayout
+from spinndrift.systems.plant.wrench_limits import ThrusterLimits
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 

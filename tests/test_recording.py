@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from spinndrift.models.errors import UserError
-from spinndrift.models.recording import Recording
-from spinndrift.models.recording_build import Trajectory
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.recordings.build import Trajectory
+from spinndrift.models.recordings.store import Recording
+from spinndrift.models.recordings.summary import summarize
 
 DT = 0.05
 
@@ -99,7 +100,7 @@ def test_a_channel_may_lack_throughout_a_run_only():
     lacking.V_WB_B[:, :2] = np.nan
     made = Recording.from_trajectories([trajectory(seed=0), lacking], DT)
     assert made.missing == {"X_WB": ("x", "y"), "V_WB_B": ("u", "v")}
-    assert "missing in at least one run: x, y of X_WB" in made.summary()
+    assert "missing in at least one run: x, y of X_WB" in summarize(made)
     assert recording().missing == {}
 
 

@@ -8,11 +8,11 @@ import pytest
 from motion import smooth_motion
 
 from helpers import ROOT, shared_data
-from spinndrift.models.errors import UserError
-from spinndrift.models.recording import Recording
-from spinndrift.models.recording_build import Trajectory
-from spinndrift.models.recording_csv import read_csv, write_csv
-from spinndrift.training.windows import make_windows
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.recordings.build import Trajectory
+from spinndrift.models.recordings.csv import read_csv, write_csv
+from spinndrift.models.recordings.store import Recording
+from spinndrift.training.data.windows import make_windows
 
 T = np.arange(0.0, 5.0, 0.05)
 STATE = "t,x,y,z,qw,qx,qy,qz,u,v,w,p,q,r"

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from spinndrift.models import se3
-from spinndrift.models.config import loads
-from spinndrift.models.errors import UserError
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.config.typed_yaml import loads
 from spinndrift.models.integrate import step
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.systems.controllers import TrackReference
-from spinndrift.systems.disturbance_observer import MomentumObserver
-from spinndrift.systems.paths import FigureEight, HoldPose, PoseConfig, Waypoints
-from spinndrift.systems.plan import PlanLayout
-from spinndrift.systems.reference import Reference, feedforward
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.systems.controllers.kinds import TrackReference
+from spinndrift.systems.estimation.disturbance_observer import MomentumObserver
+from spinndrift.systems.planning.paths import FigureEight, HoldPose, PoseConfig, Waypoints
+from spinndrift.systems.planning.plan import PlanLayout
+from spinndrift.systems.planning.reference import Reference, feedforward
 
 PATHS = {
     "hold": HoldPose(PoseConfig((1.0, 2.0, -1.0), (5.0, -3.0, 120.0))),

@@ -7,10 +7,10 @@ import pytest
 from hidden.draw import draw
 from hidden.scenarios import Plan
 
-from spinndrift.models.recording_csv import read_csv
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.training.diagnosis.data import make_data
-from spinndrift.training.diagnosis.repeats import repeating, repeats, shares
+from spinndrift.models.recordings.csv import read_csv
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.diagnosis.data.arrays import make_data
+from spinndrift.training.diagnosis.data.repeats import repeating, repeats, shares
 
 
 @pytest.fixture(scope="module")

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from run_example import GOAL, example_log
 
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.sims import figures_path, figures_time
-from spinndrift.sims.criteria import FollowPath, Outcome, ReachGoal
-from spinndrift.sims.figures_path import Scene
-from spinndrift.sims.meshcat_replay import write_replay
-from spinndrift.sims.metrics import clearance, metrics
-from spinndrift.sims.report import run_page
-from spinndrift.systems.mppi import FIGURES
-from spinndrift.systems.obstacles import Pylon
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.sims.reports import figures_path, figures_time
+from spinndrift.sims.reports.figures_path import Scene
+from spinndrift.sims.reports.meshcat_replay import write_replay
+from spinndrift.sims.reports.run_report import run_page
+from spinndrift.sims.run.metrics import clearance, metrics
+from spinndrift.sims.scenarios.criteria import FollowPath, Outcome, ReachGoal
+from spinndrift.systems.planning.mppi import FIGURES
+from spinndrift.systems.planning.obstacles import Pylon
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 PYLONS = (Pylon(1.5, -1.2, 0.4, name="near pylon"), Pylon(3.0, 0.2, 0.4))

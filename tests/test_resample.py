@@ -5,7 +5,7 @@ import numpy as np
 from motion import smooth_motion
 
 from spinndrift.models import se3
-from spinndrift.models.resample import (
+from spinndrift.models.recordings.resample import (
     continuous,
     geodesic,
     grid,

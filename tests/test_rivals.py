@@ -7,15 +7,15 @@ import pytest
 from jaxtyping import Array
 
 from spinndrift.models.effects import Extended
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.sims.check import run as running
-from spinndrift.sims.check.cases import Case, Truth
-from spinndrift.sims.check.judging import Judgement
-from spinndrift.sims.check.rivals import Rival, labels, sparse, terms
-from spinndrift.sims.check.tables import tables
-from spinndrift.training.diagnosis.blackbox import arguments
-from spinndrift.training.diagnosis.data import Data
-from spinndrift.training.diagnosis.forecast import forecast
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.sims.diagnosis_benchmark import run as running
+from spinndrift.sims.diagnosis_benchmark.cases import Case, Truth
+from spinndrift.sims.diagnosis_benchmark.judging import Judgement
+from spinndrift.sims.diagnosis_benchmark.rivals import Rival, labels, sparse, terms
+from spinndrift.sims.diagnosis_benchmark.tables import tables
+from spinndrift.training.diagnosis.data.arrays import Data
+from spinndrift.training.diagnosis.validation.blackbox import arguments
+from spinndrift.training.diagnosis.validation.forecast import forecast
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 DIRECTIONS = np.asarray(VEHICLE.thrusters().directions)

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from killing import killed, litter
 
-from spinndrift.models import config
-from spinndrift.models.errors import UserError
-from spinndrift.models.owned import MARKER
-from spinndrift.models.recording import Recording
-from spinndrift.sims import run_folder
+from spinndrift.models.config import typed_yaml
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.files.owned import MARKER
+from spinndrift.models.recordings.store import Recording
 from spinndrift.sims.cli import main
-from spinndrift.sims.run_folder import new_folder, write_run
-from spinndrift.sims.run_log import RunLog
-from spinndrift.sims.run_loop import simulate, simulate_seeds
-from spinndrift.sims.run_signals import mean_over
-from spinndrift.sims.scenario import Scenario, load_scenario, overridden
+from spinndrift.sims.run import folder as run_folder
+from spinndrift.sims.run.folder import new_folder, write_run
+from spinndrift.sims.run.log import RunLog
+from spinndrift.sims.run.loop import simulate, simulate_seeds
+from spinndrift.sims.run.signals import mean_over
+from spinndrift.sims.scenarios.scenario import Scenario, load_scenario, overridden
 from spinndrift.systems.closed_loop import Signal
 
 CROSSING = """
@@ -32,7 +32,7 @@ controller:
 EXAMPLE = """
 from run_example import example_log
 from spinndrift.sims import run_loop
-from spinndrift.sims.criteria import Outcome
+from spinndrift.sims.scenarios.criteria import Outcome
 made = example_log(2.0, planned=False), Outcome("duration", 2.0, "over"), run_loop.Timing()
 run_loop.simulate = lambda scenario, *_, **__: run_loop.Run(scenario, *made)
 """
@@ -106,7 +106,7 @@ def test_folder_is_whole(crossing, tmp_path):
     assert {path.name for path in (tmp_path / "run").iterdir()} == names
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     text = (tmp_path / "run" / "scenario.yaml").read_text(encoding="utf-8")
-    assert config.loads(Scenario, text) == crossing.scenario
+    assert typed_yaml.loads(Scenario, text) == crossing.scenario
     told = json.loads((tmp_path / "run" / "metrics.json").read_text(encoding="utf-8"))
     assert told == values
     assert told["seed"] == crossing.scenario.seed
@@ -208,7 +208,7 @@ def test_a_ringed_goal_is_said_and_the_vehicle_stays(crossing, tmp_path):
         f"{{x: {4.5 + np.cos(a):.3f}, y: {-2 + np.sin(a):.3f}, diameter: 0.35}}" for a in angles
     )
     text = f"{{duration: 0.5, station: {{disturbance_set: still, obstacles: [{pylons}]}}}}"
-    base = config.dump(crossing.scenario)
+    base = typed_yaml.dump(crossing.scenario)
     run = simulate(overridden(base, text))
     assert run.outcome.reason == "no safe plan"
     found = re.search(r"every way .* risk of ([\d.]+) % or more, and 5 % is", run.outcome.sentence)
@@ -225,7 +225,7 @@ def test_a_ringed_goal_is_said_and_the_vehicle_stays(crossing, tmp_path):
 BAD = """
 import numpy as np
 from pydrake.systems.framework import LeafSystem
-from spinndrift.systems.plan import PlanLayout
+from spinndrift.systems.planning.plan import PlanLayout
 
 class Bad(LeafSystem):
     def __init__(self, start: float = -1.0, plan: bool = False):
@@ -288,7 +288,7 @@ def test_a_plan_that_is_judged_has_to_be_told(tmp_path):
 
 def test_whose_code_runs_is_said_before(tmp_path, capsys):
     scenario = tmp_path / "mine.yaml"
-    scenario.write_text(config.dump(_bad(tmp_path, "Missing")))
+    scenario.write_text(typed_yaml.dump(_bad(tmp_path, "Missing")))
     with pytest.raises(SystemExit):
         main(["run", str(scenario), "--quiet", "--out", str(tmp_path / "out")])
     said, refused = capsys.readouterr().err.splitlines()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from run_example import example_log
 
-from spinndrift.models.recording import Recording
-from spinndrift.sims.run_log import RunLog
+from spinndrift.models.recordings.store import Recording
+from spinndrift.sims.run.log import RunLog
 
 
 def test_log_survives_its_file(tmp_path):

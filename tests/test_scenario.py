@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spinndrift.models import config
-from spinndrift.models.effects.by_hand import EffectConfig, check_distinct
-from spinndrift.models.errors import UserError
-from spinndrift.sims.criteria import FollowPath, ReachGoal
-from spinndrift.sims.run_loop import simulate
-from spinndrift.sims.scenario import Scenario, load_scenario, overridden, scenario_names
-from spinndrift.systems.controllers import MppiImpedance, TrackReference
+from spinndrift.models.config import typed_yaml
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.effects.effect_config import EffectConfig, check_distinct
+from spinndrift.sims.run.loop import simulate
+from spinndrift.sims.scenarios.criteria import FollowPath, ReachGoal
+from spinndrift.sims.scenarios.scenario import Scenario, load_scenario, overridden, scenario_names
+from spinndrift.systems.controllers.kinds import MppiImpedance, TrackReference
 
 SMALL = """
 planner: {horizon: 10, sequences: 16, realisations: 1, knots: [2], effective_samples: 4,
@@ -38,7 +38,7 @@ def test_shipped_scenarios_are_whole(name):
     scenario = load_scenario(name)
     assert scenario.name == name
     assert scenario.description
-    assert config.loads(Scenario, config.dump(scenario)) == scenario
+    assert typed_yaml.loads(Scenario, typed_yaml.dump(scenario)) == scenario
     assert scenario.station.disturbance_set in name
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from spinndrift.models import se3
-from spinndrift.training.kernels import ChordalKernel, GeodesicKernel, VelocityKernel
-from spinndrift.training.scores import kernel_score, partners, shifts, time_pairs
+from spinndrift.training.losses.kernels import ChordalKernel, GeodesicKernel, VelocityKernel
+from spinndrift.training.losses.scores import kernel_score, partners, shifts, time_pairs
 
 N, P, W = 2, 8, 4000
 SPREAD = jnp.asarray([0.1, 0.2, 0.3, 0.1, 0.2, 0.3])

@@ -11,15 +11,16 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
-from spinndrift.models import config, se3
-from spinndrift.models.errors import UserError
+from spinndrift.models import se3
+from spinndrift.models.config import typed_yaml
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu, Sensor, SensorFault
 from spinndrift.models.sensors.faults import VALUES, FaultySensor
 from spinndrift.systems.closed_loop import Signal, logged, seeded
-from spinndrift.systems.compiled import CompiledSimulator
-from spinndrift.systems.sensor_suite import NAMES, SensorSuite
-from spinndrift.systems.station import add_noise
-from spinndrift.systems.station_config import Sensing, StationConfig
+from spinndrift.systems.compiled.simulator import CompiledSimulator
+from spinndrift.systems.plant.sensor_suite import NAMES, SensorSuite
+from spinndrift.systems.station.config import Sensing, StationConfig
+from spinndrift.systems.station.simulated import add_noise
 
 SENSORS: dict[str, Sensor] = {
     "imu": Imu(),
@@ -259,13 +260,13 @@ def test_a_suite_with_faults_is_the_suite_without_but_for_them():
 def test_a_scenario_names_faults():
     text = "faults: [{sensor: imu, fault: frozen, start: 10, duration: 1}, {sensor: dvl, fault: "
     text += "frozen, start: 5, duration: 20, components: [0]}, {sensor: depth, fault: nan}]"
-    found = config.loads(StationConfig, f"sensing: {{{text}}}")
+    found = typed_yaml.loads(StationConfig, f"sensing: {{{text}}}")
     assert found.sensing.faults == (
         SensorFault("imu", "frozen", 10.0, 1.0),
         SensorFault("dvl", "frozen", 5.0, 20.0, (0,)),
         SensorFault("depth", "nan"),
     )
-    assert config.loads(StationConfig, config.dump(found)) == found
+    assert typed_yaml.loads(StationConfig, typed_yaml.dump(found)) == found
     assert Sensing().faults == ()
 
 
@@ -290,7 +291,7 @@ def test_a_scenario_names_faults():
 )
 def test_what_makes_no_sense_is_refused_with_a_remedy(text, message):
     with pytest.raises(UserError, match=message):
-        config.loads(Sensing, f"faults: [{text}]")
+        typed_yaml.loads(Sensing, f"faults: [{text}]")
 
 
 def test_a_dvl_may_be_lost_most_of_the_time():

@@ -8,8 +8,8 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from spinndrift.models import se3
 from spinndrift.models.rigid_body import FossenDynamics, spatial_inertia
 from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu
-from spinndrift.systems.learned_plant import LearnedPlant
-from spinndrift.systems.sensor_suite import SensorSuite
+from spinndrift.systems.plant.learned_plant import LearnedPlant
+from spinndrift.systems.plant.sensor_suite import SensorSuite
 
 PORTS = ("imu", "dvl", "depth", "compass")
 X = np.asarray(se3.from_position_rpy(jnp.array([1.0, 2, -3]), jnp.array([0.1, -0.2, 0.7])))

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from spinndrift.models import config, se3
-from spinndrift.models.errors import UserError
+from spinndrift.models import se3
+from spinndrift.models.config import typed_yaml
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu, Sensor, wrap
 
 KEY = jax.random.key(3)
@@ -94,7 +95,7 @@ class TestContract:
 
     @pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: type(s).__name__)
     def test_text_and_back(self, sensor):
-        assert config.loads(type(sensor), config.dump(sensor)) == sensor
+        assert typed_yaml.loads(type(sensor), typed_yaml.dump(sensor)) == sensor
 
     @pytest.mark.parametrize(
         ("make", "field"),

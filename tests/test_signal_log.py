@@ -7,10 +7,10 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import PassThrough, SymbolicVectorSystem
 
 from spinndrift.systems.closed_loop import _truth, logged
-from spinndrift.systems.compiled import CompiledSimulator
-from spinndrift.systems.network import flatten, holders
-from spinndrift.systems.pure import Event, Pure, shown
-from spinndrift.systems.signal_log import Rows, SignalLog, add_log
+from spinndrift.systems.compiled.network import flatten, holders
+from spinndrift.systems.compiled.pure import Event, Pure, shown
+from spinndrift.systems.compiled.signal_log import Rows, SignalLog, add_log
+from spinndrift.systems.compiled.simulator import CompiledSimulator
 
 
 class Moves(LeafSystem):

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from spinndrift.models import config as typed_yaml
 from spinndrift.models import integrate, se3
-from spinndrift.models.errors import UserError
+from spinndrift.models.config import typed_yaml
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.rigid_body import FossenDynamics, spatial_inertia
 from spinndrift.models.spinn import Spinn, SpinnConfig
 

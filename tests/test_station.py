@@ -12,21 +12,21 @@ from pydrake.systems.analysis import MonteCarloSimulation, Simulator
 from pydrake.systems.framework import BasicVector, LeafSystem, System
 
 from helpers import ROOT
-from spinndrift.models.config import dump, loads
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.config.typed_yaml import dump, loads
 from spinndrift.models.disturbances import GaussMarkovCurrent
-from spinndrift.models.errors import UserError
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.systems.closed_loop import build_diagram, logged, seeded
-from spinndrift.systems.compiled import CompiledSimulator
-from spinndrift.systems.controllers import MppiImpedance, Own, Tracking, TrackReference
-from spinndrift.systems.filtering.delayed import EkfConfig
-from spinndrift.systems.health_gate import HealthGate
-from spinndrift.systems.mppi_config import MppiConfig
-from spinndrift.systems.obstacles import BoxHull, Cylinders, Pylon
-from spinndrift.systems.paths import HoldPose, PoseConfig
-from spinndrift.systems.pure import Event, Pure, shown
-from spinndrift.systems.station import make_station, station_ports
-from spinndrift.systems.station_config import Sensing, StationConfig
+from spinndrift.systems.compiled.pure import Event, Pure, shown
+from spinndrift.systems.compiled.simulator import CompiledSimulator
+from spinndrift.systems.controllers.health_gate import HealthGate
+from spinndrift.systems.controllers.kinds import MppiImpedance, Own, Tracking, TrackReference
+from spinndrift.systems.estimation.delayed import EkfConfig
+from spinndrift.systems.planning.mppi_config import MppiConfig
+from spinndrift.systems.planning.obstacles import BoxHull, Cylinders, Pylon
+from spinndrift.systems.planning.paths import HoldPose, PoseConfig
+from spinndrift.systems.station.config import Sensing, StationConfig
+from spinndrift.systems.station.simulated import make_station, station_ports
 
 START = PoseConfig((0.0, 0.0, -1.5))
 HARBOUR = StationConfig(disturbance_set="harbour", seed=3)

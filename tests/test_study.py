@@ -15,9 +15,9 @@ import xarray as xr
 from diagonal import Diagonal
 from killing import killed, litter
 
-from spinndrift.models import config as yaml
-from spinndrift.models.errors import UserError
-from spinndrift.models.owned import claim
+from spinndrift.models.config import typed_yaml as yaml
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.files.owned import claim
 from spinndrift.sims.cli import main
 from spinndrift.sims.fanout import run_here
 from spinndrift.sims.study import train
@@ -36,7 +36,7 @@ from spinndrift.sims.study.table import collect
 from spinndrift.sims.study.task import RunSettings, Task, make_tasks
 from spinndrift.sims.study.train import descended
 from spinndrift.sims.study.work import run_task
-from spinndrift.training.guard import TrainingError
+from spinndrift.training.fitting.guard import TrainingError
 from spinndrift.training.methods import METHODS, method_config
 
 TINY = scaled("tiny")

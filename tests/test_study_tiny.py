@@ -2,8 +2,8 @@
 
 import pytest
 
-from spinndrift.models.checkpoint import load_model
-from spinndrift.models.owned import MARKER
+from spinndrift.models.files.checkpoint import load_model
+from spinndrift.models.files.owned import MARKER
 from spinndrift.models.spinn import Spinn
 from spinndrift.sims.cli import main
 from spinndrift.sims.study.run import STUDY

@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from helpers import ROOT, load_example, run_script, shared_data
-from spinndrift.models.errors import UserError
-from spinndrift.models.recording_csv import read_csv
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.recordings.csv import read_csv
+from spinndrift.models.vehicles.vehicle import load_vehicle
 
 example = load_example("tank_runs")
 OFFSET = (0.1, -0.22, 0.6)  # rad

@@ -9,7 +9,7 @@ from scipy.optimize import linprog
 
 from spinndrift.models.thruster_curves import QuadraticCurve, T200Curve
 from spinndrift.models.thrusters import Thrusters
-from spinndrift.models.vehicle import load_vehicle, vehicle_names
+from spinndrift.models.vehicles.vehicle import load_vehicle, vehicle_names
 
 # ArduPilot, AP_Motors6DOF.cpp, VECTORED_6DOF: roll, pitch, yaw, throttle, forward, lateral
 FACTORS = np.array(

@@ -8,17 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from spinndrift.models.errors import UserError
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.euclidean import coordinates, create_spinn
-from spinndrift.models.vehicle import load_vehicle
-from spinndrift.training.distance_aware import DistanceAware, Unconstrained
-from spinndrift.training.euclidean import EuclideanFdm, predict_coordinates
-from spinndrift.training.fit import fit
-from spinndrift.training.guard import Diagnosis, TrainingError
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.data.windows import Windows
+from spinndrift.training.fitting.fit import fit
+from spinndrift.training.fitting.guard import Diagnosis, TrainingError
+from spinndrift.training.losses.base import Batch
+from spinndrift.training.losses.distance_aware_losses import DistanceAware, Unconstrained
+from spinndrift.training.losses.euclidean_losses import EuclideanFdm, predict_coordinates
 from spinndrift.training.methods import method_config
-from spinndrift.training.objective import Batch
 from spinndrift.training.predict import predict
-from spinndrift.training.windows import Windows
 
 STEPS, DT, GROUPS, RUNS = 6, 0.05, 3, 6
 NOISE = (2.0, 2.0, 2.0, 0.2, 0.2, 0.2)
@@ -85,7 +85,7 @@ def start(config):
 def quick(monkeypatch):
     """Compile fast; steps are few."""
     options = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-    monkeypatch.setattr("spinndrift.training.step.QUICK_COMPILE", options)
+    monkeypatch.setattr("spinndrift.training.fitting.step.QUICK_COMPILE", options)
 
 
 @pytest.mark.usefixtures("quick")
@@ -110,7 +110,7 @@ def test_a_few_steps_make_the_loss_smaller(name, windows):
 @pytest.mark.usefixtures("quick")
 def test_instability_ends_training_with_a_report(windows, monkeypatch):
     found = Diagnosis((), (), (), "motion runs away")  # what it looks for is tested with the guard
-    monkeypatch.setattr("spinndrift.training.fit.diagnose", lambda *_: found)
+    monkeypatch.setattr("spinndrift.training.fitting.fit.diagnose", lambda *_: found)
     config = replace(small("euclidean-unconstrained"), max_recoveries=1)
     with pytest.raises(TrainingError, match="step 1: motion runs away; more than 1 bad steps"):
         fit(config, start(config), replace(windows, V=1e25 * windows.V))

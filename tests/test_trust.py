@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu
-from spinndrift.systems.filtering.trust import (
+from spinndrift.systems.estimation.trust import (
     SIZES,
     Shown,
     Trust,

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from spinndrift.models import se3
-from spinndrift.models.config import dump, loads
-from spinndrift.models.errors import UserError
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.config.typed_yaml import dump, loads
+from spinndrift.models.config.yaml_text import Tagged, parse
 from spinndrift.models.integrate import rollout
-from spinndrift.models.vehicle import Vehicle, load_vehicle, vehicle_names
-from spinndrift.models.yaml_text import Tagged, parse
+from spinndrift.models.vehicles.vehicle import Vehicle, load_vehicle, vehicle_names
 
 VEHICLES = {name: load_vehicle(name) for name in vehicle_names()}
 AXES = {"surge": (0, 1), "sway": (1, 1), "down": (2, -1), "up": (2, 1), "yaw": (5, 1)}

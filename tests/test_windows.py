@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from spinndrift.models import se3
-from spinndrift.models.errors import UserError
-from spinndrift.models.recording import Recording
-from spinndrift.models.recording_build import Trajectory
-from spinndrift.training.windows import make_windows, split_windows
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.recordings.build import Trajectory
+from spinndrift.models.recordings.store import Recording
+from spinndrift.training.data.windows import make_windows, split_windows
 
 DT = 0.05
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spinndrift.models.errors import UserError
-from spinndrift.models.yaml_text import Tagged, emit, line_of, parse
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.config.yaml_text import Tagged, emit, line_of, parse
 
 pytestmark = pytest.mark.smoke
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from spinndrift.models.thruster_curves import T200Curve
 from spinndrift.models.thrusters import Thrusters
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 
 
 def prompt_thrusters(**settings: float) -> Thrusters:

@@ -1,12 +1,12 @@
-"""Settings of a training run, as YAML (`models.config`) and on the command line."""
+"""Settings of a training run, as YAML (`models.config.typed_yaml`) and on the command line."""
 
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ..models.checks import check_numbers, require
+from ..models.config.checks import check_numbers, require
 from ..models.spinn import SpinnConfig
-from .losses import Fdm
-from .objectives import ObjectiveConfig
+from .losses.kinds import ObjectiveConfig
+from .losses.matching import Fdm
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class PretrainConfig:
 
 @dataclass(frozen=True)
 class DriftConfig:
-    """Least squares on the output biases before the law is trained (`training.drift`)."""
+    """Least squares on the output biases before the law is trained (`training.fitting.drift`)."""
 
     iterations: int = 12
     """At most so many steps of each of two passes; 0 leaves the fit out."""
@@ -63,7 +63,8 @@ class DriftConfig:
     of the relative change of the potential's bound and net buoyancy, against the mean squared error
     in the units of what the model misses."""
     innovations: Literal["auto", "always", "never"] = "auto"
-    """Whether constants and b are fitted from sample to sample instead (`training.likelihood`): the
+    """Whether constants and b are fitted from sample to sample instead
+    (`training.fitting.likelihood`): the
     best there is for states that are known exactly, and misled by noise of measurement. `auto` does
     it where the innovations that are left are correlated by less than `white`."""
     white: float = 0.1

@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ..models import config as yaml
+from ..models.config import typed_yaml as yaml
+from ..models.config.errors import UserError
 from ..models.distance_aware import DiffusionKind
-from ..models.errors import UserError
 from ..models.spinn import SpinnConfig
 from .config import TrainingConfig
-from .distance_aware import DistanceAware, Unconstrained
-from .euclidean import EuclideanFdm, EuclideanMoments
-from .losses import Fdm, Mse
-from .moments import Moments
+from .losses.distance_aware_losses import DistanceAware, Unconstrained
+from .losses.euclidean_losses import EuclideanFdm, EuclideanMoments
+from .losses.matching import Fdm, Mse
+from .losses.moments import Moments
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from jaxtyping import Array, DTypeLike, Float, Int
 
 from ..models.dynamics import Dynamics
 from ..models.effects.extended import Extended
-from ..models.effects.played import Commands, gaussians, play
+from ..models.effects.recorded_rollout import Commands, gaussians, play
 from ..models.integrate import rollout
 
 

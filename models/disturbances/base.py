@@ -5,7 +5,7 @@ import abc
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..checks import check_numbers
+from ..config.checks import check_numbers
 from ..dynamics import Flow
 from ..randomness import Scalar
 

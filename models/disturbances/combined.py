@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..checks import require
+from ..config.checks import require
+from ..config.errors import UserError
 from ..dynamics import Flow
-from ..errors import UserError
 from ..randomness import Scalar
 from .base import Disturbance
 from .current import GaussMarkovCurrent

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..checks import require
+from ..config.checks import require
 from ..dynamics import Flow
 from ..randomness import Scalar, column, gauss_markov
 from .base import Disturbance

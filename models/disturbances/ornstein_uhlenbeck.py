@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import se3
-from ..checks import Vector6, require
+from ..config.checks import Vector6, require
 from ..dynamics import Flow
 from ..randomness import Scalar, column, gauss_markov
 from .base import Disturbance

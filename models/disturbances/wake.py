@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..checks import require
+from ..config.checks import require
 from ..dynamics import Flow
 from ..randomness import Scalar, uniform
 from .base import Disturbance

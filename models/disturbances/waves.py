@@ -10,7 +10,7 @@ import numpy as np
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
-from ..checks import require
+from ..config.checks import require
 from ..dynamics import Flow
 from ..randomness import Scalar, column
 from .base import Disturbance

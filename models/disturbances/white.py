@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..checks import Vector6, require
+from ..config.checks import Vector6, require
 from ..dynamics import Flow
 from ..randomness import Scalar, column
 from .base import Disturbance

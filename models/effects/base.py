@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..errors import UserError
+from ..config.errors import UserError
 from ..networks import expand
 from .recent import Recent
 

@@ -1,7 +1,7 @@
 """A base model with effects: rolls out, is stored, and stands where any `Dynamics` stands."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,6 +13,8 @@ from ..dynamics import Coefficients, Dynamics, Flow, Memory
 from ..spd import ConstantSpd, Spd
 from ..thrusters import Thrusters
 from .base import Effect, Plant
+from .deterministic_step import advance
+from .inertia import Inertia, times
 from .recent import Recent
 
 Random = tuple[Array, ...]
@@ -24,21 +26,6 @@ FOR_EVER = 1e9
 def core(dynamics: Dynamics) -> Dynamics:
     """A model without the effects about it."""
     return dynamics.base if isinstance(dynamics, Extended) else dynamics
-
-
-class Inertia(NamedTuple):
-    """The constant mass matrix with its inverse, of the effects' own batch; made once a call."""
-
-    matrix: Float[Array, "6 6 *batch"]
-    inverse: Float[Array, "6 6 *batch"]
-
-
-def times(M: Array, x: Array) -> Array:
-    """M x for matrices with or without batch axes."""
-    if M.ndim == 2:
-        return jnp.tensordot(M, x, 1)
-    M = M.reshape(M.shape + (1,) * (x.ndim + 1 - M.ndim))
-    return jnp.sum(M * x[None], axis=1)
 
 
 class Extended(Dynamics):
@@ -435,8 +422,6 @@ class Extended(Dynamics):
         their stationary law; without it the motion is noise-free. Values of the effects must have
         no batch axes, or ones that broadcast against the state's.
         """
-        from .predict import advance
-
         inertia = self.inertia()
         memory, state = self.carried(command[0])
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..errors import UserError
+from ..config.errors import UserError
 from .added_mass import AddedMass, AddedMassCoupling
 from .attitude import ClockOffset, GyroBias, HeadingError
 from .base import ALL_OR_ONE, Effect, Parameter

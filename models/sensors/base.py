@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import se3
-from ..checks import Vector3, check_numbers, require
+from ..config.checks import Vector3, check_numbers, require
 from ..randomness import Scalar
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import se3
-from ..checks import require
+from ..config.checks import require
 from ..randomness import Scalar, column, gauss_markov
 from .base import Sensor
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import se3
-from ..checks import Vector3, require
+from ..config.checks import Vector3, require
 from ..randomness import Scalar, bernoulli, column, uniform
 from .base import Sensor, velocity_at
 

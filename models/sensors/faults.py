@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..checks import check_numbers, require
+from ..config.checks import check_numbers, require
 from ..randomness import bernoulli, column
 from .base import Sensor
 from .compass import Compass, wrap

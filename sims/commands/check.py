@@ -8,8 +8,8 @@ from typing import Annotated, ClassVar
 
 from tyro.conf import OmitArgPrefixes, subcommand
 
-from ...models.checks import RATE_OF_ALARMS, WORKERS
-from ...models.errors import UserError
+from ...models.config.checks import RATE_OF_ALARMS, WORKERS
+from ...models.config.errors import UserError
 from ..progress import console, progress_bar
 from .check_estimator import CheckEstimator
 
@@ -41,9 +41,9 @@ class CheckDiagnosis:
     @contextmanager
     def place(self) -> Iterator[None]:
         """Hold what is to be written."""
-        from ...models.owned import run_folder
-        from ..check.run import CHECK
-        from ..marked_page import held_page
+        from ...models.files.owned import run_folder
+        from ..diagnosis_benchmark.run import CHECK
+        from ..reports.marked_page import held_page
 
         with ExitStack() as held:
             if self.docs is not None:
@@ -53,10 +53,10 @@ class CheckDiagnosis:
 
     def run(self) -> None:
         """Diagnose, judge, tell."""
-        from ..check.cases import find_cases
-        from ..check.pages import write_page
-        from ..check.run import run_cases
-        from ..check.tables import print_tables, tables
+        from ..diagnosis_benchmark.cases import find_cases
+        from ..diagnosis_benchmark.pages import write_page
+        from ..diagnosis_benchmark.run import run_cases
+        from ..diagnosis_benchmark.tables import print_tables, tables
 
         if self.docs is not None and self.docs.suffix != ".md":
             raise UserError(f"--docs {self.docs}: end the name in .md")

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from ...models.checks import WORKERS, Within
-from ...models.errors import UserError
+from ...models.config.checks import WORKERS, Within
+from ...models.config.errors import UserError
 from ..progress import console, progress_bar
 
 if TYPE_CHECKING:
@@ -47,9 +47,9 @@ class CheckEstimator:
     @contextmanager
     def place(self) -> Iterator[None]:
         """Hold what is to be written."""
-        from ...models.owned import run_folder
+        from ...models.files.owned import run_folder
         from ..estimator_check.run import ESTIMATOR
-        from ..marked_page import held_page
+        from ..reports.marked_page import held_page
 
         with ExitStack() as held:
             if self.docs is not None:
@@ -59,11 +59,11 @@ class CheckEstimator:
 
     def run(self) -> None:
         """Fly, judge, tell."""
-        from ..check.tables import print_tables
+        from ..diagnosis_benchmark.tables import print_tables
         from ..estimator_check.pages import page_text
         from ..estimator_check.run import run_settings
         from ..estimator_check.tables import tables
-        from ..marked_page import write_measured
+        from ..reports.marked_page import write_measured
 
         self._check_options()
         settings = self._settings()

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from ...models.checks import COUNT
+from ...models.config.checks import COUNT
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Demo:
         from ..cores import share_cores
         from ..demo import EMBEDDED, demo, demo_folder
         from ..progress import console, tell_code
-        from ..scenario import load_scenario
+        from ..scenarios.scenario import load_scenario
 
         share_cores()
         config = TrainingConfig()

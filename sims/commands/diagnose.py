@@ -7,9 +7,9 @@ from typing import Annotated, ClassVar, Literal
 
 from tyro.conf import Positional
 
-from ...models.checks import RATE_OF_ALARMS, WATER_DENSITY, Vector6, Within
-from ...models.errors import UserError
-from ...models.owned import FolderKind, run_folder
+from ...models.config.checks import RATE_OF_ALARMS, WATER_DENSITY, Vector6, Within
+from ...models.config.errors import UserError
+from ...models.files.owned import FolderKind, run_folder
 from ..progress import console, progress_bar
 
 DIAGNOSIS = FolderKind(
@@ -66,13 +66,13 @@ class Diagnose:
 
         import numpy as np
 
-        from ...models.checkpoint import load_model, save_model
-        from ...models.files import atomic_files
-        from ...models.vehicle import load_vehicle
-        from ...systems.mavlink.logs import LogOptions, load_data
-        from ...training.diagnosis.diagnose import DiagnoseConfig, diagnose
-        from ...training.diagnosis.result import schema
-        from ..diagnosis_report import diagnosis_page
+        from ...models.files.atomic import atomic_files
+        from ...models.files.checkpoint import load_model, save_model
+        from ...models.vehicles.vehicle import load_vehicle
+        from ...systems.logs.load import LogOptions, load_data
+        from ...training.diagnosis.findings.result import schema
+        from ...training.diagnosis.pipeline import DiagnoseConfig, diagnose
+        from ..reports.diagnosis_report import diagnosis_page
 
         self._check()
         config = DiagnoseConfig(alpha=self.alpha, refit=self.refit)

@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar
 
 from tyro.conf import Positional
 
-from ...models.checks import SECONDS
-from ...models.errors import UserError
+from ...models.config.checks import SECONDS
+from ...models.config.errors import UserError
 from ..progress import console, progress_bar
 
 
@@ -38,8 +38,8 @@ class Evaluate:
 
     def place(self) -> AbstractContextManager[Path | None]:
         """Hold what is to be written."""
-        from ...models.owned import output_file
-        from ...training.evaluate import is_evaluation
+        from ...models.files.owned import output_file
+        from ...training.evaluation.evaluate import is_evaluation
 
         if self.out is None:
             return nullcontext()
@@ -47,9 +47,9 @@ class Evaluate:
 
     def run(self) -> None:
         """Load, predict, compare."""
-        from ...models.vehicle import load_vehicle
-        from ...systems.mavlink.logs import load_data
-        from ...training.windows import make_windows
+        from ...models.vehicles.vehicle import load_vehicle
+        from ...systems.logs.load import load_data
+        from ...training.data.windows import make_windows
         from ..learning import FINE_SUBSTEPS, Start, compare, judged, windowing
 
         if self.out is not None and self.out.suffix not in (".csv", ".json", ".nc"):

@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar
 
 from tyro.conf import OmitArgPrefixes
 
-from ...models.errors import UserError
-from ...training.generate import GenerateConfig
+from ...models.config.errors import UserError
+from ...training.data.generate import GenerateConfig
 from ..progress import console, progress_bar
 
 
@@ -44,17 +44,18 @@ class Generate:
 
     def place(self) -> AbstractContextManager[Path]:
         """Hold what is to be written."""
-        from ...models.owned import output_file
-        from ...models.recording import Recording
+        from ...models.files.owned import output_file
+        from ...models.recordings.store import Recording
 
         return output_file(self.out, Recording.is_one, "recording of spinndrift")
 
     def run(self) -> None:
         """Simulate and write."""
-        from ...models.checkpoint import load_model
         from ...models.disturbances import preset
-        from ...models.vehicle import load_vehicle
-        from ...training.generate import generate
+        from ...models.files.checkpoint import load_model
+        from ...models.recordings.summary import summarize
+        from ...models.vehicles.vehicle import load_vehicle
+        from ...training.data.generate import generate
 
         if self.out.suffix != ".nc":
             raise UserError(f"--out {self.out}: a Recording is a NetCDF file; end the name in .nc")
@@ -67,5 +68,5 @@ class Generate:
             )
         recording.save(self.out)
         shown = console()
-        shown.print(recording.summary())
+        shown.print(summarize(recording))
         shown.print(f"wrote {self.out}")

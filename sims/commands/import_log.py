@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar
 
 from tyro.conf import FlagCreatePairsOff, Positional
 
-from ...models.checks import WATER_DENSITY, Within
-from ...models.errors import UserError
+from ...models.config.checks import WATER_DENSITY, Within
+from ...models.config.errors import UserError
 from ..progress import console, progress_bar
 
 
@@ -48,14 +48,15 @@ class Import:
 
     def place(self) -> AbstractContextManager[Path]:
         """Hold what is to be written."""
-        from ...models.owned import output_file
-        from ...models.recording import Recording
+        from ...models.files.owned import output_file
+        from ...models.recordings.store import Recording
 
         return output_file(self._out(), Recording.is_one, "recording of spinndrift")
 
     def run(self) -> None:
         """Read, convert, write, summarise."""
-        from ...systems.mavlink.logs import LogOptions, load_data
+        from ...models.recordings.summary import summarize
+        from ...systems.logs.load import LogOptions, load_data
 
         out = self._out()
         if out.suffix != ".nc":
@@ -67,7 +68,7 @@ class Import:
             )
         recording.save(out)
         shown = console()
-        shown.print(recording.summary())
+        shown.print(summarize(recording))
         shown.print(f"wrote {out}")
 
     def _out(self) -> Path:

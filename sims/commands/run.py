@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from ...models.checks import SECONDS, SEED
+from ...models.config.checks import SECONDS, SEED
 from ..progress import console, progress_bar, tell_code
 
 
@@ -52,9 +52,9 @@ class Run:
 
     def run(self) -> None:
         """Simulate, write, summarise."""
-        from ..run_folder import new_folder, write_files
-        from ..run_loop import simulate
-        from ..scenario import load_scenario
+        from ..run.folder import new_folder, write_files
+        from ..run.loop import simulate
+        from ..scenarios.scenario import load_scenario
 
         scenario = load_scenario(self.scenario, self.scenario_text)
         tell_code(self.scenario, scenario.code)

@@ -8,8 +8,8 @@ from typing import Annotated, ClassVar, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from ...models.checks import WORKERS, Within
-from ...models.errors import UserError
+from ...models.config.checks import WORKERS, Within
+from ...models.config.errors import UserError
 from ..progress import console, progress_bar
 
 
@@ -61,7 +61,7 @@ class Study:
     @contextmanager
     def place(self) -> Iterator[None]:
         """Hold what is to be written."""
-        from ...models.owned import output_file, run_folder
+        from ...models.files.owned import output_file, run_folder
         from ..study.pages import check_shown, is_page
         from ..study.run import STUDY
 
@@ -74,7 +74,7 @@ class Study:
 
     def run(self) -> None:
         """Train, judge, tell."""
-        from ...models.config import load
+        from ...models.config.typed_yaml import load
         from ...training.methods import METHODS
         from ..cores import share_cores
         from ..study.config import StudyConfig, from_belief, scaled

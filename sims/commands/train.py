@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar
 
 from tyro.conf import Positional
 
-from ...models.checks import COUNT, SEED
-from ...models.errors import UserError
+from ...models.config.checks import COUNT, SEED
+from ...models.config.errors import UserError
 from ..progress import console, progress_bar
 
 
@@ -53,22 +53,22 @@ class Train:
 
     def place(self) -> AbstractContextManager[Path]:
         """Hold what is to be written."""
-        from ...models.owned import run_folder
-        from ...training.run_folder import TRAINING
+        from ...models.files.owned import run_folder
+        from ...training.fitting.run_folder import TRAINING
 
         return run_folder(self.out, TRAINING)
 
     def run(self) -> None:
         """Train, evaluate, report."""
-        from ...models.config import load
-        from ...models.vehicle import load_vehicle
-        from ...systems.mavlink.logs import load_data
+        from ...models.config.typed_yaml import load
+        from ...models.vehicles.vehicle import load_vehicle
+        from ...systems.logs.load import load_data
         from ...training.config import TrainingConfig
         from ...training.methods import method_config
         from ..cores import share_cores
         from ..learning import Start, learn
-        from ..learning_report import add_data, add_evaluation, add_training
-        from ..pages import Page
+        from ..reports.learning_report import add_data, add_evaluation, add_training
+        from ..reports.pages import Page
 
         share_cores()
         if self.method is not None:

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from ...models.vehicle import load_vehicle
-from ...systems.mavlink.logs import load_data
+from ...models.vehicles.vehicle import load_vehicle
+from ...systems.logs.load import load_data
 from ...training.config import TrainingConfig
 from ..demo import EMBEDDED
 from ..learning import learn

@@ -11,15 +11,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from ...models import config
-from ...models.errors import UserError
-from ...models.files import atomic_path
-from ...models.owned import FolderKind
-from ...training.provenance import revision
+from ...models.config import typed_yaml
+from ...models.config.errors import UserError
+from ...models.files.atomic import atomic_path
+from ...models.files.owned import FolderKind
+from ...training.data.provenance import revision
 from ..compile_cache import give_back_programs, keep_compiled
 from ..fanout import Failed, run_here, run_on_cluster
 from ..progress import Update
-from ..run_loop import Engine, simulate_seeds
+from ..run.loop import Engine, simulate_seeds
 from .scores import Scores, score, stacked
 from .settings import Setting, setting_files
 
@@ -46,7 +46,7 @@ class FlySetting:
         out: folder; the file is `<table>/<name>.npz`.
         runs: of each setting, by its table.
         revision: of the sources.
-        engine: as `sims.run_loop.simulate` has it.
+        engine: as `sims.run.loop.simulate` has it.
     """
 
     out: str
@@ -107,7 +107,7 @@ class FlySetting:
     def _made(self, setting: Setting) -> dict[str, Any]:
         model = setting.scenario.station.model
         return {
-            "scenario": config.dump(setting.scenario),
+            "scenario": typed_yaml.dump(setting.scenario),
             "runs": self.runs[setting.table],
             "model": "" if model is None else hashlib.sha256(model.read_bytes()).hexdigest(),
         }

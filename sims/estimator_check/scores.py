@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import chi2
 
-from ..estimate import average_bound, estimate_error, mahalanobis, nees
-from ..run_log import FUSED
-from ..run_loop import Run
+from ..run.estimate import average_bound, estimate_error, mahalanobis, nees
+from ..run.log import FUSED
+from ..run.loop import Run
 
 Scores = dict[str, np.ndarray]
 """Arrays of one run, or of many with the runs first."""

@@ -7,11 +7,11 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal
 
-from ...models.checkpoint import load_model
-from ...models.errors import UserError
+from ...models.config.errors import UserError
+from ...models.files.checkpoint import load_model
 from ...models.sensors import SensorFault
-from ..criteria import Safety
-from ..scenario import Scenario, load_scenario
+from ..scenarios.criteria import Safety
+from ..scenarios.scenario import Scenario, load_scenario
 
 TableName = Literal["consistency", "faults"]
 _CALM, _HARBOUR = "trajectory_tracking_calm", "trajectory_tracking_harbour"

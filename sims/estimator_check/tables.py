@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..check.tables import Table
-from ..estimate import BLOCKS, HEALTH, TRUSTED, average_bound
-from ..run_log import FUSED
+from ..diagnosis_benchmark.tables import Table
+from ..run.estimate import BLOCKS, HEALTH, TRUSTED, average_bound
+from ..run.log import FUSED
 from .run import Result
 from .scores import FREEDOM, Average, average_nees, average_nis, within_three_sigma
 

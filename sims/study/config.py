@@ -3,12 +3,12 @@
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, TypeVar, get_args
 
-from ...models.checks import Vector6, check_numbers, require
-from ...models.errors import UserError
+from ...models.config.checks import Vector6, check_numbers, require
+from ...models.config.errors import UserError
 from ...training.config import TrainingConfig
-from ...training.generate import GenerateConfig
-from ...training.law_metrics import GroundMetric
-from ...training.maneuvers import MANEUVERS
+from ...training.data.generate import GenerateConfig
+from ...training.data.maneuvers import MANEUVERS
+from ...training.evaluation.law_metrics import GroundMetric
 
 T = TypeVar("T")
 Regime = Literal["rich", "sparse"]

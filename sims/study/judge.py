@@ -9,14 +9,14 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array, Float
 
+from ...models.config.errors import UserError
 from ...models.dynamics import Dynamics
-from ...models.errors import UserError
-from ...models.vehicle import load_vehicle
-from ...training.law_metrics import LawSamples, compare_laws
-from ...training.maneuvers import maneuver_wrench
+from ...models.vehicles.vehicle import load_vehicle
+from ...training.data.maneuvers import maneuver_wrench
+from ...training.evaluation.law_metrics import LawSamples, compare_laws
 from ...training.predict import predict
-from ..learning_report import AXES
 from ..progress import Update
+from ..reports.learning_report import AXES
 from .config import Regime, StudyConfig
 
 _SHOWN_TIMES = 20
@@ -79,7 +79,7 @@ def judge(
     substeps: int,
     progress: Update = lambda fraction, remark="", /: None,
 ) -> tuple[xr.Dataset, dict[str, dict[str, float]]]:
-    """Metrics of every scenario (`training.law_metrics`), and the diffusion beside the true one."""
+    """Metrics of every scenario (`training.evaluation.law_metrics`), and the two diffusions."""
     truth, config = true_model(study), study.regime(regime)
     dt, count = 1 / config.rate, study.evaluation.samples
     parts: list[xr.Dataset] = []

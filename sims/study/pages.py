@@ -10,11 +10,11 @@ from pathlib import Path
 import xarray as xr
 from matplotlib.figure import Figure
 
-from ...models import config as yaml
-from ...models.errors import UserError
-from ...models.files import atomic_path
+from ...models.config import typed_yaml as yaml
+from ...models.config.errors import UserError
+from ...models.files.atomic import atomic_path
 from ...training.methods import METHODS
-from ..pages import Page
+from ..reports.pages import Page
 from .claims import Verdict, targets, verdicts
 from .config import REGIMES, StudyConfig, asked_for
 from .figures import (

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ...models import config as yaml
-from ...models.errors import UserError
-from ...models.files import atomic_path
-from ...models.owned import FolderKind, claim
-from ...training.maneuvers import MANEUVERS
+from ...models.config import typed_yaml as yaml
+from ...models.config.errors import UserError
+from ...models.files.atomic import atomic_path
+from ...models.files.owned import FolderKind, claim
+from ...training.data.maneuvers import MANEUVERS
 from ..fanout import Failed, check_workers, run_here, run_on_cluster
 from ..progress import Update
 from .config import REGIMES, StudyConfig

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from ...models.errors import UserError
-from ...models.files import atomic_path
-from ...models.netcdf import save_netcdf
+from ...models.config.errors import UserError
+from ...models.files.atomic import atomic_path
+from ...models.files.netcdf import save_netcdf
 from .config import REGIMES
 
 Row = dict[str, Any]

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...models import config as yaml
-from ...models.errors import UserError
-from ...models.files import atomic_path
-from ...models.locks import locked
-from ...models.owned import FolderKind, check_folder, claim, finish, sweep
+from ...models.config import typed_yaml as yaml
+from ...models.config.errors import UserError
+from ...models.files.atomic import atomic_path
+from ...models.files.locks import locked
+from ...models.files.owned import FolderKind, check_folder, claim, finish, sweep
 from ...training.config import TrainingConfig
 from ...training.methods import METHODS, method_config
 from .config import REGIMES, Regime, StudyConfig

@@ -8,19 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from ...models.checkpoint import load_model, save_model
+from ...models.config.errors import UserError
 from ...models.dynamics import Dynamics
-from ...models.errors import UserError
-from ...models.owned import claim
-from ...models.vehicle import load_vehicle
+from ...models.files.checkpoint import load_model, save_model
+from ...models.files.owned import claim
+from ...models.vehicles.vehicle import load_vehicle
 from ...training.config import TrainingConfig
-from ...training.ensemble import fit_ensemble
-from ...training.fit import Progress, TrainingResult, fit
-from ...training.generate import generate
-from ...training.guard import TrainingError, not_finite
-from ...training.run_folder import TRAINING
-from ...training.start import starting_model
-from ...training.windows import Windows, make_windows
+from ...training.data.generate import generate
+from ...training.data.windows import Windows, make_windows
+from ...training.fitting.ensemble import fit_ensemble
+from ...training.fitting.fit import Progress, TrainingResult, fit
+from ...training.fitting.guard import TrainingError, not_finite
+from ...training.fitting.run_folder import TRAINING
+from ...training.fitting.start import starting_model
 from ..progress import Update
 from .task import RunSettings
 
@@ -105,7 +105,8 @@ def train_seeds(
     folders: Sequence[Path],
     progress: Update,
 ) -> list[Trained]:
-    """Train the runs of one task, several seeds in one batched program (`training.ensemble`).
+    """Train the runs of one task, several seeds in one batched program
+    (`training.fitting.ensemble`).
 
     Each resumes from the start and the checkpoint in its folder. Starts are made one by one.
     """

@@ -7,9 +7,9 @@ from typing import Any
 
 import jax
 
-from ...models.netcdf import save_netcdf
-from ...training.law_metrics import overall
-from ...training.provenance import revision, versions
+from ...models.files.netcdf import save_netcdf
+from ...training.data.provenance import revision, versions
+from ...training.evaluation.law_metrics import overall
 from ..compile_cache import keep_compiled
 from ..progress import Update
 from .config import StudyConfig

@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from spinndrift.models.checkpoint import load_model, save_model
 from spinndrift.models.effects.extended import Extended
 from spinndrift.models.effects.library import kind
+from spinndrift.models.files.checkpoint import load_model, save_model
 from spinndrift.models.spinn import Spinn, SpinnConfig
-from spinndrift.models.vehicle import load_vehicle
+from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.config import TrainingConfig
-from spinndrift.training.run_folder import RunFolder, TrainState
+from spinndrift.training.fitting.run_folder import RunFolder, TrainState
 
 from .harness import Kind
 from .mutate import FLOATS, WORDS, Rng, bytes_spoiled, part, pick

@@ -7,10 +7,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from motion import smooth_motion
 
-from spinndrift.models.recording import Recording
-from spinndrift.models.recording_build import Trajectory
-from spinndrift.models.recording_csv import write_csv
-from spinndrift.systems.mavlink.logs import load_data
+from spinndrift.models.recordings.build import Trajectory
+from spinndrift.models.recordings.csv import write_csv
+from spinndrift.models.recordings.store import Recording
+from spinndrift.models.recordings.summary import summarize
+from spinndrift.systems.logs.load import load_data
 
 from .harness import Kind
 from .mutate import NUMBERS, WORDS, Rng, bytes_spoiled, encoded, pick, text_spoiled, yaml_spoiled
@@ -101,7 +102,7 @@ def _table_spoiled(rng: Rng, text: str) -> str:
 
 
 def _read(path: Path) -> None:
-    load_data(path).summary()
+    summarize(load_data(path))
     load_data(path, resample=False)
 
 

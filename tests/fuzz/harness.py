@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from spinndrift.models.errors import UserError
+from spinndrift.models.config.errors import UserError
 
 from .mutate import Rng
 

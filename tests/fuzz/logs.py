@@ -11,7 +11,8 @@ from log_writers import dataflash, dive
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from pymavlink.generator.mavcrc import x25crc
 
-from spinndrift.systems.mavlink.logs import LogOptions, load_data
+from spinndrift.models.recordings.summary import summarize
+from spinndrift.systems.logs.load import LogOptions, load_data
 
 from .harness import Kind
 from .mutate import FLOATS, Rng, bytes_spoiled, packed_special, part, pick
@@ -27,7 +28,7 @@ _PARAMETERS = (
 
 def _read(path: Path) -> None:
     options = LogOptions(minimum=0.5, water_density=1025.0)
-    load_data(path, rate=50.0, options=options).summary()
+    summarize(load_data(path, rate=50.0, options=options))
 
 
 def _written(rng: Rng, data: bytes, path: Path) -> Path:

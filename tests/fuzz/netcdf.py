@@ -10,8 +10,9 @@ import h5py
 import numpy as np
 from motion import smooth_motion
 
-from spinndrift.models.recording import Recording
-from spinndrift.models.recording_build import Trajectory
+from spinndrift.models.recordings.build import Trajectory
+from spinndrift.models.recordings.store import Recording
+from spinndrift.models.recordings.summary import summarize
 
 from .harness import Kind
 from .mutate import FLOATS, NUMBERS, WORDS, Rng, bytes_spoiled, part, pick
@@ -146,7 +147,7 @@ def _replace(rng: Rng, file: Any, name: str) -> None:
 
 def _read(path: Path) -> None:
     recording = Recording.load(path)
-    recording.summary()
+    summarize(recording)
     recording.thrust(recording.vehicle or "bluerov2_heavy")
 
 

@@ -5,10 +5,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from spinndrift.models import config
-from spinndrift.models.vehicle import Vehicle, load_vehicle
-from spinndrift.sims.check.cases import HiddenCause, Truth
-from spinndrift.sims.scenario import load_scenario, scenario_names
+from spinndrift.models.config import typed_yaml
+from spinndrift.models.vehicles.vehicle import Vehicle, load_vehicle
+from spinndrift.sims.diagnosis_benchmark.cases import HiddenCause, Truth
+from spinndrift.sims.scenarios.scenario import load_scenario, scenario_names
 from spinndrift.sims.study.config import StudyConfig
 from spinndrift.training.config import TrainingConfig
 from spinndrift.training.methods import METHODS, method_config
@@ -27,18 +27,18 @@ _TEXTS = (
 @cache
 def _sound() -> dict[str, tuple[str, ...]]:
     """Text of sound files by what they are."""
-    vehicle = config.dump(load_vehicle("bluerov2_heavy"))
+    vehicle = typed_yaml.dump(load_vehicle("bluerov2_heavy"))
     truth = Truth(
         "single", "explained", causes=(HiddenCause("thruster_lag", "all", {"time_constant": 0.1}),)
     )
     return {
         "vehicle": (vehicle,),
-        "scenario": tuple(config.dump(load_scenario(name)) for name in scenario_names()),
+        "scenario": tuple(typed_yaml.dump(load_scenario(name)) for name in scenario_names()),
         "overlay": _TEXTS,
-        "study": (config.dump(StudyConfig()),),
-        "training": tuple(config.dump(method.config) for method in METHODS.values()),
+        "study": (typed_yaml.dump(StudyConfig()),),
+        "training": tuple(typed_yaml.dump(method.config) for method in METHODS.values()),
         "method": ("steps: 3\nmodel: {width: 4}\nobjective: !Fdm {samples: 4}\nseed: 1\n",),
-        "truth": (config.dump(truth),),
+        "truth": (typed_yaml.dump(truth),),
     }
 
 
@@ -47,13 +47,13 @@ def _load_overlay(path: Path) -> None:
 
 
 _READERS: dict[str, Callable[[Path], Any]] = {
-    "vehicle": lambda path: config.load(Vehicle, path),
+    "vehicle": lambda path: typed_yaml.load(Vehicle, path),
     "scenario": load_scenario,
     "overlay": _load_overlay,
-    "study": lambda path: config.load(StudyConfig, path),
-    "training": lambda path: config.load(TrainingConfig, path),
+    "study": lambda path: typed_yaml.load(StudyConfig, path),
+    "training": lambda path: typed_yaml.load(TrainingConfig, path),
     "method": lambda path: method_config("fdm-geodesic", path),
-    "truth": lambda path: config.load(Truth, path),
+    "truth": lambda path: typed_yaml.load(Truth, path),
 }
 
 

@@ -1,0 +1,1 @@
+"""Typed YAML and the checks that configurations make of themselves."""

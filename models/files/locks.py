@@ -1,0 +1,76 @@
+"""Locks between processes that go with the process that took them, killed or not."""
+
+import errno
+import fcntl
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from ..config.errors import UserError
+
+_BUSY = (errno.EAGAIN, errno.EACCES)
+_NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
+_log = logging.getLogger(__name__)
+
+
+class BusyError(UserError):
+    """Another process has a lock."""
+
+
+@contextmanager
+def locked(path: Path, called: str | None) -> Iterator[None]:
+    """Hold the lock of the file `path`, which is made if missing and removed when the block ends.
+
+    The operating system keeps the lock (flock; on NFS with its server, so between machines too)
+    and gives it back when the process ends, so a file that a killed process left holds nobody up.
+    On a file system without locks the block runs without, and a warning says so.
+
+    Args:
+        path: a file that holds nothing, in a folder that exists.
+        called: what the sentence begins with if another process has the lock; None waits for it.
+
+    Raises:
+        BusyError: another process has the lock.
+    """
+    handle = _open(path, called)
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            path.unlink()  # while it is held: whoever opened it before finds that it is gone
+        os.close(handle)
+
+
+def _open(path: Path, called: str | None) -> int:
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if called is None else fcntl.LOCK_NB))
+            if _still_there(handle, path):
+                return handle
+        except OSError as error:
+            if error.errno in _NO_LOCKS:
+                _log.warning(f"{path.parent}: has no file locks, so take care that no other "
+                             "command writes there")  # fmt: skip
+                return handle
+            os.close(handle)
+            if error.errno in _BUSY:
+                raise BusyError(
+                    f"{called}: another spinndrift command is writing there; wait until it has "
+                    "ended, or name another place"
+                ) from error
+            raise
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)
+
+
+def _still_there(handle: int, path: Path) -> bool:
+    """Whether the file that was opened has not been removed in the meantime."""
+    try:
+        return os.path.samestat(os.fstat(handle), os.stat(path))
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,442 @@
+"""Recordings: measured or simulated motion with its commands, in one checked form for every part.
+
+An `xarray.Dataset` with dims (scenario, trajectory, time, component); poses, twists and wrenches in
+the conventions of `models/se3.py`, but batch first. `docs/recording.md` is the user's page.
+"""
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array
+
+from ..config.errors import UserError
+from ..files.netcdf import load_netcdf, save_netcdf
+from .build import Trajectory, assemble, window
+from .schema import (
+    COMMANDS,
+    FORMAT,
+    LABELS,
+    LEADING,
+    SENSORS,
+    STATES,
+    UNEVEN,
+    WRENCH,
+    check,
+    check_plausible,
+    observed,
+    present,
+)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A checked dataset of trajectories; every method that changes something returns a new one.
+
+    Raises:
+        ValueError: at construction, if the dataset is not what `docs/recording.md` says.
+    """
+
+    dataset: xr.Dataset
+
+    def __post_init__(self) -> None:
+        check(self.dataset)
+
+    @classmethod
+    def from_trajectories(
+        cls,
+        trajectories: Sequence[Trajectory],
+        dt: float,
+        *,
+        vehicle: str = "",
+        source: str = "",
+        notes: Sequence[str] = (),
+    ) -> "Recording":
+        """Stack trajectories of equal step `dt` (s); equal scenario names make repetitions."""
+        return cls(assemble(trajectories, dt, vehicle=vehicle, source=source, notes=notes))
+
+    # what is there
+
+    @property
+    def dt(self) -> float:
+        """Time step (s)."""
+        return float(self.dataset.attrs["dt"])
+
+    @property
+    def command_period(self) -> float:
+        """Time (s) between samples of commands where they were logged; `dt` if nothing tells."""
+        return float(self.dataset.attrs.get("command_period", self.dt))
+
+    @property
+    def scenarios(self) -> tuple[str, ...]:
+        """Names of the scenarios."""
+        return tuple(str(name) for name in self.dataset["scenario"].to_numpy())
+
+    @property
+    def mask(self) -> np.ndarray:
+        """Samples that exist, bool (scenario, trajectory, time)."""
+        return self.dataset["mask"].to_numpy()
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """Samples of each trajectory, int (scenario, trajectory)."""
+        return self.mask.sum(axis=2)
+
+    @property
+    def duration(self) -> float:
+        """Time recorded in all trajectories together (s)."""
+        return float(np.maximum(self.lengths - 1, 0).sum() * self.dt)
+
+    @property
+    def vehicle(self) -> str:
+        """Name of the vehicle's preset, or empty."""
+        return str(self.dataset.attrs.get("vehicle", ""))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the source had and lacked, one sentence each."""
+        text = str(self.dataset.attrs.get("notes", ""))
+        return tuple(line for line in text.split("\n") if line)
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """Which of F_Bo_B, thruster_force, pwm are there."""
+        return present(self.dataset, COMMANDS)
+
+    @property
+    def thrust_from(self) -> str:
+        """Which of the commands says most of the thrusters' forces."""
+        return next(c for c in ("thruster_force", "pwm", "F_Bo_B") if c in self.commands)
+
+    @property
+    def missing(self) -> dict[str, tuple[str, ...]]:
+        """State channels that some trajectory lacks, by variable: {"X_WB": ("x", "y"), …}."""
+        exists = (self.lengths > 0)[..., None]
+        found: dict[str, tuple[str, ...]] = {}
+        for name, (dim, _) in STATES.items():
+            lacking = exists & ~observed(self.dataset[name].to_numpy(), self.mask)
+            if lacking.any():
+                found[name] = tuple(
+                    label
+                    for label, no in zip(LABELS[dim], np.any(lacking, axis=(0, 1)), strict=True)
+                    if no
+                )
+        return found
+
+    def trajectories(self) -> Iterator[Trajectory]:
+        """Yield every trajectory without its padding, scenario by scenario."""
+        lengths = self.lengths
+        known = COMMANDS | SENSORS
+        start = self.dataset.get("start_time")
+        for j, scenario in enumerate(self.scenarios):
+            for k in np.flatnonzero(lengths[j]):
+                arrays = {
+                    str(name): variable.to_numpy()[j, k, : lengths[j, k]]
+                    for name, variable in self.dataset.data_vars.items()
+                    if variable.dims[:3] == LEADING and name != "mask"
+                }
+                commands = {name: arrays[name] for name in self.commands}
+                sensors = {
+                    name: values
+                    for name, values in arrays.items()
+                    if name not in commands
+                    and name not in STATES
+                    and (name not in known or np.isfinite(values).any())
+                }
+                yield Trajectory(
+                    scenario,
+                    arrays["X_WB"],
+                    arrays["V_WB_B"],
+                    commands,
+                    sensors,
+                    0.0 if start is None else float(start.to_numpy()[j, k]),
+                )
+
+    @property
+    def uneven(self) -> bool:
+        """Whether samples stand at times of their own (`elapsed`) and not on a grid."""
+        return UNEVEN in self.dataset
+
+    def elapsed(self, scenario: int, trajectory: int) -> np.ndarray:
+        """Times of a trajectory's samples since its first one (s), (N,)."""
+        length = int(self.lengths[scenario, trajectory])
+        if self.uneven:
+            times = self.dataset[UNEVEN].to_numpy()[scenario, trajectory, :length]
+            if np.isfinite(times).all():
+                return times - times[:1]
+        return self.dt * np.arange(length)
+
+    # inputs
+
+    def wrench(self, vehicle: Any = None) -> xr.DataArray:
+        """Return the commanded wrench F_Bo_B (N, N·m), from what the recording holds.
+
+        In this order: `F_Bo_B` itself; thruster forces through the vehicle's allocation; PWM and
+        voltage through its thruster curve (steady state: no lag) and the allocation. Samples
+        without a voltage take the vehicle's nominal one.
+
+        Args:
+            vehicle: a `Vehicle`, the name of a preset, or None for the one named in the recording.
+
+        Raises:
+            UserError: if a vehicle is needed and none is known, or its thruster count differs.
+        """
+        if "F_Bo_B" in self.dataset:
+            return self.dataset["F_Bo_B"]
+        thrusters = self._resolve(vehicle).thrusters(jnp.result_type(float))
+        name = self.commands[0]
+        F = np.moveaxis(np.asarray(thrusters.wrench(self._forces(name, thrusters))), 0, -1)
+        return xr.DataArray(
+            np.where(self.mask[..., None], F, np.nan),
+            dims=(*LEADING, "wrench_component"),
+            coords={
+                "scenario": self.dataset["scenario"],
+                "time": self.dataset["time"],
+                "wrench_component": list(WRENCH),
+            },
+            attrs={"units": COMMANDS["F_Bo_B"][1], "made from": name},
+        )
+
+    def thrust(self, vehicle: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the thrusters' commanded forces (N) and the voltage relative to the nominal one.
+
+        Arrays (scenario, trajectory, time, n) and (scenario, trajectory, time), finite throughout.
+        Forces are taken as they are, else PWM through the vehicle's curve at the recorded voltage
+        (steady state: no lag), else the wrench split over the thrusters with the least effort.
+
+        Args:
+            vehicle: a `Vehicle`, the name of a preset, or None for the one named in the recording.
+
+        Raises:
+            UserError: if no vehicle is known, or its thruster count differs.
+        """
+        thrusters = self._resolve(vehicle).thrusters(jnp.result_type(float))
+        name = self.thrust_from
+        if name == "F_Bo_B":
+            F = np.moveaxis(self.dataset[name].to_numpy(), -1, 0)
+            level = jnp.tensordot(thrusters.inverse, jnp.asarray(F), 1)
+        else:
+            level = self._forces(name, thrusters)
+        volts = self._voltage(thrusters) / float(thrusters.nominal_voltage)
+        return np.nan_to_num(np.moveaxis(np.asarray(level), 0, -1)), volts
+
+    def _forces(self, name: str, thrusters: Any) -> Array:
+        """Forces (n, scenario, trajectory, time) of a command to thrusters."""
+        values = self.dataset[name].to_numpy()
+        count = thrusters.allocation.shape[1]
+        if values.shape[-1] != count:
+            raise UserError(
+                f"{name}: the recording has {values.shape[-1]} thrusters, the vehicle {count}; "
+                "choose the vehicle it was recorded with"
+            )
+        rest = 1500.0 if name == "pwm" else 0.0
+        command = jnp.asarray(np.moveaxis(np.where(self.mask[..., None], values, rest), -1, 0))
+        if name == "thruster_force":
+            return command
+        return thrusters.force(command, jnp.asarray(self._voltage(thrusters)))
+
+    def _resolve(self, vehicle: Any) -> Any:
+        if vehicle is None and not self.vehicle:
+            raise UserError(
+                f"vehicle: the recording holds {self.commands[0]} and names no vehicle; "
+                "name one to turn it into a wrench"
+            )
+        if vehicle is None or isinstance(vehicle, str | os.PathLike):
+            from ..vehicles.vehicle import load_vehicle
+
+            return load_vehicle(self.vehicle if vehicle is None else os.fspath(vehicle))
+        return vehicle
+
+    def _voltage(self, thrusters: Any) -> np.ndarray:
+        nominal = float(thrusters.nominal_voltage)
+        if "voltage" not in self.dataset:
+            return np.full(self.mask.shape, nominal)
+        measured = self.dataset["voltage"].to_numpy()
+        return np.where(np.isfinite(measured), measured, nominal)
+
+    # parts
+
+    def select(self, scenarios: str | Sequence[str]) -> "Recording":
+        """Return only the named scenarios.
+
+        Raises:
+            UserError: if a name is not there; the sentence lists those that are.
+        """
+        names = [scenarios] if isinstance(scenarios, str) else list(scenarios)
+        unknown = [name for name in names if name not in self.scenarios]
+        if unknown or not names:
+            raise UserError(
+                f"scenario: no {unknown or 'name given'}; the recording has {list(self.scenarios)}"
+            )
+        rows = [self.scenarios.index(name) for name in names]
+        kept = self.dataset.isel(scenario=rows)
+        stop = kept["mask"].to_numpy().sum(axis=2)
+        return type(self)(window(kept, np.zeros_like(stop), stop))
+
+    def cut(self, start: float = 0.0, stop: float = np.inf) -> "Recording":
+        """Return the samples with start ≤ t < stop (s) of every trajectory; time starts anew."""
+        N = self.mask.shape[2]
+        first, last = (
+            int(np.clip(np.ceil(t / self.dt - 1e-6), 0, N)) for t in (start, min(stop, N * self.dt))
+        )
+        ones = np.ones_like(self.lengths)
+        if last <= first or not (self.lengths > first).any():
+            raise UserError(f"cut: no sample between {start:g} and {stop:g} s")
+        return type(self)(window(self.dataset, first * ones, last * ones))
+
+    def split_by_time(
+        self, held_out: float = 0.25, gap: float = 1.0
+    ) -> "tuple[Recording, Recording]":
+        """Split every trajectory: the first part to learn from, the last part held out.
+
+        The `gap` (s) between them is dropped so that the end of one doesn't tell the other.
+        """
+        _check_fraction(held_out)
+        skip = int(np.ceil(gap / self.dt - 1e-9))
+        known = np.rint(self.lengths * (1 - held_out)).astype(int)
+        if not (self.lengths > known + skip).any() or not (known > 1).any():
+            raise UserError(
+                f"split: trajectories of {self.lengths.max() * self.dt:g} s are too short for "
+                f"{held_out:g} held out after a gap of {gap:g} s"
+            )
+        learn = window(self.dataset, np.zeros_like(known), known)
+        return type(self)(learn), type(self)(window(self.dataset, known + skip, self.lengths))
+
+    def split_by_run(
+        self, held_out: float | Sequence[str] = 0.25, seed: int | None = None
+    ) -> "tuple[Recording, Recording]":
+        """Split by whole runs: named scenarios held out, or a fraction of each scenario's runs.
+
+        With a fraction every scenario keeps at least one run on both sides; the last ones are held
+        out, or with a seed a random choice.
+        """
+        if not isinstance(held_out, float | int):
+            inside = [name for name in self.scenarios if name not in set(held_out)]
+            return self.select(inside), self.select(list(held_out))
+        _check_fraction(float(held_out))
+        lengths = self.lengths
+        learn, test = lengths.copy(), lengths.copy()
+        rng = np.random.default_rng(seed) if seed is not None else None
+        for j in range(lengths.shape[0]):
+            runs = np.flatnonzero(lengths[j])
+            if runs.size < 2:
+                raise UserError(
+                    f"split: scenario '{self.scenarios[j]}' has a single run; split by time "
+                    "or name the scenarios to hold out"
+                )
+            order = runs if rng is None else rng.permutation(runs)
+            count = int(np.clip(round(held_out * runs.size), 1, runs.size - 1))
+            learn[j, order[-count:]] = 0
+            test[j, order[:-count]] = 0
+        zero = np.zeros_like(lengths)
+        return type(self)(window(self.dataset, zero, learn)), type(self)(
+            window(self.dataset, zero, test)
+        )
+
+    def split(
+        self,
+        held_out: float = 0.25,
+        by: Literal["auto", "time", "run"] = "auto",
+        gap: float = 1.0,
+    ) -> "tuple[Recording, Recording]":
+        """Split honestly: by run where every scenario has several, else by time."""
+        if by == "auto":
+            by = "run" if (np.count_nonzero(self.lengths, axis=1) > 1).all() else "time"
+        return self.split_by_run(held_out) if by == "run" else self.split_by_time(held_out, gap)
+
+    @classmethod
+    def concat(cls, recordings: "Sequence[Recording]") -> "Recording":
+        """Join recordings of equal step; scenarios of equal name gain repetitions.
+
+        Commands that not all of them hold are dropped; other variables are NaN where they lack.
+
+        Raises:
+            UserError: for unequal steps, thruster counts or vehicles, or no command in common.
+        """
+        if not recordings:
+            raise UserError("concat: no recording given")
+        steps = {recording.dt for recording in recordings}
+        if max(steps) - min(steps) > 1e-9 * max(steps):
+            raise UserError(f"concat: unequal steps {sorted(steps)} s; import at one rate")
+        vehicles = {recording.vehicle for recording in recordings} - {""}
+        if len(vehicles) > 1:
+            raise UserError(f"concat: different vehicles {sorted(vehicles)}; join them one by one")
+        common = [c for c in COMMANDS if all(c in recording.commands for recording in recordings)]
+        if not common:
+            raise UserError(
+                "concat: no command in common; turn each into F_Bo_B with its wrench(vehicle) first"
+            )
+        parts = [
+            Trajectory(
+                t.scenario, t.X_WB, t.V_WB_B, {c: t.commands[c] for c in common}, t.sensors, t.start
+            )
+            for recording in recordings
+            for t in recording.trajectories()
+        ]
+        notes = dict.fromkeys(note for recording in recordings for note in recording.notes)
+        sources = dict.fromkeys(str(r.dataset.attrs.get("source", "")) for r in recordings)
+        joined = cls.from_trajectories(
+            parts,
+            recordings[0].dt,
+            vehicle=vehicles.pop() if vehicles else "",
+            source="; ".join(source for source in sources if source),
+            notes=list(notes),
+        )
+        period = max(recording.command_period for recording in recordings)
+        return cls(joined.dataset.assign_attrs(command_period=period))
+
+    # files
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write NetCDF-4 (compressed); the file appears whole or not at all."""
+        encoding = {
+            name: {"zlib": True, "complevel": 4, "shuffle": True}
+            for name, variable in self.dataset.data_vars.items()
+            if variable.ndim >= 3
+        }
+        save_netcdf(self.dataset, path, encoding)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "Recording":
+        """Read what `save` wrote, into memory.
+
+        Raises:
+            UserError: if the file is missing, no NetCDF, or no recording.
+        """
+        path = Path(path)
+        dataset = load_netcdf(path)
+        if not _is_recording(dataset):
+            raise UserError(f"{path}: a NetCDF file, but no recording (see docs/recording.md)")
+        if dataset.attrs["format"] != FORMAT:
+            raise UserError(
+                f"{path}: written as '{dataset.attrs['format']}', this version reads '{FORMAT}'"
+            )
+        try:
+            recording = cls(dataset)
+            check_plausible(dataset)
+        except ValueError as error:
+            raise UserError(f"{path}: {error}") from error
+        return recording
+
+    @staticmethod
+    def is_one(path: Path) -> bool:
+        """Whether a file says that `save` wrote it, whatever else is wrong with it."""
+        try:
+            return _is_recording(load_netcdf(path))
+        except UserError:
+            return False
+
+
+def _is_recording(dataset: xr.Dataset) -> bool:
+    """Of this version's format or another's."""
+    return str(dataset.attrs.get("format", "")).startswith(FORMAT.rsplit(" ", 1)[0])
+
+
+def _check_fraction(held_out: float) -> None:
+    if not 0 < held_out < 1:
+        raise UserError(f"held_out: must lie between 0 and 1, got {held_out:g}")

@@ -1,0 +1,1 @@
+"""Vehicles in numbers: the presets that are shipped, their thrusters' curves."""

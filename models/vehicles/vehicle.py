@@ -1,0 +1,179 @@
+"""A vehicle in numbers: hull, hydrodynamics, thrusters, battery; and the presets that are shipped.
+
+All coefficients are stated about Bo in B (forward, left, up). Added mass and damping are positive
+magnitudes, diagonal, of the SNAME derivatives (X_u̇ and so on, whose own sign is negative); a
+diagonal is the same in forward-left-up and in forward-starboard-down axes.
+"""
+
+import os
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..config.checks import Vector3, Vector6, check_numbers, require
+from ..config.errors import UserError
+from ..config.typed_yaml import load
+from ..rigid_body import FossenDynamics, spatial_inertia
+from ..thruster_curves import QuadraticCurve, T200Curve
+from ..thrusters import Thrusters
+
+_FOLDER = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class T200:
+    """Blue Robotics T200 (see `thruster_curves.T200Curve`)."""
+
+    def build(self, dtype: jnp.dtype | type) -> T200Curve:
+        return T200Curve(dtype)
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """F = `full_force` u|u|, in N at full command; `dead_band` in µs on either side of 1500."""
+
+    full_force: float
+    dead_band: float = 25.0
+
+    def build(self, dtype: jnp.dtype | type) -> QuadraticCurve:
+        return QuadraticCurve(self.full_force, self.dead_band, dtype)
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Where a thruster sits (m from Bo) and its force in B per newton at PWM above 1500.
+
+    `motor` is ArduSub's MOT_n_DIRECTION: -1 where PWM above 1500 turns the propeller backwards.
+    """
+
+    position: Vector3
+    direction: Vector3
+    motor: float = 1.0
+
+
+@dataclass(frozen=True)
+class Propulsion:
+    """Eight thrusters in ArduSub's order; lag (s); battery's open voltage (V), resistance (Ω)."""
+
+    mounts: tuple[Mount, ...]
+    curve: T200 | Quadratic = field(default_factory=T200)
+    time_constant: float = 0.0
+    start_delay: float = 0.0
+    voltage: float = 16.0
+    resistance: float = 0.0
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """Everything the models need to know of a vehicle; SI units, B forward-left-up, Bo the origin.
+
+    `sources` says for each entry (by its path, such as `propulsion.mounts`) where it comes from;
+    [E] marks an engineering estimate. The file of every shipped preset has one for every number.
+    """
+
+    name: str
+    description: str
+    size: Vector3
+    mass: float
+    inertia: Vector3
+    weight: float
+    buoyancy: float
+    center_of_mass: Vector3
+    center_of_buoyancy: Vector3
+    added_mass: Vector6
+    linear_damping: Vector6
+    quadratic_damping: Vector6
+    water_density: float
+    propulsion: Propulsion
+    sources: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self):
+        check_numbers(self)
+        for name in ("mass", "weight", "buoyancy", "water_density"):
+            require(getattr(self, name) > 0, self, name, "give a positive number")
+        for name in ("size", "inertia"):
+            require(min(getattr(self, name)) > 0, self, name, "give three positive numbers")
+        for name in ("added_mass", "linear_damping", "quadratic_damping"):
+            require(
+                min(getattr(self, name)) >= 0,
+                self,
+                name,
+                "give positive magnitudes, not derivatives",
+            )
+        a, b, c = sorted(self.inertia)
+        require(a + b >= c, self, "inertia", "no body has one moment above the other two together")
+        if len(self.propulsion.mounts) != 8:
+            raise UserError(
+                f"Vehicle.propulsion.mounts has {len(self.propulsion.mounts)} thrusters: give 8, "
+                "in ArduSub's order."
+            )
+        self.thrusters()
+
+    def dynamics(
+        self, diffusion: Float[np.ndarray, "6"] | None = None, dtype: jnp.dtype | type = float
+    ) -> FossenDynamics:
+        """Fossen's model with constant coefficients; `diffusion` b in N√s and N·m√s (0 if None)."""
+        return FossenDynamics(
+            rigid_inertia=spatial_inertia(
+                self.mass, np.array(self.center_of_mass), np.diag(self.inertia)
+            ),
+            added_mass=np.diag(self.added_mass),
+            linear_drag=np.diag(self.linear_damping),
+            quadratic_drag=np.diag(self.quadratic_damping),
+            weight=self.weight,
+            buoyancy=self.buoyancy,
+            p_BoBcm_B=np.array(self.center_of_mass),
+            p_BoCb_B=np.array(self.center_of_buoyancy),
+            diffusion=diffusion,
+            dtype=dtype,
+        )
+
+    def thrusters(self, dtype: jnp.dtype | type = float) -> Thrusters:
+        """The eight thrusters with their curve, lag and battery."""
+        p = self.propulsion
+        return Thrusters(
+            np.array([mount.position for mount in p.mounts]).T,
+            np.array([mount.direction for mount in p.mounts]).T,
+            p.curve.build(dtype),
+            motor_directions=np.array([mount.motor for mount in p.mounts]),
+            time_constant=p.time_constant,
+            start_delay=p.start_delay,
+            nominal_voltage=p.voltage,
+            resistance=p.resistance,
+            dtype=dtype,
+        )
+
+
+def vehicle_names() -> tuple[str, ...]:
+    """Names of the shipped presets."""
+    return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
+
+
+def load_vehicle(name_or_path: str | Path) -> Vehicle:
+    """Read a preset by its name, or a vehicle's YAML file by its path (anything with a suffix).
+
+    Raises:
+        UserError: there is no such preset or file, or its content is no vehicle.
+    """
+    if isinstance(name_or_path, Path) or Path(name_or_path).suffix:
+        if not os.path.exists(name_or_path):  # its name may come from data, so say what it is
+            raise UserError(
+                f"vehicle `{name_or_path}`: there is no such file; name a preset or the path of a "
+                ".yaml file"
+            )
+        return load(Vehicle, name_or_path)
+    if name_or_path not in vehicle_names():
+        raise UserError(
+            f"vehicle `{name_or_path}` is no preset; take one of {', '.join(vehicle_names())}, or "
+            "the path of a .yaml file"
+        )
+    return _preset(str(name_or_path))
+
+
+@lru_cache
+def _preset(name: str) -> Vehicle:
+    return load(Vehicle, _FOLDER / f"{name}.yaml")

@@ -1,0 +1,160 @@
+"""Cases whose answer is known: a folder each, with data, sealed answer and the true model's view.
+
+docs/blind-cases.md describes the form; a case is drawn and simulated by code that shares nothing
+with this package.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from ...models.config import typed_yaml
+from ...models.config.errors import UserError
+from ...models.effects.library import kind
+from ...models.effects.unknown import Unknown
+from ...training.diagnosis.findings.result import Verdict
+
+USUAL = "usual"
+"""Data recorded as most cases are."""
+Kind = Literal["null", "single", "pair", "triple", "unknown", "fault"]
+
+
+@dataclass(frozen=True)
+class HiddenCause:
+    """One cause that is hidden.
+
+    Attributes:
+        name: of the cause, or `unknown`.
+        where: as a diagnosis says it; empty if that is not judged.
+        parameters: in the definitions and units of the effect of that name; only these are judged.
+        tolerance: share of a parameter by which definitions may differ, before errors count.
+        twins: names that such data can't tell apart from it for physical reasons.
+        variables: of an unknown: inputs that it depends on.
+    """
+
+    name: str
+    where: str = ""
+    parameters: dict[str, float] = field(default_factory=dict)
+    tolerance: float = 0.0
+    twins: tuple[str, ...] = ()
+    variables: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.name != Unknown.name:
+            known = {p.name for p in kind(self.name).parameters}
+            if wrong := set(self.parameters) - known:
+                raise ValueError(
+                    f"parameters: {self.name} has {', '.join(sorted(known))}, not "
+                    f"{', '.join(sorted(wrong))}"
+                )
+
+
+@dataclass(frozen=True)
+class Truth:
+    """`truth.yaml`: what is hidden in a case.
+
+    Attributes:
+        kind: which table a case belongs to.
+        label: what is counted together; by default the hidden names.
+        size: times a realistic size.
+        data: how they were recorded, where not as usual; such cases are counted apart.
+        verdict: what a diagnosis should say.
+        causes: what is hidden.
+        vehicle: the belief; empty for what the data name.
+        diffusion: that is believed (N√s, N·m√s); empty for none.
+        every: samples of a window of the forecasts in `oracle/`.
+        problems: words of which each must be in what is said about faults of the data.
+        limits: words of which each must be in what is said not to be identifiable.
+    """
+
+    kind: Kind
+    verdict: Verdict
+    label: str = ""
+    size: float = 1.0
+    data: str = USUAL
+    causes: tuple[HiddenCause, ...] = ()
+    vehicle: str = ""
+    diffusion: tuple[float, ...] = ()
+    every: int = 20
+    problems: tuple[str, ...] = ()
+    limits: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.diffusion) not in (0, 6):
+            raise ValueError(f"diffusion: give six numbers or none, not {len(self.diffusion)}")
+        if self.every < 1:
+            raise ValueError(f"every: is {self.every}; give at least 1")
+
+    @property
+    def called(self) -> str:
+        """What the case is counted under."""
+        return self.label or " + ".join(cause.name for cause in self.causes) or self.kind
+
+
+@dataclass(frozen=True)
+class Case:
+    """A folder with a case."""
+
+    folder: Path
+    truth: Truth
+
+    @property
+    def name(self) -> str:
+        """Of the folder."""
+        return self.folder.name
+
+    def __str__(self) -> str:
+        return self.name
+
+    @property
+    def has_oracle(self) -> bool:
+        """Whether there are data that no diagnosis sees, with the true model's forecasts."""
+        return (self.folder / "oracle").is_dir() and (self.folder / "fresh").is_dir()
+
+
+def find_cases(folder: str | os.PathLike[str], only: Sequence[str] = ()) -> list[Case]:
+    """The cases in a folder, by name; `only` are patterns of names, or labels.
+
+    Raises:
+        UserError: there is none, or a truth can't be read.
+    """
+    paths = sorted(Path(folder).absolute().glob("*/truth.yaml"))
+    if not paths:
+        raise UserError(
+            f"--cases {folder}: holds no case (a folder with truth.yaml); docs/blind-cases.md says "
+            "how to write some"
+        )
+    cases = [Case(path.parent, typed_yaml.load(Truth, path)) for path in paths]
+    if not only:
+        return cases
+    kept = [
+        c for c in cases if any(fnmatchcase(n, o) for o in only for n in (c.name, c.truth.called))
+    ]
+    if not kept:
+        raise UserError(f"--only {' '.join(only)}: fits none of the {len(cases)} cases there")
+    return kept
+
+
+def read_oracle(folder: Path) -> list[tuple[Float[np.ndarray, "7 N"], Float[np.ndarray, "6 N"]]]:
+    """Poses and twists that the true model forecasts, run by run in the order of names.
+
+    Raises:
+        UserError: a column is missing.
+    """
+    names = ["qw", "qx", "qy", "qz", "x", "y", "z", "u", "v", "w", "p", "q", "r"]
+    found = []
+    for path in sorted(folder.glob("*.csv")):
+        table = np.genfromtxt(path, delimiter=",", names=True)
+        if lacking := [n for n in names if n not in (table.dtype.names or ())]:
+            raise UserError(f"{path}: lacks the column {lacking[0]}")
+        values = np.stack([table[n] for n in names])
+        found.append((values[:7], values[7:]))
+    if not found:
+        raise UserError(f"{folder}: holds no CSV file")
+    return found

@@ -1,0 +1,196 @@
+"""One case judged: names, parameters, gain against the true model's."""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ...models import se3
+from ...models.dynamics import Dynamics
+from ...models.effects.extended import Extended
+from ...models.recordings.csv import read_csv
+from ...models.recordings.store import Recording
+from ...models.vehicles.vehicle import Vehicle, load_vehicle
+from ...training.diagnosis.data.arrays import make_data
+from ...training.diagnosis.findings.result import Cause, Diagnosis
+from ...training.diagnosis.pipeline import DiagnoseConfig, Finding, diagnose
+from ...training.diagnosis.validation.forecast import Learned, forecast
+from ..progress import Update
+from .cases import Case, HiddenCause, Truth, read_oracle
+
+CLOSE = 3.0
+"""Standard errors within which a parameter is right."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """How a diagnosis compares with the truth.
+
+    Attributes:
+        case, kind, label, size, data: which.
+        verdict, verdict_right: what was said, and whether it is so.
+        hidden, named: names, as drawn and as told.
+        first_right: the first name is hidden, or the twin of one that is.
+        declared: it is, or what is hidden is told to be indistinguishable from the first name.
+        place_right: so is the place of the first one; None where it is not judged.
+        recalled, spurious: hidden causes that were named, names that are not hidden.
+        z: deviation of each judged parameter in standard errors, by cause and name.
+        ratio: found over true value.
+        gain: share of the true model's gain over the belief, by part of the state and over `all`
+            (m, rad, m/s and rad/s alike); 1 is as good as the true model.
+        told: whether each fault and limit of the data was told; None where there are none.
+        seconds: of the diagnosis.
+    """
+
+    case: str
+    kind: str
+    label: str
+    size: float
+    data: str
+    verdict: str
+    verdict_right: bool
+    hidden: list[str]
+    named: list[str]
+    first_right: bool
+    declared: bool
+    place_right: bool | None
+    recalled: int
+    spurious: int
+    z: dict[str, float] = field(default_factory=dict)
+    ratio: dict[str, float] = field(default_factory=dict)
+    gain: dict[str, float] = field(default_factory=dict)
+    told: bool | None = None
+    seconds: float = 0.0
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON."""
+        return asdict(self)
+
+
+def fits(hidden: HiddenCause, found: Cause) -> bool:
+    """Whether a named cause is the hidden one or can't be told from it."""
+    if hidden.name == "unknown":
+        if found.name != "unknown":
+            return False
+        seen = found.structure.variables if found.structure is not None else []
+        return not hidden.variables or bool(set(hidden.variables) & set(seen))
+    return found.name == hidden.name or found.name in hidden.twins
+
+
+def compare(truth: Truth, d: Diagnosis) -> dict[str, Any]:
+    """Everything but the gain."""
+    causes = d.causes
+    first = causes[0] if causes else None
+    matched = [h for h in truth.causes if first is not None and fits(h, first)]
+    alike = () if first is None else first.indistinguishable_from
+    told_alike = [h for h in truth.causes if h.name in alike]
+    place = None
+    if first is not None and matched and matched[0].where and matched[0].name == first.name:
+        places = {w.strip() for w in first.where.split(",")}
+        places |= {c.where for c in causes if c.name == first.name}
+        place = matched[0].where in places
+    z, ratio = {}, {}
+    for h in truth.causes:
+        same = [c for c in causes if c.name == h.name and h.where in ("", c.where)]
+        same = same or [c for c in causes if c.name == h.name]
+        for name, true in h.parameters.items() if same else ():
+            value = same[0].parameters.get(name)
+            if value is None:
+                continue
+            error = (value.interval95[1] - value.interval95[0]) / 3.92
+            if not np.isfinite(error):
+                continue  # said not to be known
+            off = max(abs(value.value - true) - h.tolerance * abs(true), 0.0)
+            key = f"{h.name}.{name}"
+            z[key] = float(np.copysign(off / max(error, 1e-300), value.value - true))
+            if true:
+                ratio[key] = value.value / true
+    told = None
+    if truth.problems or truth.limits:
+        faults, limits = " ".join(d.data.problems), " ".join(d.data.limits)
+        told = all(w in faults for w in truth.problems) and all(w in limits for w in truth.limits)
+    return {
+        "verdict": d.verdict,
+        "verdict_right": d.verdict == truth.verdict,
+        "hidden": [h.name for h in truth.causes],
+        "named": [c.name for c in causes],
+        "first_right": bool(matched) if truth.causes else not causes,
+        "declared": bool(matched or told_alike) if truth.causes else not causes,
+        "place_right": place,
+        "recalled": sum(any(fits(h, c) for c in causes) for h in truth.causes),
+        "spurious": sum(not any(fits(h, c) for h in truth.causes) for c in causes),
+        "z": z,
+        "ratio": ratio,
+        "told": told,
+    }
+
+
+def gain_of(case: Case, base: Extended, extended: Extended, vehicle: Vehicle) -> dict[str, float]:
+    """1 - |extended - oracle|² / |base - oracle|² over all windows of the fresh runs.
+
+    The recorded noise cancels: forecasts are compared with those of the true model, and all three
+    start from the same records.
+    """
+    return share_of_gain(case, vehicle, (base, None), (extended, None))
+
+
+def share_of_gain(
+    case: Case,
+    vehicle: Vehicle,
+    base: tuple[Extended, Learned | None],
+    better: tuple[Extended, Learned | None],
+) -> dict[str, float]:
+    """The same of models with a learned rest beside them."""
+    fresh = read_csv(case.folder / "fresh", resample=False)
+    data = make_data(fresh, vehicle, segment=10**9, remembered=0.0)
+    truths = read_oracle(case.folder / "oracle")
+    every = case.truth.every
+    off = [_off(forecast(model, data, every, rest), truths) for model, rest in (base, better)]
+    for one in off:
+        one["all"] = sum(one.values())
+    return {part: 1 - off[1][part] / max(off[0][part], 1e-300) for part in off[0]}
+
+
+def believed(truth: Truth, recording: Recording) -> tuple[Vehicle, Dynamics | None]:
+    """The vehicle that a case believes in, and its law where the case states one."""
+    vehicle = load_vehicle(truth.vehicle or recording.vehicle or "bluerov2_heavy")
+    if not truth.diffusion:
+        return vehicle, None
+    return vehicle, vehicle.dynamics(np.array(truth.diffusion, float))
+
+
+def _off(
+    told: tuple[Float[np.ndarray, "N 7 R"], Float[np.ndarray, "N 6 R"]],
+    truths: list[tuple[np.ndarray, np.ndarray]],
+) -> dict[str, float]:
+    total = {"position": 0.0, "rotation": 0.0, "velocity": 0.0, "rate": 0.0}
+    for r, (X, V) in enumerate(truths):
+        count = min(X.shape[1] - 1, len(told[0]))
+        X1, V1 = jnp.asarray(X[:, 1 : 1 + count]), V[:, 1 : 1 + count]
+        X2, V2 = jnp.asarray(told[0][:count, :, r].T), told[1][:count, :, r].T
+        turn = se3.log(se3.compose(se3.inverse(X1), X2))[3:]
+        parts = (np.asarray(X2 - X1)[4:], np.asarray(turn), V2[:3] - V1[:3], V2[3:] - V1[3:])
+        for name, part in zip(total, parts, strict=True):
+            total[name] += float(np.sum(part**2))
+    return total
+
+
+def judge(case: Case, alpha: float, progress: Update) -> tuple[Judgement, Finding]:
+    """Diagnose the data of a case, then open its truth.
+
+    Raises:
+        UserError: the data can't be read.
+    """
+    recording = read_csv(case.folder / "data", resample=False)
+    truth = case.truth
+    vehicle, base = believed(truth, recording)
+    finding = diagnose(recording, vehicle, base, DiagnoseConfig(alpha=alpha), progress)
+    d = finding.diagnosis
+    gain = {}
+    if case.has_oracle and truth.causes:
+        gain = gain_of(case, finding.extended.with_effects(()), finding.extended, vehicle)
+    told = compare(truth, d)
+    about = {"case": case.name, "kind": truth.kind, "label": truth.called, "size": truth.size}
+    return Judgement(**about, data=truth.data, **told, gain=gain, seconds=d.seconds), finding

@@ -1,0 +1,259 @@
+"""A diagnosis as a page."""
+
+import math
+
+from ...models.effects.base import AXES
+from ...training.diagnosis.findings.maneuver_library import TRIALS
+from ...training.diagnosis.findings.result import Cause, Diagnosis, Interval, Value
+from ...training.diagnosis.pipeline import Finding
+from .figures_diagnosis import (
+    CONTENDERS,
+    experiments_figure,
+    horizon_figure,
+    innovations_figure,
+    names_figure,
+    residual_figure,
+)
+from .figures_maps import in_one_noise, map_figure
+from .figures_simulated import axes_figure, bands_figure, runs_figure, simulated_map_figure
+from .figures_structure import memory_figure, repeats_figure, state_space_figure
+from .pages import Page
+
+_LEFT_OUT = {
+    "scenario": "Each model and its noise levels were fitted without the scenario it is judged on.",
+    "run": "There is one scenario: each model was fitted without the runs that it is judged on.",
+    "block": "There is one run: each model was fitted without the stretch that it is judged on.",
+    "nothing": "Nothing could be left out: the models are judged on what they were fitted to.",
+}
+_UNITS = (
+    "Both models are measured in one noise, that estimated with the causes: by noise levels of its "
+    "own, which hold some of its errors, a wrong belief would look like noise."
+)
+_VERDICTS = {
+    "adequate": "no difference that data tell",
+    "explained": "all that data tell has a name, or is a matter of coefficients",
+    "partly_explained": "names, and structure or errors that no name explains",
+    "unexplained": "structure or errors that no name explains",
+}
+_NOISE = {
+    "position_m": "of positions / m",
+    "attitude_rad": "of attitudes / rad",
+    "velocity_m_s": "of velocities / (m/s)",
+    "rate_rad_s": "of turning rates / (rad/s)",
+}
+_WORDS = {
+    "nat": "Unit of log likelihood: what wins n nats makes the data eⁿ times as likely. Won on "
+    "data that were left out of the fit, so that more parameters win nothing by themselves.",
+    "p": "The probability that noise alone makes one of all names look so good. Runs are counted "
+    "as independent, samples are not.",
+    "innovation": "The error of a prediction over one step that is not the noise of the record it "
+    "starts from. Of a right model it is noise: 1 in variance, without memory.",
+    "belief": "The model that was given, as it is.",
+    "refitted": "The belief with its coefficients fitted (added mass, drag and buoyancy, unless "
+    "others are asked for) and no cause named: what tuning alone wins.",
+    "with the causes": "The belief with the causes in it: the extended model.",
+    "black box": "The belief and a regression of its errors on random features, that names "
+    "nothing: what data tell to those who do not know the physics.",
+    "energy score": "Mean distance of simulations with noise from the record, less half their "
+    "mean distance from each other, over position, rotation, velocity and turning rate with m, "
+    "rad, m/s and rad/s counted alike. Smaller is better.",
+    "inside 50 %, 90 %": "The share of records inside the bands that hold 50 and 90 % of "
+    "simulations. Less: too sure of itself; more: not sure enough.",
+    "u, v, w; p, q, r": "Velocity forward, left, up; turning rate about the same axes.",
+    "f1, f2, …; X, Y, Z, K, M, N": "Commanded force of each thruster; or force and moment, where "
+    "these are commanded. Effort is the sum of the thrusters' absolute forces.",
+}
+
+
+def diagnosis_page(finding: Finding, title: str) -> Page:
+    """Verdict, causes, where the error lives, gain, data."""
+    d = finding.diagnosis
+    shared = in_one_noise(finding)
+    page = Page(
+        title, f"{len(d.data.scenarios)} scenarios, {d.data.runs} runs, {d.data.seconds:.0f} s"
+    )
+    page.verdict(d.sentence, good=d.verdict == "adequate")
+    page.text(
+        f"Verdict: **{d.verdict.replace('_', ' ')}** ({_VERDICTS[d.verdict]}). Words are explained "
+        "[at the end](#words)."
+    )
+    for problem in d.data.problems:
+        page.text(f"**Data:** {problem}")
+    page.section("Causes")
+    if d.causes:
+        page.table(
+            [
+                (
+                    c.name,
+                    c.where,
+                    "; ".join(_told(k, v) for k, v in c.parameters.items()),
+                    f"{c.evidence.heldout_gain:.0f}",
+                    _probability(c.evidence.p_value),
+                    ", ".join(c.indistinguishable_from) or "–",
+                    c.next_experiment,
+                )
+                for c in d.causes
+            ],
+            (
+                "cause", "where", "parameters (95 %)", "nats won", "p", "could as well be",
+                "next experiment",
+            ),
+        )  # fmt: skip
+        page.text("What other names would have won in its place:")
+        page.table([(f"{c.name} ({c.where})", _rivals(c)) for c in d.causes],
+                   ("cause", "rivals, with nats"))  # fmt: skip
+    else:
+        page.text(
+            f"None of {d.tested} names wins more than noise alone can win ({d.threshold:.1f} nats "
+            f"at a false-alarm rate of {d.alpha:g})."
+        )
+    for c in d.causes:
+        if c.structure is not None:
+            s = c.structure
+            page.text(
+                f"**Unknown:** {s.description} wins {s.heldout_gain:.0f} nats; the best name would "
+                f"win {s.best_name_gain:.0f} of them."
+            )
+    if d.ratios:
+        page.text("What the motion tells whatever the mass, over the inertia of the axis:")
+        page.table(
+            [(r.name, r.where, f"{r.believed:.4g}", _valued(r.found))
+             for r in d.ratios],
+            ("ratio", "where", "believed", "found (95 %)"),
+        )  # fmt: skip
+    if d.refitted:
+        page.text("Coefficients that were fitted before any cause was named:")
+        page.table(
+            [(r.name, r.where, f"{r.believed:.4g}", _told(r.parameter, r.fitted))
+             for r in d.refitted],
+            ("coefficient", "where", "believed", "fitted (95 %)"),
+        )  # fmt: skip
+    page.figure(names_figure(finding), "Each name alone, fitted on the other scenarios.")
+    following = experiments_figure(d)
+    if following is not None:
+        page.figure(
+            following,
+            "What each maneuver of a set is expected to tell about a cause, beside its closest "
+            "rivals: simulated by the model with the causes, looked at as these data were.",
+        )
+        trials = dict.fromkeys(t for c in d.causes for t in c.experiments)
+        page.table([(t, TRIALS[t].text) for t in trials if t in TRIALS], ("maneuver", "what to do"))
+    page.section("Simulations beside the records")
+    page.figure(
+        bands_figure(finding),
+        "The run with the median error in the scenario that the belief forecasts worst. Bands hold "
+        "the disturbance and the records' noise.",
+    )
+    page.figure(
+        axes_figure(finding),
+        "Root mean square error of noise-free simulations from recorded states, axis by axis.",
+    )
+    page.figure(
+        runs_figure(shared),
+        "Root mean square of all axes, run by run (long runs: piece by piece). " + _UNITS,
+    )
+    page.section(
+        "Where the error lives",
+        "Innovations are the errors of one-step predictions, in units of what the noise explains. "
+        + _UNITS,
+    )
+    page.figure(
+        map_figure(shared),
+        "How much of each axis' innovations depends on each state and input, on time in the run "
+        "and on the run. Pale is noise; grey did not vary.",
+    )
+    page.figure(
+        simulated_map_figure(shared),
+        "The same of the errors at the ends of simulations, against the means over each of them. "
+        "Grey did not vary: time, say, where each run has room for one simulation.",
+    )
+    page.figure(
+        state_space_figure(shared),
+        "Where in state space: the axes with most structure, over what tells most of each.",
+    )
+    page.section("Error or noise")
+    page.figure(
+        repeats_figure(shared),
+        "What repeats is error, what doesn't is noise. Dashed: as much as noise alone makes.",
+    )
+    page.figure(innovations_figure(shared), "Repeated runs average the noise, errors stay.")
+    page.figure(
+        memory_figure(shared),
+        "What innovations remember, and at which frequencies they are. Grey and dashed: noise.",
+    )
+    page.figure(
+        residual_figure(shared),
+        "What is left by channel: errors of pose (seen from the vehicle) and twist.",
+    )
+    page.section("Gain", _LEFT_OUT[d.left_out])
+    page.table(
+        _gains(d),
+        (
+            "model", "nats a sample", "won over the belief", "energy score", "inside 50 % bands",
+            "inside 90 % bands",
+        ),
+    )  # fmt: skip
+    page.figure(
+        horizon_figure(d),
+        "Root mean square error of noise-free simulations from recorded states, and energy score "
+        "of simulations with noise (m, rad, m/s and rad/s alike); bands: 95 %. ↑: the largest "
+        "error of a model that is far beyond the panel.",
+    )
+    page.section("Data")
+    page.table(
+        {
+            "commands": d.data.command,
+            "step / s": d.data.step,
+            **{f"estimated noise {_noise(k)}": v for k, v in d.data.noise.items()},
+        },
+        caption="Standard deviations of the records, mean over axes, and diffusion of the random "
+        "disturbance, as estimated from these data with the causes.",
+    )
+    for limit in d.data.limits:
+        page.text(f"Not told: {limit}.")
+    page.section("Words").table(_WORDS)
+    return page.footer(f"{d.tested} names, {d.seconds:.0f} s")
+
+
+def _noise(key: str) -> str:
+    """A noise level of the data in words, with its unit."""
+    axis = key.removeprefix("diffusion_")
+    if axis == key:
+        return _NOISE.get(key, key.replace("_", " "))
+    return f"of the disturbance, {axis} / {'N√s' if axis in AXES[:3] else 'N·m√s'}"
+
+
+def _probability(p: float) -> str:
+    told = "< 1e-300" if p == 0 else f"{p:.2g}" if math.isfinite(p) else "–"
+    return told.replace("-", "−")
+
+
+def _rivals(c: Cause) -> str:
+    return ", ".join(f"{r.name} ({r.where}) {r.heldout_gain:.0f}" for r in c.rivals) or "–"
+
+
+def _told(name: str, v: Value) -> str:
+    return f"{name} = {_valued(v)}"
+
+
+def _valued(v: Value) -> str:
+    low, high = v.interval95
+    between = f"({low:.4g} … {high:.4g})" if math.isfinite(low) else "(not estimated)"
+    return f"{v.value:.4g} {between} {v.unit}"
+
+
+def _gains(d: Diagnosis) -> list[tuple[str, ...]]:
+    """A row a model: scores, and bands at the longest horizon."""
+    rows = []
+    for name, g in d.gain.items():
+        last = list(g.energy_score)[-1]
+        shares = [_interval(bands[last], 2) for bands in g.coverage.values()]
+        energy = f"{_interval(g.energy_score[last])} at {last} s"
+        row = (CONTENDERS[name], _interval(g.log_score, 2), _interval(g.log_score_gain, 2))
+        rows.append((*row, energy, *shares))
+    return rows
+
+
+def _interval(v: Interval, digits: int = 3) -> str:
+    low, high = v.interval95
+    return f"{v.value:.{digits}f} ({low:.{digits}f} … {high:.{digits}f})"

@@ -1,0 +1,174 @@
+"""Figures of a diagnosis: where the error lives, axis by axis against states and commands."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from ...training.diagnosis.data.arrays import Data
+from ...training.diagnosis.filter.noise import filtered, make_filter
+from ...training.diagnosis.filter.problem import Look
+from ...training.diagnosis.filter.transition import Transition
+from ...training.diagnosis.pipeline import Finding
+from .figures import panels, styled
+
+TWIST = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+_WRENCH = ("X", "Y", "Z", "K", "M", "N")
+_UNITS = {
+    **dict.fromkeys("uvw", "m/s"), **dict.fromkeys("pqr", "°/s"),
+    **dict.fromkeys(("roll", "pitch", "heading"), "°"),
+    **dict.fromkeys(("east", "north", "height"), "m"),
+    **dict.fromkeys(("X", "Y", "Z", "effort"), "N"), **dict.fromkeys("KMN", "N·m"),
+    "voltage": "share of nominal", "time": "s",
+}  # fmt: skip
+_BINS = 12
+_EQUAL = 1e-9
+"""Relative difference below which values are the same."""
+_UNKNOWN = "#d3dae0"
+"""Of cells whose variable did not vary."""
+
+
+def in_one_noise(finding: Finding) -> Finding:
+    """The same with the belief's innovations in units of the noise estimated with the causes.
+
+    Each model's own noise takes up some of its errors, so that by it a wrong one looks like noise.
+    """
+    d, look, noise = finding.data, finding.base, finding.final.noise
+    here = d.weight[:, None] > 0
+    error = np.where(here, np.asarray(look.predictions.error), 0.0)
+    jacobian = np.where(here[:, :, None], np.asarray(look.predictions.jacobian), 0.0)
+    steps = Transition.along(jacobian, d.weight, look.predictions.late)
+    inverse = np.asarray(finding.extended.inertia().inverse)
+    kalman = make_filter(noise, steps, inverse, d.dt, d.step, jacobian)
+    z = filtered(error, jacobian, kalman) * d.weight[:, None]
+    return replace(finding, base=look._replace(noise=noise, kalman=kalman, z=z))
+
+
+def run_times(d: Data) -> Float[np.ndarray, "M R"]:
+    """Times of the samples since the first that is predicted of each run (s)."""
+    lasts, starts = (d.step * d.weight).sum(axis=0), np.zeros(len(d.run))
+    for run in np.unique(d.run):
+        own = np.flatnonzero(d.run == run)
+        starts[own[1:]] = np.cumsum(lasts[own[:-1]])
+    return d.times + starts
+
+
+def variables(finding: Finding) -> dict[str, Float[np.ndarray, "N R"]]:
+    """What errors may depend on where each step begins, in the units of `labelled`.
+
+    States, the command of each thruster or of each axis of a wrench, in recordings' words, the sum
+    of thrusters' absolute forces, voltage, time in the run, and the run.
+    """
+    d = finding.data
+    qw, qx, qy, qz = (d.X[:-1, i] for i in range(4))
+    found = {n: d.V[:-1, i] for i, n in enumerate("uvw")}
+    found |= {n: np.degrees(d.V[:-1, 3 + i]) for i, n in enumerate("pqr")}
+    angles = {
+        "roll": np.arctan2(2 * (qw * qx + qy * qz), 1 - 2 * (qx**2 + qy**2)),
+        "pitch": np.arcsin(np.clip(2 * (qw * qy - qx * qz), -1, 1)),
+        "heading": np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2)),
+    }
+    found |= {n: np.degrees(angle) for n, angle in angles.items()}
+    found |= {"east": d.X[:-1, 4], "north": d.X[:-1, 5], "height": d.X[:-1, 6]}
+    if d.command == "F_Bo_B":
+        to_wrench = np.asarray(finding.extended.allocate(jnp.eye(d.u.shape[1])))
+        wrench = np.einsum("fi,nir->fnr", to_wrench, d.u)
+        found |= dict(zip(_WRENCH, wrench, strict=True))
+    else:
+        found |= {f"f{i + 1}": d.u[:, i] for i in range(d.u.shape[1])}
+    found["effort"] = np.abs(d.u).sum(axis=1)
+    found["voltage"] = d.voltage
+    found["time"] = run_times(d)[:-1]
+    found["run"] = np.broadcast_to(d.run.astype(float), d.voltage.shape)
+    return found
+
+
+def labelled(name: str) -> str:
+    """A variable with its unit, for an axis of a figure."""
+    unit = _UNITS.get(name, "N" if name[0] == "f" else "")
+    unit = f"({unit})" if "/" in unit else unit
+    return f"{name} / {unit}" if unit else name
+
+
+def binned(values: Float[np.ndarray, " n"], most: int = _BINS) -> np.ndarray | None:
+    """Bins from 0 on of about equal counts, one a value where these are few; None if all equal."""
+    if np.ptp(values) <= _EQUAL * max(float(np.abs(values).max()), 1e-3):
+        return None
+    distinct, bins = np.unique(values, return_inverse=True)
+    if len(distinct) <= most:
+        return bins
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, most + 1)))
+    if len(edges) < min(4, most + 1):  # nearly all are one value
+        return np.unique(np.sign(values - np.median(values)), return_inverse=True)[1]
+    return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
+
+
+def error_map(
+    z: Float[np.ndarray, "n a"], variables: Mapping[str, Float[np.ndarray, " n"]], most: int = _BINS
+) -> Float[np.ndarray, "a k"]:
+    """Nats by axis and variable: ½ Σ n m² of means m in bins of equal counts, less the bins.
+
+    White errors of unit variance give about zero; what depends on a variable gives much. Not a
+    number where a variable did not vary.
+    """
+    found = np.full((z.shape[1], len(variables)), np.nan)
+    for k, values in enumerate(variables.values()):
+        bins = binned(values, most)
+        if bins is None:
+            continue
+        counts = np.bincount(bins)
+        for i in range(z.shape[1]):
+            sums = np.bincount(bins, weights=z[:, i], minlength=len(counts))
+            nats = (sums**2 / np.maximum(counts, 1)).sum() / 2 - len(counts) / 2
+            found[i, k] = max(float(nats), 0.0)
+    return found
+
+
+def draw_map(
+    maps: Sequence[Float[np.ndarray, "a k"]],
+    titles: Sequence[str],
+    variables: Sequence[str],
+    axes_of: Sequence[str],
+) -> Figure:
+    """Maps of nats side by side, on one scale."""
+    height = 1.3 + 0.32 * len(axes_of)
+    figure, axes = panels(1, len(maps), height, sharey=True)
+    top = max(10.0, *(float(np.nanmax(values, initial=0.0)) for values in maps))
+    images = []
+    for ax, values, title in zip(axes[0], maps, titles, strict=True):
+        image = ax.imshow(np.log10(1 + values), vmin=0, vmax=np.log10(1 + top), cmap="PuBu")
+        images.append(image)
+        ax.set_facecolor(_UNKNOWN)
+        ax.set_aspect("auto")
+        ax.set_xticks(range(len(variables)), list(variables), rotation=90, fontsize=7.5)
+        ax.set_yticks(range(len(axes_of)), axes_of)
+        ax.grid(visible=False)
+        ax.set_title(title)
+    bar = figure.colorbar(images[0], ax=axes[0].tolist(), shrink=0.9)
+    ticks = [0, *(10**t for t in range(8) if 10**t <= top)]
+    bar.set_ticks(list(np.log10(1 + np.array(ticks))), labels=[f"{t:g}" for t in ticks])
+    bar.set_label("nats")
+    return figure
+
+
+def innovations_of(finding: Finding, look: Look) -> Float[np.ndarray, "n 6"]:
+    """Whitened innovations of the twist at all steps that exist."""
+    return look.z[:, 6:].swapaxes(1, 2)[finding.data.weight > 0].astype(float)
+
+
+def where_they_are(finding: Finding) -> dict[str, Float[np.ndarray, " n"]]:
+    """What innovations may depend on, at all steps that exist."""
+    exists = finding.data.weight > 0
+    return {name: values[exists] for name, values in variables(finding).items()}
+
+
+@styled
+def map_figure(finding: Finding) -> Figure:
+    """Where the error lives: axis against state and input, belief and explained."""
+    known = where_they_are(finding)
+    looks = (finding.base, finding.final)
+    maps = [error_map(innovations_of(finding, look), known) for look in looks]
+    return draw_map(maps, ("Belief", "With the causes"), list(known), TWIST)

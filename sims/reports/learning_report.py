@@ -1,0 +1,153 @@
+"""What training found, as sections of a page."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from ...models.dynamics import Dynamics
+from ...models.recordings.store import Recording
+from ...models.recordings.summary import summarize
+from ...training.fitting.fit import TrainingResult
+from ..learning import FINE_SUBSTEPS, Learned
+from .figures_learning import (
+    bands_figure,
+    coverage_figure,
+    error_figure,
+    learning_figure,
+    recording_figure,
+)
+from .pages import Page
+
+_LEFT_OUT = ("rmse_geodesic", "rmse_velocity", "finite")
+_SPEED = 0.5
+AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+
+
+def add_data(page: Page, recording: Recording) -> Page:
+    """What the recording holds, and lacks."""
+    minutes = recording.duration / 60
+    page.section(
+        "The data",
+        f"{minutes:.1f} minutes at {1 / recording.dt:g} Hz in {int((recording.lengths > 0).sum())} "
+        f"stretches; commands as `{recording.commands[0]}`.",
+    )
+    page.figure(recording_figure(recording), "What was measured, one colour a stretch.")
+    if recording.notes:
+        page.table([(note,) for note in recording.notes], ("what the source had and lacked",))
+    return page.details("Ranges of everything recorded", summarize(recording))
+
+
+def add_training(page: Page, learned: Learned) -> Page:
+    """Learning curves, what the data changed in the coefficients, and what went wrong."""
+    result, parts = learned.result, learned.parts
+    validation = 0 if parts.validation is None else len(parts.validation)
+    page.section(
+        "Training",
+        f"{result.steps} steps on {len(parts.learn)} windows of {parts.learn.length:g} s in "
+        f"{result.seconds:.0f} s. {taken_words(result, validation)} The other "
+        f"{len(parts.held_out)} windows were held out.",
+    )
+    caption = "Loss against steps (running median)."
+    if result.refits:
+        caption += (
+            " At dotted lines bandwidths were fitted anew: losses before and after one are of "
+            "different scales."
+        )
+    page.figure(learning_figure(result.metrics, result.refits, result.best_step), caption)
+    rows = coefficient_rows(learned.preset, learned.model)
+    page.table(
+        rows,
+        ("axis", "M preset", "M learned", "D preset", "D learned", "D^f preset", "D^f learned",
+         "b preset", "b learned"),
+        "Diagonals at rest: mass with added mass (kg, kg·m²), viscous and fluid drag, diffusion "
+        "(N√s, N·m√s). The preset's diffusion is estimated from its own errors. "
+        + scale_words(rows),
+    )  # fmt: skip
+    for event in result.events:
+        page.text(f"Step {event['step']}: {event['text']}")
+    return page
+
+
+def add_evaluation(page: Page, learned: Learned, window: int | None = None) -> Page:
+    """Held-out errors and bands, and one window in full."""
+    held_out, evaluation = learned.parts.held_out, learned.evaluation
+    page.section(
+        "Held-out error: preset against learned",
+        f"{len(held_out)} windows of {held_out.length:g} s that share no moment with training.",
+    )
+    page.figure(error_figure(evaluation), "Error of the noise-free prediction against its horizon.")
+    shown = [key for key in next(iter(evaluation.overall().values())) if key not in _LEFT_OUT]
+    page.table(
+        [(name, *(row[key] for key in shown)) for name, row in evaluation.overall().items()],
+        ("model", *(key.replace("_", " ") for key in shown)),
+        "Averages over all horizons; coverage should be 0.5 and 0.9, the energy score is small "
+        "for a law that is sharp and right.",
+    )
+    page.figure(coverage_figure(evaluation), "Calibration of the predicted bands.")
+    index = len(held_out) // 2 if window is None else window
+    page.figure(
+        bands_figure(
+            learned.model,
+            learned.preset,
+            held_out,
+            index,
+            (learned.substeps, FINE_SUBSTEPS),
+        ),
+        "One held-out window, seen from the learned model's noise-free motion: measured motion "
+        "over the learned law's 50 % and 90 % bands; dashed, the preset's prediction (cut off "
+        "where it leaves the panel).",
+    )
+    return page
+
+
+def taken_words(result: TrainingResult, validation: int) -> str:
+    """Which step's model was taken and why; `validation` is the number of windows that chose."""
+    windows = f"{validation} validation window{'s' * (validation != 1)}"
+    step, last = result.best_step, max(result.refits, default=0)
+    if validation == 0:
+        return f"No windows could be spared to choose a step by, so step {step} is taken, the last."
+    if step == 0:
+        return f"No step was better on {windows} than the start, which is taken."
+    if step <= last:
+        return (
+            f"Step {step} is taken: on {windows} none was better, also by the bandwidths that were "
+            f"fitted anew at step {last}."
+        )
+    since = f" since bandwidths were fitted anew at step {last}" if last else ""
+    return f"Step {step} is taken, whose loss on {windows} is the lowest{since}."
+
+
+def scale_words(rows: Sequence[tuple[object, ...]]) -> str:
+    """What mass and drag have in common with thrust, whose scale motion alone doesn't tell."""
+    table = np.array([[float(str(cell)) for cell in row[1:]] for row in rows])
+    mass = float(np.median(table[:, 1] / table[:, 0]))
+    drag = [table[:, 2 + k] + _SPEED * table[:, 4 + k] for k in (0, 1)]
+    ratio = float(np.median(drag[1] / np.maximum(drag[0], np.finfo(float).tiny)))
+    told = (
+        f"In the median of the axes mass is {mass:.2f} times and drag at {_SPEED:g} m/s or rad/s "
+        f"{ratio:.2f} times the preset's."
+    )
+    if (mass - 1) * (ratio - 1) <= 0:
+        return told
+    does, shows = ("overrates", "much") if mass > 1 else ("underrates", "little")
+    return f"{told} A preset that {does} thrust shows up as too {shows} of both."
+
+
+def coefficient_rows(preset: Dynamics, learned: Dynamics) -> list[tuple[object, ...]]:
+    """Diagonals of M, D, D^f and b at rest: preset, learned, for each axis."""
+    columns = []
+    for model in (preset, learned):
+        rest = jnp.zeros(6, model.rigid_inertia.dtype)
+        c = model.coefficients(rest)
+        columns.append(
+            [
+                *(np.diag(o.matrix()) for o in (c.mass, c.linear_drag, c.quadratic_drag)),
+                np.broadcast_to(np.asarray(c.diffusion), (6,)),
+            ]
+        )
+    rows: list[tuple[object, ...]] = []
+    for i, axis in enumerate(AXES):
+        cells = [float(column[k][i]) for k in range(4) for column in columns]
+        rows.append((axis, *cells))
+    return rows

@@ -1,0 +1,1 @@
+"""One run of a scenario: closed loop, log, metrics, folder."""

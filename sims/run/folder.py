@@ -1,0 +1,136 @@
+"""A run on disk: a folder whose files appear together."""
+
+import itertools
+import json
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...models.config import typed_yaml
+from ...models.files.atomic import atomic_files
+from ...models.files.locks import BusyError
+from ...models.files.owned import FolderKind, run_folder
+from ...systems.plant.wrench_limits import ThrusterLimits
+from ...training.data.provenance import revision
+from ..reports.figures_path import Scene
+from ..reports.meshcat_replay import write_replay
+from ..reports.pages import Page
+from ..reports.run_report import PACKAGES, run_page
+from ..scenarios.criteria import ReachGoal
+from ..scenarios.scenario import Scenario
+from .loop import Run
+from .metrics import clearance, metrics
+
+RUN = FolderKind("run", ("scenario.yaml", "log.nc", "metrics.json", "report.html", "meshcat.html"))
+"""What `spinndrift run` writes."""
+
+
+def write_run(run: Run, folder: str | os.PathLike[str], report: bool = True) -> dict[str, Any]:
+    """Write a run as a new folder and return its metrics.
+
+    `scenario.yaml` (defaults written out), `log.nc` (a recording), `metrics.json`, and with
+    `report` also `report.html` and `meshcat.html`. But for the block `timing` the metrics of equal
+    seeds are equal.
+
+    Raises:
+        UserError: the folder exists and is not empty, or can't be made.
+    """
+    with run_folder(folder, RUN, "", new=True) as held:
+        return write_files(run, held, report)
+
+
+def write_files(run: Run, folder: Path, report: bool = True) -> dict[str, Any]:
+    """The same into a folder that is held (`run_folder`): all files take their places at once."""
+    values = run_metrics(run)
+    with atomic_files(folder) as partial:
+        (partial / "scenario.yaml").write_text(typed_yaml.dump(run.scenario), encoding="utf-8")
+        run.log.save(partial / "log.nc")
+        text = json.dumps(values, indent=2, allow_nan=False, ensure_ascii=False)
+        (partial / "metrics.json").write_text(text + "\n", encoding="utf-8")
+        if report:
+            vehicle = run.scenario.station.load_vehicle()
+            report_page(run, values, replay="meshcat.html").write(partial / "report.html")
+            write_replay(partial / "meshcat.html", run.log, scene(run.scenario), vehicle)
+    return values
+
+
+def run_metrics(run: Run) -> dict[str, Any]:
+    """All numbers of a run, with its seed, versions and timing."""
+    scenario = run.scenario
+    station = scenario.station
+    values = metrics(
+        run.log,
+        run.outcome,
+        scenario.success,
+        station.load_vehicle(),
+        station.obstacles,
+        scenario.goal,
+    )
+    made = {"revision": revision(), **{name: metadata.version(name) for name in PACKAGES}}
+    head = {"scenario": scenario.name, "seed": scenario.seed}
+    return {**head, **values, "versions": made, "timing": run.timing.summary()}
+
+
+def scene(scenario: Scenario) -> Scene:
+    """What stands around the vehicle in a scenario's pictures."""
+    goal, success = scenario.goal, scenario.success
+    return Scene(
+        scenario.station.load_vehicle().size,
+        scenario.station.obstacles,
+        None if goal is None else (float(goal[0]), float(goal[1]), float(goal[2])),
+        success.radius if isinstance(success, ReachGoal) else 0.5,
+        scenario.station.sensing.dvl.water_depth,
+    )
+
+
+def report_page(run: Run, values: dict[str, Any], replay: str = "") -> Page:
+    """The report of a run; `replay` is the address of its 3-D replay."""
+    station = run.scenario.station
+    vehicle = station.load_vehicle()
+    limits = ThrusterLimits.create(vehicle.thrusters(), station.voltage).axes()
+    title = run.scenario.name.replace("_", " ").capitalize()
+    return run_page(
+        run.log,
+        values,
+        scene(run.scenario),
+        title=f"{title}, seed {run.scenario.seed}",
+        description=run.scenario.description,
+        scenario_text=typed_yaml.dump(run.scenario),
+        limits=np.asarray(limits),
+        clearance=clearance(run.log, vehicle, station.obstacles),
+        replay=replay,
+    )
+
+
+@contextmanager
+def new_folder(
+    out: str | os.PathLike[str] | None, scenario: Scenario, parent: str | os.PathLike[str] = "runs"
+) -> Iterator[Path]:
+    """Hold a new folder for a run: `out`, or the first free of <name>-<seed>, <name>-<seed>-2, ….
+
+    Raises:
+        UserError: `out` exists and is not empty, or it can't be made.
+    """
+    with ExitStack() as stack:
+        if out is not None:
+            yield stack.enter_context(run_folder(out, RUN, new=True))
+            return
+        names = (f"{scenario.name}-{scenario.seed}{end}" for end in _endings())
+        for path in (Path(parent) / name for name in names):
+            if os.path.lexists(path):
+                continue
+            try:
+                yield stack.enter_context(run_folder(path, RUN, "", new=True))
+            except BusyError:  # another process was as fast
+                continue
+            return
+
+
+def _endings() -> Iterator[str]:
+    yield ""
+    yield from (f"-{count}" for count in itertools.count(2))

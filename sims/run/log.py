@@ -1,0 +1,184 @@
+"""What a run leaves behind: a Recording of the true motion, with what the vehicle knew and planned.
+
+Besides the variables of every recording (`docs/recording.md`) a run's log holds, over its time:
+
+- `X_WB_estimate`, `V_WB_B_estimate`: the filter's estimates; `error_std` (18): standard deviations
+  it claims, in the order of `systems.estimation.error_state`; `error_covariance` (27): covariances
+  that it claims of δp, δθ and δv, each 3 × 3 by rows;
+- `nis`, `rejected` (3): normalised innovation squared of the last reading of `FUSED`, and how many
+  were rejected in a row;
+- `health` (5), if the filter has such a port: 0 good, 1 degraded, 2 lost, then 1 where it trusts
+  imu, dvl, depth and compass;
+- `X_WB_plan`, `V_WB_B_plan`: the plan at that time; `plan_valid`: 1 where there was one;
+- `F_disturbance_Bo_B` (N, N·m), `flow_W` (velocity m/s, acceleration m/s²): what the water did;
+
+and for every plan made (dim `plan`): `plan_time` (s), `plan_X_WB`, and of a sampling planner also
+`sample_p_WB`, `sample_weight` and `planner_figures`. Attributes: `allowed_risk` of the planner's
+chance constraint, and `least_risk`, that of the widest way to the goal.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+
+from ...models.recordings.build import Trajectory
+from ...models.recordings.store import Recording
+
+FUSED = ("dvl", "depth", "compass")
+"""Sensors whose readings the filter fuses, in the order of `nis` and `rejected`."""
+
+
+@dataclass(frozen=True)
+class Plans:
+    """Every plan of a run, thinned in time for pictures and replays.
+
+    Attributes:
+        time: when each was made (s).
+        dt: between the thinned states (s).
+        X_WB: planned poses; the first is where the vehicle was thought to be.
+        p_WB: positions of sampled paths (m, W), at `dt`, 2 `dt`, … after `time`.
+        weights: of the sampled paths.
+        figures: the planner's own figures (`systems.planning.mppi.FIGURES`).
+        allowed: probability of a collision that the planner's chance constraint allows.
+    """
+
+    time: Float[np.ndarray, " plans"]
+    dt: float
+    X_WB: Float[np.ndarray, "plans steps 7"]
+    p_WB: Float[np.ndarray, "plans sampled 3 paths"] | None = None
+    weights: Float[np.ndarray, "plans paths"] | None = None
+    figures: Float[np.ndarray, "plans figures"] | None = None
+    allowed: float | None = None
+
+    def at(self, t: float) -> int | None:
+        """Index of the plan that was the newest at time t, None before the first."""
+        index = int(np.searchsorted(self.time, t + 1e-9, side="right")) - 1
+        return None if index < 0 else index
+
+
+_PLAN_DIMS = {
+    "plan_X_WB": ("plan", "plan_step", "pose_component"),
+    "sample_p_WB": ("plan", "sample_step", "axis", "sample_path"),
+    "sample_weight": ("plan", "sample_path"),
+    "planner_figures": ("plan", "planner_figure"),
+}
+
+
+@dataclass(frozen=True)
+class RunLog:
+    """A recording of a single run with its further variables."""
+
+    recording: Recording
+
+    @classmethod
+    def create(
+        cls,
+        scenario: str,
+        dt: float,
+        variables: Mapping[str, np.ndarray],
+        plans: Plans | None = None,
+        *,
+        vehicle: str = "",
+        source: str = "",
+        notes: tuple[str, ...] = (),
+        least_risk: float | None = None,
+    ) -> "RunLog":
+        """Build from arrays with time first; `variables` holds at least X_WB, V_WB_B, F_Bo_B.
+
+        `least_risk` is the probability of a collision on the widest way to the goal.
+        """
+        rest = dict(variables)
+        X, V = rest.pop("X_WB"), rest.pop("V_WB_B")
+        commands = {name: rest.pop(name) for name in ("F_Bo_B", "pwm") if name in rest}
+        recording = Recording.from_trajectories(
+            [Trajectory(scenario, X, V, commands, rest)],
+            dt,
+            vehicle=vehicle,
+            source=source,
+            notes=notes,
+        )
+        dataset = recording.dataset
+        if plans is not None:
+            dataset = dataset.assign(_plan_variables(plans))
+            dataset.attrs["plan_dt"] = float(plans.dt)
+            if plans.allowed is not None:
+                dataset.attrs["allowed_risk"] = float(plans.allowed)
+        if least_risk is not None:
+            dataset.attrs["least_risk"] = float(least_risk)
+        return cls(Recording(dataset))
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.recording.dataset
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """A variable over time, time first."""
+        return self.recording.dataset[name].to_numpy()[0, 0]
+
+    @property
+    def time(self) -> Float[np.ndarray, " n"]:
+        """Times of the samples (s)."""
+        return self.recording.dataset["time"].to_numpy()
+
+    @property
+    def dt(self) -> float:
+        """Step (s)."""
+        return self.recording.dt
+
+    @property
+    def least_risk(self) -> float | None:
+        """Probability of a collision on the widest way to the goal, if there is a goal."""
+        return self._attribute("least_risk")
+
+    def _attribute(self, name: str) -> float | None:
+        value = self.recording.dataset.attrs.get(name)
+        return None if value is None else float(value)
+
+    @property
+    def plans(self) -> Plans | None:
+        """The plans, if any were made."""
+        data = self.recording.dataset
+        if "plan_X_WB" not in data:
+            return None
+        arrays = {n: data[n].to_numpy() if n in data else None for n in _PLAN_DIMS}
+        return Plans(
+            data["plan_time"].to_numpy(),
+            float(data.attrs["plan_dt"]),
+            arrays["plan_X_WB"],
+            arrays["sample_p_WB"],
+            arrays["sample_weight"],
+            arrays["planner_figures"],
+            self._attribute("allowed_risk"),
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write as a recording (NetCDF); appears whole or not at all."""
+        self.recording.save(path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "RunLog":
+        """Read what `save` wrote.
+
+        Raises:
+            UserError: the file is missing or no recording.
+        """
+        return cls(Recording.load(path))
+
+
+def _plan_variables(plans: Plans) -> dict[str, xr.DataArray]:
+    arrays = {
+        "plan_X_WB": plans.X_WB,
+        "sample_p_WB": plans.p_WB,
+        "sample_weight": plans.weights,
+        "planner_figures": plans.figures,
+    }
+    made = {
+        name: xr.DataArray(values, dims=_PLAN_DIMS[name])
+        for name, values in arrays.items()
+        if values is not None
+    }
+    made["plan_time"] = xr.DataArray(plans.time, dims=("plan",), attrs={"units": "s"})
+    return made

@@ -1,0 +1,333 @@
+"""Closes the loop of a scenario: builds the diagram, simulates, watches, logs."""
+
+import gc
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, Diagram
+
+from ...models.config.errors import UserError
+from ...systems.closed_loop import build_diagram, logged, seeded
+from ...systems.compiled.network import NotPureError
+from ...systems.compiled.simulator import CompiledSimulator
+from ...systems.planning.passage import Passage
+from ..scenarios.criteria import FollowPath, Monitor, Outcome
+from ..scenarios.scenario import Scenario
+from .log import RunLog
+from .signals import PlanTap, collect, log_commands, log_periods, plan_source
+from .way import check_free, find_passage, holding, no_safe_plan
+
+Progress = Callable[[float, str], None]
+Engine = Literal["auto", "drake", "compiled"]
+_WARM_UP = 0.45  # s: beyond the filter's delay, so that every event has occurred
+_WORTH_A_LOOP = 10.0  # s of a run
+_AT_ONCE = 0.2  # s that a compiled loop advances before the monitor looks at its samples
+
+
+@dataclass
+class Timing:
+    """What the clock on the wall said; no part of the log, which is the same for the same seed."""
+
+    engine: str = "drake"
+    compilation: float = 0.0
+    chunks: list[float] = field(default_factory=list)
+    planning: list[bool] = field(default_factory=list)
+    dt: float = 0.0
+
+    def add(self, spent: float, planning: bool, steps: int = 1) -> None:
+        """File the time of some steps of the log, and whether the planner was called in them."""
+        self.chunks += [spent / steps] * steps
+        self.planning += [planning] * steps
+
+    def speed(self, last: int = 0) -> float:
+        """Simulated time per time on the clock, of the whole run or its last steps."""
+        chunks = self.chunks[-last:]
+        return len(chunks) * self.dt / max(sum(chunks), 1e-9)
+
+    def summary(self) -> dict[str, float | str | None]:
+        """Who stepped, seconds of compilation, real-time factor, planner's time a call (ms)."""
+        spent, planning = 1e3 * np.array(self.chunks), np.array(self.planning, bool)
+        rest = spent[~planning]
+        calls = spent[planning] - (np.median(rest) if rest.size else 0.0)
+        return {
+            "engine": self.engine,
+            "compilation_s": self.compilation,
+            "wall_s": sum(self.chunks),
+            "real_time_factor": self.speed() if self.chunks else None,
+            "planner_median_ms": float(np.median(calls)) if calls.size else None,
+            "planner_p95_ms": float(np.percentile(calls, 95)) if calls.size else None,
+        }
+
+
+class Run(NamedTuple):
+    """What came of a scenario."""
+
+    scenario: Scenario
+    log: RunLog
+    outcome: Outcome
+    timing: Timing
+
+
+def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engine = "auto") -> Run:
+    """Fly a scenario to its end. The same scenario gives the same log, bit for bit.
+
+    Drake steps the diagram, or one compiled loop does (`systems.compiled.simulator`), some times as
+    fast; but for rounding they give the same run. By default the loop is taken if it can be, and if
+    the run may last long enough to repay its compilation.
+
+    Ctrl-C ends the flight after the sample at hand with the outcome `interrupted`; what was flown
+    until then is returned. A second one, or one before the flight, interrupts at once.
+
+    Where no way to the goal keeps to the allowed risk, a planner holds the vehicle's place, and the
+    outcome is `no safe plan`.
+
+    Raises:
+        UserError: start or goal are in an obstacle, the scenario names what can't be read, its
+            controller lacks a port, tells no plan though `FollowPath` judges by it or puts out no
+            finite wrench at t = 0, or the engine is to be `compiled` and can't.
+    """
+    return next(simulate_seeds(scenario, [scenario.seed], progress, engine))
+
+
+def simulate_seeds(
+    scenario: Scenario,
+    seeds: Iterable[int],
+    progress: Progress | None = None,
+    engine: Engine = "auto",
+) -> Iterator[Run]:
+    """Fly a scenario with one seed after the other: the runs of `simulate`, one diagram for all.
+
+    Building, tracing and compiling takes longer than many a flight. After Ctrl-C the run at hand is
+    the last.
+
+    Raises:
+        UserError: as `simulate`, when the first run is asked for.
+    """
+    tell = progress or (lambda fraction, remark: None)
+    tell(0.0, "building")
+    check_free(scenario)
+    passage = find_passage(scenario)
+    blocked = passage is not None and not passage.safe
+    diagram = build_diagram(
+        scenario.station,
+        holding(scenario) if blocked else scenario.controller,
+        log_periods=log_periods(scenario),
+        extend=log_commands(scenario),
+        goal=scenario.goal,
+    )
+    _check_plan(diagram, scenario)
+    simulator = None
+    for seed in seeds:
+        warm = simulator is not None
+        if simulator is None:
+            simulator = _simulator(diagram, scenario, engine)
+        else:
+            simulator.reset_context(diagram.CreateDefaultContext())
+        run = _one(diagram, simulator, scenario.with_changes(seed=seed), warm, tell, passage)
+        yield run
+        if run.outcome.reason == "interrupted":
+            return
+
+
+def _check_plan(diagram: Diagram, scenario: Scenario) -> None:
+    if isinstance(scenario.success, FollowPath) and plan_source(diagram) is None:
+        controller = type(diagram.GetSubsystemByName("controller")).__name__
+        raise UserError(
+            f"success: !FollowPath judges how a plan is followed, and the controller {controller} "
+            "tells none: give it an output port `plan` with the attribute `layout` "
+            "(systems.planning.plan.PlanLayout), or the scenario "
+            "success: !ReachGoal {goal: [x, y, z]}"
+        )
+
+
+def _check_start(
+    diagram: Diagram, context: Context, period: float, error: FloatingPointError
+) -> None:
+    """Blame what was not finite from the start on: there is no flight to tell of.
+
+    What a controller puts out at t = 0 acts at once or a `period` of the plant (s) later.
+    """
+    signals = logged(diagram, context)
+    acting = signals["F_acting"]
+    bad = acting.time[~np.isfinite(acting.value).all(axis=1)]
+    if bad.size and bad[0] < 1.5 * period:
+        controller = type(diagram.GetSubsystemByName("controller")).__name__
+        raise UserError(
+            f"controller {controller}: its F_Bo_B is not finite at t = 0 s; put out a finite "
+            "wrench from the start on"
+        ) from error
+    if not signals["X_WB_cheat"].time.size:
+        raise UserError(f"the run ended in its first step: {error}") from error
+
+
+def _one(
+    diagram: Diagram,
+    simulator: Simulator | CompiledSimulator,
+    scenario: Scenario,
+    warm: bool,
+    tell: Progress,
+    passage: Passage | None,
+) -> Run:
+    """Fly a diagram once, in a fresh context; `warm` says that its programs are compiled."""
+    context = simulator.get_mutable_context()
+    seeded(diagram, context, scenario.seed)
+    vehicle = scenario.station.load_vehicle()
+    obstacles = scenario.station.obstacles
+    monitor = Monitor(vehicle, obstacles, scenario.success, scenario.goal, scenario.safety)
+    tap = PlanTap(diagram, context, scenario.log.samples)
+    timing = Timing(dt=1 / scenario.log.rate)
+    started = time.perf_counter()
+    with _ticking(tell, "compiling"):
+        if isinstance(simulator, CompiledSimulator):
+            timing.engine = "compiled"
+            simulator.compile()
+        elif not warm:
+            _warm_up(diagram, min(scenario.duration, _WARM_UP))
+    timing.compilation = time.perf_counter() - started
+    with _stop_on_interrupt() as stopped, _few_collections():
+        outcome = _fly(scenario, diagram, simulator, monitor, tap, timing, tell, stopped)
+    if passage is not None and not passage.safe and outcome.reason in ("duration", "no progress"):
+        outcome = Outcome("no safe plan", outcome.time, no_safe_plan(scenario, passage))
+    log = collect(scenario, logged(diagram, context), tap, outcome.time, passage)
+    return Run(scenario, log, outcome, timing)
+
+
+def _simulator(
+    diagram: Diagram, scenario: Scenario, engine: Engine
+) -> Simulator | CompiledSimulator:
+    """Who steps a diagram."""
+    if engine == "drake" or (engine == "auto" and scenario.duration < _WORTH_A_LOOP):
+        return Simulator(diagram)
+    try:
+        return CompiledSimulator(diagram, {"log_F_acting": scenario.station.period})
+    except NotPureError as error:
+        if engine == "compiled":
+            raise UserError(
+                f"engine: this run can't be compiled: {error}; let Drake step it (drake or auto)"
+            ) from error
+        return Simulator(diagram)
+
+
+def _fly(
+    scenario: Scenario,
+    diagram: Diagram,
+    simulator: Simulator | CompiledSimulator,
+    monitor: Monitor,
+    tap: PlanTap,
+    timing: Timing,
+    tell: Progress,
+    stopped: threading.Event,
+) -> Outcome:
+    """Advance sample by sample until the monitor, the clock or the user ends the run."""
+    context = simulator.get_mutable_context()
+    station = diagram.GetSubsystemByName("station")
+    own = station.GetMyContextFromRoot(context)
+    ports = [station.GetOutputPort(name) for name in ("X_WB_cheat", "V_WB_B_cheat")]
+    sinks: list[Any] = [diagram.GetSubsystemByName(f"log_{port.get_name()}") for port in ports]
+    dt = timing.dt
+    steps = max(1, round(scenario.duration / dt))
+    stride = _samples_at_once(simulator, tap, dt)
+    k, done, outcome = 0, 0.0, None
+    try:
+        simulator.Initialize()
+        outcome = monitor.check(0.0, *(port.Eval(own) for port in ports))
+        while outcome is None:
+            stride = min(stride, steps - k)
+            started = time.perf_counter()
+            simulator.AdvanceTo((k + stride) * dt)
+            spent = time.perf_counter() - started
+            phase = (k * dt + 1e-9) % (tap.period or 1.0)
+            timing.add(spent, tap.period is not None and phase < dt - 1e-9, stride)
+            tap.read(round(k * dt, 9))
+            seen = [sink.FindLog(context).data() for sink in sinks]
+            for n in range(k + 1, k + stride + 1):
+                outcome = outcome or monitor.check(round(n * dt, 9), *(v[:, n] for v in seen))
+            k += stride
+            t = round(k * dt, 9)
+            if outcome is None and k >= steps:
+                outcome = Outcome("duration", t, f"The time was over after {t:.1f} s.")
+            elif outcome is None and k // 5 > (k - stride) // 5:
+                done = max(done, k / steps, monitor.progress)
+                tell(done, f"{t:.0f} s, {timing.speed(200):.1f} × real time")
+            if outcome is None and stopped.is_set():
+                outcome = Outcome("interrupted", t, f"Stopped by hand after {t:.1f} s.")
+        # on to the last sample's row: what the updates of its time make of it
+        simulator.AdvanceTo(k * dt + scenario.station.period)
+    except FloatingPointError as error:  # it names what was not finite
+        log = sinks[0].FindLog(context)
+        last = log.sample_times()[np.isfinite(log.data()).all(axis=0)][-1]
+        _check_start(diagram, context, scenario.station.period, error)
+        outcome = outcome or Outcome("not finite", round(float(last), 9), str(error))
+    return outcome
+
+
+def _samples_at_once(simulator: Simulator | CompiledSimulator, tap: PlanTap, dt: float) -> int:
+    """How many samples of the log to advance by, so that no plan comes and goes unseen."""
+    if isinstance(simulator, Simulator):
+        return 1
+    plans = getattr(tap.source, "period", _AT_ONCE)
+    return max(1, int(min(plans, _AT_ONCE) / dt + 1e-9))
+
+
+def _warm_up(diagram: Diagram, duration: float) -> None:
+    """Compile every event's function by a short flight in a context of its own."""
+    simulator = Simulator(diagram)
+    seeded(diagram, simulator.get_mutable_context(), 0)
+    with suppress(FloatingPointError):  # the flight that counts will tell
+        simulator.AdvanceTo(duration)
+
+
+@contextmanager
+def _ticking(tell: Progress, remark: str) -> Iterator[None]:
+    """Report every second that nothing is finished yet, while the block runs."""
+    over = threading.Event()
+
+    def tick() -> None:
+        while not over.wait(1.0):
+            tell(0.0, remark)
+
+    thread = threading.Thread(target=tick, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@contextmanager
+def _few_collections() -> Iterator[None]:
+    """Leave what exists out of Python's garbage collections: they took 5 % of a flight's time."""
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+
+
+@contextmanager
+def _stop_on_interrupt() -> Iterator[threading.Event]:
+    """Turn the first Ctrl-C into an event, in the main thread and unless the caller ignores it."""
+    event = threading.Event()
+    former = signal.getsignal(signal.SIGINT)
+    main = threading.current_thread() is threading.main_thread()
+    if not main or former is signal.SIG_IGN:
+        yield event
+        return
+
+    def stop(*_: object) -> None:
+        event.set()
+        signal.signal(signal.SIGINT, former)
+
+    signal.signal(signal.SIGINT, stop)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, former)

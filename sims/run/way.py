@@ -1,0 +1,92 @@
+"""What is judged before a scenario flies: whether start and goal are free, and the way between."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...models.config.errors import UserError
+from ...systems.controllers.kinds import ControllerKind, MppiImpedance
+from ...systems.planning.obstacles import Pylon
+from ...systems.planning.passage import Passage, upright_gap, widest_way
+from ...systems.planning.paths import PoseConfig
+from ..scenarios.criteria import ReachGoal, clearance
+from ..scenarios.scenario import Scenario
+
+
+def check_free(scenario: Scenario) -> None:
+    """Check that nothing stands where the vehicle starts and where it is to go.
+
+    Raises:
+        UserError: the hull touches a pylon there.
+    """
+    station = scenario.station
+    _check("station.start", station.start, scenario)
+    if isinstance(scenario.controller, MppiImpedance):
+        _check("controller.goal", scenario.controller.goal, scenario)
+    if isinstance(scenario.success, ReachGoal) and scenario.success.goal is not None:
+        size = station.load_vehicle().size
+        for pylon in station.obstacles:
+            gap = upright_gap(np.array(scenario.success.goal), pylon, size)
+            if gap <= 0:
+                raise UserError(_taken("success.goal", pylon, gap))
+
+
+def find_passage(scenario: Scenario) -> Passage | None:
+    """The widest way to the goal, by the planner's own measure of risk; None without a goal.
+
+    Where nothing is planned with a risk, a way is safe if the vehicle fits through.
+    """
+    if not isinstance(scenario.success, ReachGoal) or scenario.goal is None:
+        return None
+    controller, station = scenario.controller, scenario.station
+    std, allowed = 0.0, None
+    if isinstance(controller, MppiImpedance):
+        std, allowed = controller.planner.clearance_std, controller.planner.collision_risk
+    widest = widest_way(
+        np.array(station.start.position),
+        scenario.goal,
+        scenario.success.radius,
+        station.obstacles,
+        station.load_vehicle().size,
+        -station.sensing.dvl.water_depth,
+        4 * std,
+    )
+    return Passage(float(widest), std, allowed)
+
+
+def holding(scenario: Scenario) -> ControllerKind:
+    """The scenario's controller, a planner with the start as its goal: to stay where it is."""
+    controller = scenario.controller
+    if not isinstance(controller, MppiImpedance):
+        return controller
+    return replace(controller, goal=scenario.station.start)
+
+
+def no_safe_plan(scenario: Scenario, passage: Passage) -> str:
+    """The sentences that say so."""
+    held = " The vehicle held its place." if isinstance(scenario.controller, MppiImpedance) else ""
+    risk = f"has a collision risk of {_percent(passage.risk)} or more"
+    if passage.allowed is None:
+        return f"No safe plan: no way to the goal is wide enough for the hull; each {risk}.{held}"
+    allowed = _percent(passage.allowed)
+    return f"No safe plan: every way to the goal {risk}, and {allowed} is allowed.{held}"
+
+
+def _check(field: str, pose: PoseConfig, scenario: Scenario) -> None:
+    vehicle, X_WB = scenario.station.load_vehicle(), np.asarray(pose.pose())
+    for pylon in scenario.station.obstacles:
+        gap = clearance(vehicle, X_WB, pylon)
+        if gap <= 0:
+            raise UserError(_taken(field, pylon, gap))
+
+
+def _taken(field: str, pylon: Pylon, gap: float) -> str:
+    name = pylon.name or f"the pylon at ({pylon.x:g}, {pylon.y:g})"
+    return (
+        f"{field}: the hull would be {-gap:.2f} m inside {name}, a certain collision; move it or "
+        "the pylon"
+    )
+
+
+def _percent(risk: float) -> str:
+    return f"{100 * risk:.3g} %" if risk < 0.9995 else "nearly 100 %"

@@ -1,0 +1,1 @@
+"""Scenarios: all that decides a run, in one YAML file each; those that are shipped."""

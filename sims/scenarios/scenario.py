@@ -1,0 +1,164 @@
+"""Scenarios: all that decides a run, in one YAML file."""
+
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ...models.config import typed_yaml
+from ...models.config.checks import SECONDS, check_numbers, require
+from ...models.config.errors import UserError
+from ...models.config.yaml_text import parse
+from ...systems.controllers.kinds import ControllerKind, MppiImpedance
+from ...systems.own import OwnSystem
+from ...systems.station.config import StationConfig
+from .criteria import FollowPath, ReachGoal, Safety
+
+_FOLDER = Path(__file__).parent
+_TEXT = "--scenario-text"
+
+
+@dataclass(frozen=True)
+class LogSettings:
+    """What a run's log holds.
+
+    Attributes:
+        rate: samples per second; its period is a multiple of the station's.
+        samples: keep what the planner sampled, for pictures (a few MB a minute).
+    """
+
+    rate: float = 20.0
+    samples: bool = True
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        check_numbers(self)
+        require(self.rate > 0, self, "rate", "give a number above zero")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A run: who is where in which water, who steers, what counts as success.
+
+    Attributes:
+        name: of the run's folder.
+        description: a sentence for the report.
+        duration: the run ends at this time at the latest (s).
+        station: vehicle, water, obstacles, sensors, start, seed.
+        controller: who steers.
+        success: what counts as success.
+        safety: what ends any run.
+        log: what is kept.
+    """
+
+    name: str
+    controller: ControllerKind
+    success: ReachGoal | FollowPath
+    description: str = ""
+    duration: float = 60.0
+    station: StationConfig = field(default_factory=StationConfig)
+    safety: Safety = field(default_factory=Safety)
+    log: LogSettings = field(default_factory=LogSettings)
+
+    def __post_init__(self) -> None:
+        """Check what belongs together."""
+        check_numbers(self)
+        word = re.fullmatch(r"[A-Za-z0-9][\w.-]*", self.name)
+        require(word is not None, self, "name", "give one word of letters, digits, _ . -")
+        require(
+            SECONDS.holds(self.duration), self, "duration", f"give a number of seconds {SECONDS}"
+        )
+        steps = 1 / (self.log.rate * self.station.period)
+        require(
+            abs(steps - round(steps)) < 1e-6 and round(steps) >= 1,
+            self.log,
+            "rate",
+            f"give a rate whose period is a multiple of {self.station.period:g} s",
+        )
+        if isinstance(self.success, ReachGoal) and self.goal is None:
+            raise UserError("Scenario.success: ReachGoal needs `goal`: [x, y, z] in m")
+
+    @property
+    def seed(self) -> int:
+        """The seed of everything random."""
+        return self.station.seed
+
+    @property
+    def goal(self) -> Float[np.ndarray, "3"] | None:
+        """Where to go (m, W), None where there is no goal."""
+        if isinstance(self.success, ReachGoal) and self.success.goal is not None:
+            return np.array(self.success.goal)
+        goal = getattr(self.controller, "goal", None)
+        return None if goal is None else np.array(goal.position)
+
+    @property
+    def code(self) -> tuple[str, ...]:
+        """The code of one's own that runs with it: files or modules, with the class in them."""
+        parts = (self.controller, self.station.sensing.filter)
+        return tuple(part.code for part in parts if isinstance(part, OwnSystem))
+
+    def with_changes(
+        self, seed: int | None = None, duration: float | None = None, model: Path | None = None
+    ) -> "Scenario":
+        """The same scenario with another seed, duration or model to plan with.
+
+        Raises:
+            UserError: a model is given, and the controller plans with none.
+        """
+        changed = self
+        if seed is not None:
+            changed = replace(changed, station=replace(changed.station, seed=seed))
+        if duration is not None:
+            changed = replace(changed, duration=duration)
+        if model is not None:
+            if not isinstance(changed.controller, MppiImpedance):
+                raise UserError(
+                    f"--model: {self.name} is steered by {type(self.controller).__name__}, which "
+                    "does not plan with a model; choose a scenario with MppiImpedance"
+                )
+            changed = replace(changed, controller=replace(changed.controller, model=model))
+        return changed
+
+
+def scenario_names() -> tuple[str, ...]:
+    """Names of the scenarios that are shipped."""
+    return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
+
+
+def load_scenario(name_or_path: str | Path, text: str = "") -> Scenario:
+    """Read a shipped scenario by its name, or a YAML file by its path (anything with a suffix).
+
+    `text` is YAML laid over the file: mappings merge key by key, anything else replaces, and a
+    value with another `!Tag` than the file's replaces the whole of it.
+
+    Raises:
+        UserError: there is no such scenario, or it is none, or it is none with `text`.
+    """
+    path = Path(name_or_path)
+    if not path.suffix:
+        if str(name_or_path) not in scenario_names():
+            raise UserError(
+                f"scenario `{name_or_path}` is none of those shipped; take one of "
+                f"{', '.join(scenario_names())}, or the path of a .yaml file"
+            )
+        path = _FOLDER / f"{name_or_path}.yaml"
+    scenario = typed_yaml.load(Scenario, path)
+    return overridden(scenario, text) if text.strip() else scenario
+
+
+def overridden(base: Scenario | str, text: str) -> Scenario:
+    """A scenario (or the YAML text of one) with YAML `text` laid over it.
+
+    Raises:
+        UserError: the two together are no scenario.
+    """
+    scenario = typed_yaml.loads(Scenario, base, "scenario") if isinstance(base, str) else base
+    if not isinstance(parse(text, _TEXT)[0], dict):
+        raise UserError(f"{_TEXT}: give a mapping, such as 'duration: 5'")
+    try:
+        return typed_yaml.loads(Scenario, text, _TEXT, scenario)
+    except UserError as error:  # it is a line of the command: its parts have no numbers
+        message = re.sub(rf"^{_TEXT}:\d+: ", f"{_TEXT}: ", str(error), flags=re.MULTILINE)
+        raise UserError(message) from error

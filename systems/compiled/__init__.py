@@ -1,0 +1,1 @@
+"""Diagrams in one compiled loop: what systems compute, as pure functions."""

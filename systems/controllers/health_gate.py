@@ -1,0 +1,67 @@
+"""What a controller may believe of the estimated state: all of it, or, when it is lost, nothing."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from ..compiled.jit import value_or_none
+from ..compiled.pure import Inputs, Output, Pure
+from ..estimation.delayed import HEALTH
+
+LOST = 2.0
+"""State of a filter's health from which on its estimate says nothing."""
+
+
+class HealthGate(LeafSystem):
+    """Passes the estimate on while the filter's `health` is good or degraded; when lost, NaN.
+
+    What reads it then does what it does for a state that isn't known: planners make no plan and
+    start anew afterwards, observers keep what they have seen, and impedance control asks for no
+    wrench. Without a position there is none to hold, and feedback of a wrong state is worse than
+    none: drag brings the vehicle to rest, its righting moment keeps it level, and net buoyancy
+    raises it slowly. `health` that isn't connected counts as good, one that isn't finite as lost.
+
+    .. pydrake_system::
+
+        name: HealthGate
+        input_ports:
+        - X_WB
+        - V_WB_B
+        - health
+        output_ports:
+        - X_WB
+        - V_WB_B
+
+    """
+
+    def __init__(self):
+        """No settings."""
+        super().__init__()
+        sizes = {"X_WB": 7, "V_WB_B": 6}
+        ports = {name: self.DeclareVectorInputPort(name, size) for name, size in sizes.items()}
+        self._health = self.DeclareVectorInputPort("health", len(HEALTH))
+        for name, port in ports.items():
+
+            def pass_on(context: Context, output: BasicVector, port=port) -> None:
+                health = value_or_none(self._health, context)
+                value = np.asarray(port.Eval(context))
+                known = health is None or health[0] < LOST
+                output.SetFromVector(value if known else np.full(value.size, np.nan))
+
+            needs = {port.ticket(), self._health.ticket()}
+            self.DeclareVectorOutputPort(name, sizes[name], pass_on, needs)
+
+    def pure(self) -> Pure:
+        """The outputs as pure functions."""
+
+        def passed(name: str) -> Output:
+            def output(state: object, inputs: Inputs) -> Float[Array, "_"]:
+                del state
+                if "health" not in inputs:
+                    return inputs[name]
+                return jnp.where(inputs["health"][0] < LOST, inputs[name], jnp.nan)
+
+            return output
+
+        return Pure((), {name: passed(name) for name in ("X_WB", "V_WB_B")})

@@ -1,0 +1,275 @@
+"""Controllers by kind: each is a dataclass for YAML that adds itself to a diagram.
+
+A controller is any system with the input ports `X_WB` (7) and `V_WB_B` (6), the estimated state,
+and the output port `F_Bo_B` (6), the wrench it wants. With an input port `health` (5) it is told
+how good the estimate is (`systems.estimation.delayed.HEALTH`); those here ask for no wrench while
+it is lost (`systems.controllers.health_gate`).
+"""
+
+import abc
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from pydrake.systems.framework import Diagram, DiagramBuilder, System
+
+from ...models.config.checks import Vector6, check_numbers, require
+from ...models.dynamics import Dynamics
+from ...models.effects.extended import Extended, core
+from ...models.files.checkpoint import load_model
+from ...models.spinn import Spinn
+from ...models.vehicles.vehicle import load_vehicle
+from ..estimation.delayed import HEALTH
+from ..estimation.disturbance_observer import DisturbanceObserver, MomentumObserver
+from ..own import OwnSystem, check_ports, port_sizes
+from ..planning.mppi import Mppi
+from ..planning.mppi_config import MppiConfig
+from ..planning.mppi_core import MppiPlanner
+from ..planning.obstacles import Cylinders, SphereHull
+from ..planning.paths import FigureEight, HoldPose, PoseConfig, Waypoints
+from ..planning.plan import PlanLayout
+from ..planning.reference import Reference
+from ..plant.wrench_limits import ThrusterLimits
+from ..station.config import StationConfig
+from ..station.simulated import add_noise
+from .health_gate import HealthGate
+from .impedance import Impedance, ImpedanceGains, ImpedanceLaw
+
+INPUTS = {"X_WB": 7, "V_WB_B": 6}
+"""Input ports of every controller and their sizes."""
+
+TOLD = {"health": len(HEALTH)}
+"""Input ports that a controller may have besides, connected if the station has them."""
+
+OUTPUTS = {"F_Bo_B": 6}
+"""Output ports of every controller and their sizes; it may have more."""
+
+
+Goal = Float[np.ndarray, "3"] | None
+"""Where a run is to end (m, W), if anywhere."""
+
+
+class Controller(abc.ABC):
+    """A kind of controller."""
+
+    @abc.abstractmethod
+    def build(self, station: StationConfig, goal: Goal = None) -> System:
+        """The system; it may read vehicle, obstacles and rates of the station it is made for.
+
+        `goal` is that of the run, for a controller that has none of its own.
+        """
+
+    def add_to(self, builder: DiagramBuilder, station: StationConfig, goal: Goal = None) -> System:
+        """Add the system to a diagram under the name `controller`.
+
+        Raises:
+            UserError: it lacks a port, or a port has another size.
+        """
+        system = self.build(station, goal)
+        check_ports("controller", system, (INPUTS, OUTPUTS), (TOLD, {}))
+        return builder.AddNamedSystem("controller", system)
+
+
+@dataclass(frozen=True)
+class ObserverConfig:
+    """Settings of the disturbance observer (`systems.estimation.disturbance_observer`).
+
+    Attributes:
+        time_constant: of its low-pass (s).
+        largest_force: bound of the observed force (N).
+        largest_moment: bound of the observed moment (N·m).
+        period: between calls (s), that of the state estimates.
+    """
+
+    time_constant: float = 1.5
+    largest_force: float = 60.0
+    largest_moment: float = 5.0
+    period: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        check_numbers(self)
+        for name in ("time_constant", "largest_force", "largest_moment", "period"):
+            require(getattr(self, name) > 0, self, name, "give a number above zero")
+
+    def build(self, dynamics: Dynamics) -> DisturbanceObserver:
+        """The observer for a model."""
+        limit = (self.largest_force, self.largest_moment)
+        observer = MomentumObserver(dynamics, self.time_constant, limit)
+        return DisturbanceObserver(observer, self.period)
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How a plan is tracked.
+
+    Attributes:
+        gains: of the impedance law.
+        error_limit: the distance (m) and angle (rad) beyond which it pulls no harder.
+        period: between calls (s).
+        observer: of steady wrenches, which planner and reference then counter; none if null.
+    """
+
+    gains: ImpedanceGains = field(default_factory=ImpedanceGains)
+    error_limit: tuple[float, float] = (1.0, 1.0)
+    period: float = 0.02
+    observer: ObserverConfig | None = field(default_factory=ObserverConfig)
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        check_numbers(self)
+        require(min(self.error_limit) > 0, self, "error_limit", "give numbers above zero")
+        require(self.period > 0, self, "period", "give a time above zero")
+
+    def build(
+        self,
+        station: StationConfig,
+        source: System,
+        layout: PlanLayout,
+        observed: Dynamics,
+        noise_period: float | None = None,
+    ) -> Diagram:
+        """A controller around the source of a plan, with its `plan` (and more) put out as well.
+
+        `observed` is the model from which the observer takes its expectation; `noise_period` (s)
+        is how often the source's `noise` is drawn.
+        """
+        vehicle = station.load_vehicle()
+        limits = ThrusterLimits.create(vehicle.thrusters(), station.voltage)
+        K_p, K_d = self.gains.matrices(vehicle.dynamics())
+        law = ImpedanceLaw(K_p, K_d, limits, self.error_limit)
+        builder = DiagramBuilder()
+        builder.AddNamedSystem("source", source)
+        impedance = builder.AddNamedSystem("impedance", Impedance(law, layout, self.period))
+        builder.Connect(source.GetOutputPort("plan"), impedance.GetInputPort("plan"))
+        systems = [impedance]
+        if self.observer is not None:
+            observer = builder.AddNamedSystem("observer", self.observer.build(observed))
+            builder.Connect(impedance.GetOutputPort("F_Bo_B"), observer.GetInputPort("F_Bo_B"))
+            bias = observer.GetOutputPort("F_bias_Bo_W")
+            builder.Connect(bias, source.GetInputPort("F_bias_Bo_W"))
+            builder.ExportOutput(bias, "F_bias_Bo_W")
+            systems.append(observer)
+        if source.HasInputPort("X_WB"):
+            systems.append(source)
+        gate = builder.AddNamedSystem("gate", HealthGate())
+        for name in INPUTS | TOLD:
+            builder.ExportInput(gate.GetInputPort(name), name)
+        for name in INPUTS:
+            for system in systems:
+                builder.Connect(gate.GetOutputPort(name), system.GetInputPort(name))
+        if noise_period is not None:
+            add_noise(builder, source, "noise", noise_period)
+        builder.ExportOutput(impedance.GetOutputPort("F_Bo_B"), "F_Bo_B")
+        for name in port_sizes(source)[1]:
+            builder.ExportOutput(source.GetOutputPort(name), name)
+        return builder.Build()
+
+
+@dataclass(frozen=True)
+class MppiImpedance(Controller):
+    """Path integral planning among the station's obstacles, tracked by impedance control.
+
+    Attributes:
+        goal: where to go.
+        planner: settings of the planner.
+        model: a checkpoint of the dynamics to plan with; physics if left out.
+        vehicle: whose physics to plan with; the station's if left out.
+        diffusion: b of the physics' process noise (N√s and N·m√s): what waves, wake and pushes do
+            to the vehicle, as white noise. A wrench of standard deviation σ and time constant τ
+            counts as σ √(2τ).
+        tracking: settings of the tracking.
+    """
+
+    goal: PoseConfig
+    planner: MppiConfig = field(default_factory=MppiConfig)
+    model: Path | None = None
+    vehicle: str | None = None
+    diffusion: Vector6 = (3.0, 3.0, 3.0, 0.2, 0.2, 0.2)
+    tracking: Tracking = field(default_factory=Tracking)
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        check_numbers(self)
+        require(min(self.diffusion) >= 0, self, "diffusion", "give six numbers of zero or more")
+
+    def dynamics(self, station: StationConfig) -> Dynamics:
+        """The model to plan with."""
+        return self._model(station)[0]
+
+    def _model(self, station: StationConfig) -> tuple[Dynamics, Mapping[str, Any]]:
+        """The model to plan with and what its checkpoint says of it."""
+        if self.model is not None:
+            model, metadata = load_model(self.model, float)
+            own = core(model)
+            white = own.whitened() if isinstance(own, Spinn) else own
+            return (model.with_base(white) if isinstance(model, Extended) else white), metadata
+        vehicle = load_vehicle(self.vehicle or station.vehicle)
+        return vehicle.dynamics(np.array(self.diffusion)), {}
+
+    def build(self, station: StationConfig, goal: Goal = None) -> Diagram:
+        del goal  # it has its own
+        vehicle = station.load_vehicle()
+        model, metadata = self._model(station)
+        c = self.planner.with_substeps_of(metadata)
+        limits = ThrusterLimits.create(vehicle.thrusters(), station.voltage, c.wrench_fraction)
+        planner = MppiPlanner(
+            model,
+            limits,
+            Cylinders.create(station.obstacles),
+            SphereHull.cover(vehicle.size),
+            self.goal.pose(),
+            config=c,
+            tracking=self.tracking.gains.matrices(model),
+        )
+        return self.tracking.build(station, Mppi(planner), c.layout, model, c.period)
+
+
+@dataclass(frozen=True)
+class TrackReference(Controller):
+    """Impedance control along a path that is given beforehand; obstacles don't count.
+
+    Attributes:
+        path: the path.
+        feedforward: add the wrenches that the physics of the station's vehicle needs on the path.
+        tracking: settings of the tracking.
+    """
+
+    path: HoldPose | Waypoints | FigureEight
+    feedforward: bool = True
+    tracking: Tracking = field(default_factory=Tracking)
+
+    def build(self, station: StationConfig, goal: Goal = None) -> Diagram:
+        del goal
+        model = station.load_vehicle().dynamics()
+        reference = Reference(self.path, model if self.feedforward else None)
+        return self.tracking.build(station, reference, reference.layout, model)
+
+
+@dataclass(frozen=True)
+class Own(OwnSystem, Controller):
+    """A controller of one's own.
+
+    Its constructor is given, if it has arguments of these names and `parameters` has none: the
+    station's `vehicle` (a `Vehicle`), its `obstacles` (a tuple of `Pylon`), the `goal` (position in
+    W, m) if the run has one, and all of the `station`'s configuration. With an input port `health`
+    it is told how good the estimate is. With an output port `plan` and an attribute `layout`, the
+    plan's `PlanLayout`, its plans are logged and judged.
+    """
+
+    def build(self, station: StationConfig, goal: Goal = None) -> System:
+        return self.make(
+            {
+                "vehicle": station.load_vehicle,
+                "obstacles": lambda: station.obstacles,
+                "goal": lambda: None if goal is None else np.array(goal, float),
+                "station": lambda: station,
+            }
+        )
+
+
+ControllerKind = MppiImpedance | TrackReference | Own
+"""The kinds that a scenario can name by a tag."""

@@ -1,0 +1,1 @@
+"""The state estimator: an error-state Kalman filter as pure functions, and its systems."""

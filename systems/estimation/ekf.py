@@ -1,0 +1,222 @@
+"""The state estimator as a system; the filter itself is in `systems.estimation`."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+from numpy.typing import ArrayLike
+from pydrake.common import RandomDistribution
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from ...models import se3
+from ...models.sensors import Compass, DepthSensor, Dvl, Imu
+from ..compiled.jit import VectorFunction, value_or_zeros
+from ..compiled.pure import Event, Inputs, Pure, State, shown
+from ..plant.learned_plant import check_state
+from .delayed import HEALTH, SLOT, STATUS, DelayedFilter, EkfConfig, FilterState, Readings
+from .error_state import ERRORS
+
+_WAITING = 6  # state group of the samples that wait, after the filter's own and the outputs'
+
+
+class Ekf(LeafSystem):
+    """Error-state Kalman filter on SE(3), driven by the IMU, at a delayed horizon.
+
+    At every IMU period it takes in the sample shown, which is that of one period ago. At
+    `config.output_rate` (more often if a sensor reads faster) it moves over the samples that came,
+    fuses DVL, depth and compass `config.horizon` in the past in the order of their times of
+    validity (`systems.estimation.delayed`), and brings the estimate to the present with the samples
+    that wait. The error's order and frame are those of
+    `systems.estimation.error_state`: `covariance` is the 18 × 18 matrix by rows, whose first six
+    rows and columns belong to [δp, δθ] in body axes. Horizontal position is dead reckoning: its
+    variance grows. `status` has the components `STATUS`, `health` those of `HEALTH`.
+
+    The estimate starts at the given pose and twist. With `initial_noise` connected (a simulation)
+    it starts with an error drawn from `config`'s standard deviations: δp, δθ, δv.
+
+    .. pydrake_system::
+
+        name: Ekf
+        input_ports:
+        - imu
+        - dvl
+        - depth
+        - compass
+        - initial_noise
+        output_ports:
+        - X_WB
+        - V_WB_B
+        - covariance
+        - status
+        - health
+
+    """
+
+    def __init__(
+        self,
+        imu: Imu | None = None,
+        dvl: Dvl | None = None,
+        depth: DepthSensor | None = None,
+        compass: Compass | None = None,
+        config: EkfConfig | None = None,
+        X0_WB: ArrayLike | None = None,
+        V0_WB_B: ArrayLike | None = None,
+    ):
+        """Expect the given sensors (their defaults if left out) and start at `X0_WB`, `V0_WB_B`.
+
+        Raises:
+            ValueError: the start is no state, or the output rate is no divisor of the IMU's rate.
+            UserError: the horizon is shorter than the DVL's latency.
+        """
+        super().__init__()
+        config = config or EkfConfig()
+        core = DelayedFilter(
+            imu or Imu(), dvl or Dvl(), depth or DepthSensor(), compass or Compass(), config
+        )
+        ratio = core.imu.rate / config.output_rate
+        if abs(ratio - round(ratio)) > 1e-6 or ratio < 1 - 1e-6:
+            raise ValueError(
+                f"output_rate {config.output_rate} Hz does not divide the IMU's {core.imu.rate} Hz"
+            )
+        self.filter = core
+        X0 = np.array([1.0, 0, 0, 0, 0, 0, 0]) if X0_WB is None else X0_WB
+        X0, V0 = check_state(X0, np.zeros(6) if V0_WB_B is None else V0_WB_B)
+
+        sizes = {"imu": 6, "dvl": 7, "depth": 3, "compass": 3}
+        self._readings = [self.DeclareVectorInputPort(*item) for item in sizes.items()]
+        gaussian = RandomDistribution.kGaussian
+        self._initial_noise = self.DeclareVectorInputPort("initial_noise", 9, gaussian)
+
+        start, unravel = ravel_pytree(core.init(jnp.asarray(X0), jnp.asarray(V0)))
+        n = start.size
+        outputs = {"X_WB": 7, "V_WB_B": 6, "covariance": ERRORS**2, "status": len(STATUS)}
+        outputs["health"] = len(HEALTH)
+        self._ratio, self._period = round(ratio), core.period
+        self._samples = core.samples_at_once(self._ratio)
+        self._filter = self.DeclareDiscreteState(BasicVector(np.asarray(start).tolist()))
+        self._outputs = [self.DeclareDiscreteState(size) for size in outputs.values()]
+        self._waiting = self.DeclareDiscreteState(6 * (self._samples - 1))
+        for name, index in zip(outputs, self._outputs, strict=True):
+            self.DeclareStateOutputPort(name, index)
+        self.DeclareInitializationDiscreteUpdateEvent(self._initialise)
+        self.DeclarePeriodicDiscreteUpdateEvent(core.period, 0.0, self._update)
+
+        def initialise(w: Array) -> tuple[Array, ...]:
+            error = core.deviations()[:9] * w
+            X = se3.retract(jnp.asarray(X0), error[:6])
+            V = jnp.asarray(V0) + jnp.concatenate([error[6:], jnp.zeros(3, w.dtype)])
+            state = core.init(X, V)
+            return ravel_pytree(state)[0], *show(state, jnp.zeros((), w.dtype))
+
+        def show(state: FilterState, t: Array) -> tuple[Array, ...]:
+            # The newest sample is one period old.
+            X, V, P = core.present(state, jnp.minimum(t, core.period))
+            k = jnp.round(t / core.period) - 1
+            return X, V, P.reshape(-1), core.status(state, k), core.health(state, P, k)
+
+        def take_in(flat: Array, *given: Array) -> tuple[Array, Array, Array]:
+            *samples, dvl, depth, compass, last = given
+            imu = jnp.concatenate(samples).reshape(-1, 6)
+            readings = Readings(imu[-1], jnp.concatenate([dvl[:4], dvl[6:]]), depth, compass)
+            state, slots = core.take_in(unravel(flat), imu, readings, last[0])
+            state, at = core.move(state, slots, jnp.zeros_like(last[0]))
+            return ravel_pytree(state)[0], at, slots
+
+        def move(flat: Array, slots: Array, first: Array) -> tuple[Array, Array]:
+            state, at = core.move(unravel(flat), slots.reshape(-1, SLOT), first[0])
+            return ravel_pytree(state)[0], at
+
+        def fuse(flat: Array, slot: Array, k: Array) -> Array:
+            return ravel_pytree(core.fuse(unravel(flat), slot, k[0]))[0]
+
+        self._functions = take_in, move, fuse, show, unravel
+        results = list(outputs.values())
+        self._start = VectorFunction(initialise, [9], [n, *results])
+        # Several calls, as XLA runs small programs in line and larger ones on its pool of threads.
+        m = self._samples
+        self._take_in = VectorFunction(
+            take_in, [n, 6 * (m - 1), *sizes.values(), 1], [n, 1, SLOT * m]
+        )
+        self._move = VectorFunction(move, [n, SLOT * m, 1], [n, 1])
+        self._fuse = VectorFunction(fuse, [n, SLOT, 1], [n])
+        self._show = VectorFunction(lambda x, t: show(unravel(x), t[0]), [n, 1], results)
+
+    def filter_state(self, context: Context) -> FilterState:
+        """The filter's state at its horizon, for inspection."""
+        core = self.filter
+        like = core.init(jnp.zeros(7), jnp.zeros(6))
+        return ravel_pytree(like)[1](jnp.asarray(context.get_discrete_state(self._filter).value()))
+
+    def pure(self) -> Pure:
+        """The update as a pure function."""
+        take_in, move, fuse, show, unravel = self._functions
+        n, sizes = self._samples, [port.size() for port in self._readings]
+
+        def step(state: State, given: list[Array], last: Array) -> Array:
+            """The filter's state after the samples that wait and the one that is shown."""
+            flat, at, slots = take_in(state[0], state[_WAITING], *given, last[None])
+
+            def fuse_and_move(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+                flat, at = carry
+                slot = jax.lax.dynamic_slice(slots.reshape(-1), (SLOT * at.astype(int),), (SLOT,))
+                flat = fuse(flat, slot, (last - n + 1 + at)[None])
+                return move(flat, slots, (at + 1)[None])  # at the end it moves nothing: at = n
+
+            return jax.lax.while_loop(lambda carry: carry[1] < n, fuse_and_move, (flat, at))[0]
+
+        def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
+            names = ("imu", "dvl", "depth", "compass")
+            given = [
+                inputs.get(name, jnp.zeros(size)) for name, size in zip(names, sizes, strict=True)
+            ]
+            tick = jnp.round(t / self._period)
+            phase = jnp.mod(tick, n)
+            slot = (jnp.maximum(phase, 1) - 1).astype(int)
+            kept = jax.lax.dynamic_update_slice(state[_WAITING], given[0], (6 * slot,))
+            waiting = jnp.where(phase > 0, kept, state[_WAITING]) if n > 1 else state[_WAITING]
+            flat = jax.lax.cond(phase > 0, lambda: state[0], lambda: step(state, given, tick - 1))
+            told = jax.lax.cond(
+                jnp.mod(tick, self._ratio) == 0,
+                lambda: tuple(show(unravel(flat), t)),
+                lambda: tuple(state[1:_WAITING]),
+            )
+            return dict(enumerate([flat, *told, waiting]))
+
+        names = ("X_WB", "V_WB_B", "covariance", "status", "health")
+        outputs = {name: shown(i) for i, name in enumerate(names, 1)}
+        return Pure((Event(self._period, update),), outputs)
+
+    def _initialise(self, context: Context, discrete_state: DiscreteValues) -> None:
+        results = self._start(value_or_zeros(self._initial_noise, context))
+        for index, value in zip([self._filter, *self._outputs], results, strict=True):
+            discrete_state.set_value(index, value)
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        """Keep the sample that is shown; with the last of several, step over all of them."""
+        t = context.get_time()
+        tick = round(t / self._period)
+        phase = tick % self._samples
+        imu = value_or_zeros(self._readings[0], context)
+        if phase:
+            waiting = discrete_state.get_mutable_value(_WAITING)
+            waiting[6 * phase - 6 : 6 * phase] = imu
+            return
+        last = tick - 1.0  # what is shown was sampled one period ago
+        held = context.get_discrete_state()
+        readings = [value_or_zeros(port, context) for port in self._readings[1:]]
+        state, at, slots = self._take_in(
+            held.value(0), held.value(_WAITING), imu, *readings, np.array([last])
+        )
+        n, i = self._samples, int(at[0])
+        while i < n:
+            number = np.array([last - n + 1 + i])
+            state = self._fuse.flat(state, slots[SLOT * i : SLOT * (i + 1)], number)
+            if i == n - 1:
+                break
+            state, at = self._move(state, slots, np.array([i + 1.0]))
+            i = int(at[0])
+        discrete_state.set_value(0, state)
+        if tick % self._ratio == 0:
+            for index, value in enumerate(self._show(state, np.array([t])), 1):
+                discrete_state.set_value(index, value)

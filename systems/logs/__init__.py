@@ -1,0 +1,1 @@
+"""Logs of vehicles (.tlog, .BIN) and other data to recordings: all importers."""

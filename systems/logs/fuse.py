@@ -1,0 +1,144 @@
+"""Signals of a log, cut and brought to one uniform grid: the trajectories of a recording.
+
+Attitude along the geodesic, position by the cubic that has the estimated velocity as its slope,
+velocity linearly and turned into the body, rates and IMU as means about each instant
+(`models/recordings/resample.py`). The command of a step is the mean, over that step, of the line
+through the logged outputs: they are samples of something that changes faster, and holding each
+until the next would delay the commands by half a sampling period (50 ms at the 10 Hz of a DataFlash
+log).
+"""
+
+from itertools import pairwise
+
+import numpy as np
+
+from ...models.recordings.build import Trajectory
+from ...models.recordings.resample import (
+    conjugate,
+    grid,
+    hermite,
+    hold,
+    linear,
+    mean,
+    rotate,
+    slerp,
+)
+from .segments import Segment, segments
+from .signals import Series, Signals
+from .signals_tlog import UNAIDED
+
+_FAST_HZ, _MEAN_S = 200.0, 0.01
+_LONGEST_S = 300.0
+_STATES = {"disarmed": "disarmed", "pass-through": "passthrough", "outputs off": "outputs-off"}
+
+
+def fuse(
+    signals: Signals, *, rate: float, minimum: float, gap: float, disarmed: bool
+) -> tuple[list[Trajectory], list[str], list[str]]:
+    """Return trajectories at `rate` (Hz), a line on each, and sentences on what was left out.
+
+    Stretches shorter than `minimum` (s) are dropped, and so are disarmed ones unless wanted or
+    unless there are no others.
+    """
+    found, told = segments(signals, gap)
+    dropped = [f"Cut at {', '.join(told)}."] if told else []
+    if not disarmed:
+        armed = [s for s in found if "disarmed" not in s.labels]
+        if any(s.duration >= minimum for s in armed):
+            idle = sum(s.duration for s in found) - sum(s.duration for s in armed)
+            if idle > 0:
+                dropped.append(f"{idle:.1f} s disarmed were left out.")
+            found = armed
+        elif any(s.duration >= minimum for s in found):
+            dropped.append(
+                "The vehicle was never armed for long: the disarmed time was kept, which tells "
+                "nothing about thrusters."
+            )
+    long = [s for s in found if s.duration >= minimum]
+    short = [s for s in found if s.duration < minimum]
+    if sum(s.duration for s in short) > 0.5:
+        dropped.append(
+            f"{len(short)} stretch{'es' * (len(short) > 1)} shorter than {minimum:g} s "
+            f"({sum(s.duration for s in short):.1f} s together) were left out."
+        )
+    if any(s.duration > _LONGEST_S for s in long):
+        dropped.append(f"Stretches longer than {_LONGEST_S:g} s were cut into equal parts.")
+    long = [part for s in long for part in _parts(s)]
+    trajectories, lines = [], []
+    for number, segment in enumerate(long, 1):
+        trajectory = resample(signals, segment, number, 1.0 / rate)
+        trajectories.append(trajectory)
+        lines.append(
+            f"{trajectory.scenario}: {segment.duration:.1f} s "
+            f"from {segment.start:.1f} s on the vehicle's clock"
+        )
+    return trajectories, lines, dropped
+
+
+def _parts(segment: Segment) -> list[Segment]:
+    """Equal parts of at most `_LONGEST_S`: a recording pads all runs to the longest one."""
+    count = int(np.ceil(segment.duration / _LONGEST_S))
+    edges = np.linspace(segment.start, segment.stop, count + 1).tolist()
+    return [Segment(a, b, segment.labels) for a, b in pairwise(edges)]
+
+
+def name_of(segment: Segment, number: int) -> str:
+    """Scenario name: running number, mode, and what was special."""
+    words = [_STATES.get(label, label) for label in segment.labels if label != UNAIDED]
+    modes = [word for word in words if word not in _STATES.values()]
+    special = [word for word in words if word in _STATES.values()]
+    return "_".join([f"{number:02d}", *modes, *special])
+
+
+def resample(signals: Signals, segment: Segment, number: int, dt: float) -> Trajectory:
+    """Bring one segment to the grid of step `dt` (s)."""
+    t = grid(segment.start, segment.stop - dt, dt)
+    q = slerp(t, signals.attitude.t, signals.attitude.x)
+    omega = _instants(signals.rates, t)
+    aided = UNAIDED not in segment.labels
+    p, v = np.full((2, 3, t.size), np.nan)
+    sensors: dict[str, np.ndarray] = {}
+    if signals.position is not None and signals.velocity is not None:
+        slope = _at(signals.velocity, signals.position.t)
+        p = hermite(t, signals.position.t, signals.position.x, slope)
+        v_W = linear(t, signals.velocity.t, signals.velocity.x)
+        sensors["vertical_velocity"] = v_W[2]
+        if aided:
+            v = rotate(conjugate(q), v_W)
+        else:
+            p[:2] = np.nan
+            up = rotate(conjugate(q), np.tile([[0.0], [0.0], [1.0]], t.size))
+            v[2] = v_W[2] * up[2]
+    if signals.specific_force is not None:
+        sensors["imu_specific_force"] = _instants(signals.specific_force, t).T
+    if signals.rates.source.startswith(("RAW_IMU", "SCALED_IMU", "IMU", "GYR")):
+        sensors["imu_angular_rate"] = omega.T
+    if signals.pressure_depth is not None:
+        sensors["pressure_depth"] = _instants(signals.pressure_depth, t)
+    if signals.voltage is not None:
+        sensors["voltage"] = linear(t, signals.voltage.t, signals.voltage.x)
+    if signals.rc is not None:
+        sensors["rc"] = hold(t, signals.rc.t, signals.rc.x, dt).T
+    return Trajectory(
+        name_of(segment, number),
+        np.concatenate([q, p]).T,
+        np.concatenate([v, omega]).T,
+        {"pwm": mean(t + dt / 2, signals.outputs.t, signals.outputs.x, dt).T},
+        sensors,
+        float(t[0]),
+    )
+
+
+def _at(series: Series, t: np.ndarray) -> np.ndarray:
+    same = series.t.size == t.size and np.array_equal(series.t, t)
+    return series.x if same else linear(t, series.t, series.x)
+
+
+def _instants(series: Series, t: np.ndarray) -> np.ndarray:
+    """Values at the instants t; of sensors much faster than 100 Hz the mean over 10 ms.
+
+    Ten ms and no more: a mean over half a step of 50 ms takes 2 % off the accelerations at 5 Hz.
+    """
+    if series.rate > _FAST_HZ:
+        return mean(t, series.t, series.x, _MEAN_S)
+    return linear(t, series.t, series.x)

@@ -1,0 +1,190 @@
+"""A vehicle's log to a recording: telemetry (.tlog) and DataFlash (.BIN), plain or .xz/.gz."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from ...models.config.errors import UserError
+from ...models.recordings.csv import METADATA, read_csv
+from ...models.recordings.schema import check_plausible
+from ...models.recordings.store import Recording
+from ...models.vehicles.vehicle import load_vehicle
+from .dataflash import read_bin
+from .fuse import fuse
+from .log_bytes import LogBytes, Progress, no_progress, read_log_bytes
+from .report import ImportReport, tell
+from .signals import Signals
+from .signals_dataflash import WANTED as BIN_WANTED
+from .signals_dataflash import signals_from_bin
+from .signals_tlog import WANTED as TLOG_WANTED
+from .signals_tlog import signals_from_tlog
+from .tlog import read_tlog
+
+RATES = (50.0, 40.0, 25.0, 20.0)
+"""Rates (Hz) at which logs are imported unless another one is asked for; the last by default."""
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """What is taken from a vehicle's log.
+
+    Attributes:
+        minimum: shortest stretch kept (s).
+        gap: longest pause between samples of one signal within a stretch (s).
+        water_density: kg/m³, to correct depth and the slow part of the climb of an autopilot that
+            assumed fresh water, where its height is the barometer's (`depth.in_water`); None takes
+            its figures as they are.
+        disarmed: keep disarmed stretches too.
+        system: MAVLink system id, if several autopilots are in the log.
+    """
+
+    minimum: float = 5.0
+    gap: float = 0.5
+    water_density: float | None = None
+    disarmed: bool = False
+    system: int | None = None
+
+
+def import_log(
+    path: str | os.PathLike[str],
+    *,
+    rate: float | None = RATES[-1],
+    vehicle: str = "bluerov2_heavy",
+    options: LogOptions | None = None,
+    progress: Progress = no_progress,
+) -> tuple[Recording, ImportReport]:
+    """Import a log: one scenario for each stretch of constant mode, armed, without gaps or resets.
+
+    Args:
+        path: the log; its kind is told by its content.
+        rate: of the recording (Hz); None takes that of the slowest stream of state and outputs,
+            within 20 to 50 Hz.
+        vehicle: preset or file whose thruster directions the PWM shall have; named in the result.
+        options: what is taken from the log.
+        progress: called with the fraction done, 0 to 1.
+
+    Raises:
+        UserError: if there is no such log, it can't be read, or nothing usable is in it.
+    """
+    path = Path(path)
+    options = options or LogOptions()
+    _check_options(RATES[-1] if rate is None else rate, options)
+    motors = [mount.motor for mount in load_vehicle(vehicle).propulsion.mounts]
+    raw = read_log_bytes(path, progress)
+    try:
+        signals = _signals(raw, motors, options, progress)
+        rate = own_rate(signals) if rate is None else rate
+        trajectories, lines, dropped = fuse(
+            signals,
+            rate=rate,
+            minimum=options.minimum,
+            gap=options.gap,
+            disarmed=options.disarmed,
+        )
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    if not trajectories:
+        raise UserError(
+            f"{path}: no stretch of {options.minimum:g} s with attitude and thruster outputs is "
+            f"left ({' '.join(dropped) or 'nothing overlaps'}); allow shorter ones (minimum) or "
+            "longer gaps (gap)"
+        )
+    progress(0.95)
+    report = tell(signals, path.name, trajectories, lines, [*raw.notes, *dropped], 1.0 / rate)
+    try:
+        recording = Recording.from_trajectories(
+            trajectories, 1.0 / rate, vehicle=vehicle, source=path.name, notes=report.notes()
+        )
+        check_plausible(recording.dataset)
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from error
+    period = 1.0 / signals.outputs.rate
+    progress(1.0)
+    return Recording(recording.dataset.assign_attrs(command_period=period)), report
+
+
+def own_rate(signals: Signals) -> float:
+    """The largest of `RATES` that no stream of state or outputs falls short of, or the least."""
+    streams = (signals.attitude, signals.rates, signals.outputs, signals.velocity)
+    slowest = min(s.rate for s in streams if s is not None)
+    return next((rate for rate in RATES if rate <= 1.05 * slowest), RATES[-1])
+
+
+def load_data(
+    path: str | os.PathLike[str],
+    *,
+    rate: float | None = None,
+    vehicle: str | None = None,
+    options: LogOptions | None = None,
+    resample: bool = True,
+    progress: Progress = no_progress,
+) -> Recording:
+    """Read any data there is: a recording (.nc), a CSV folder, or a vehicle's log.
+
+    Args:
+        path: file, or folder with a `recording.yaml`.
+        rate: Hz; None keeps that of the data (20 for logs, or their streams' own as in
+            `import_log` where nothing is to be resampled).
+        vehicle: preset or file; None keeps what the data name (bluerov2_heavy for logs).
+        options: what is taken from a log.
+        resample: False keeps the samples of CSV files at uneven times where they are.
+        progress: called with the fraction done, 0 to 1.
+
+    Raises:
+        UserError: if the data can't be read, a stored recording has another rate, or options for
+            logs are given for something else.
+    """
+    path = Path(path)
+    options = options or LogOptions()
+    if path.suffix.lower() == ".csv" and path.is_file():
+        raise UserError(f"{path}: give its folder, with a {METADATA} in it (see docs/recording.md)")
+    if path.is_dir() or path.suffix.lower() in (".yaml", ".yml"):
+        recording = read_csv(path, rate=rate, resample=resample)
+    elif path.suffix.lower() in (".nc", ".nc4", ".h5"):
+        recording = Recording.load(path)
+        if rate is not None and abs(recording.dt * rate - 1) > 1e-6:
+            raise UserError(
+                f"{path}: recorded at {1 / recording.dt:g} Hz, not {rate:g}; import the source anew"
+            )
+    else:
+        logged, _ = import_log(
+            path,
+            rate=RATES[-1] if rate is None and resample else rate,
+            vehicle=vehicle or "bluerov2_heavy",
+            options=options,
+            progress=progress,
+        )
+        return logged
+    for given in fields(options):
+        if getattr(options, given.name) != given.default:
+            raise UserError(f"{path}: {given.name} is for logs of a vehicle; leave it out here")
+    progress(1.0)
+    if not vehicle or vehicle == recording.vehicle:
+        return recording
+    return Recording(recording.dataset.assign_attrs(vehicle=vehicle))
+
+
+def _signals(
+    raw: LogBytes,
+    motors: Sequence[float],
+    options: LogOptions,
+    progress: Progress,
+) -> Signals:
+    if raw.kind == "bin":
+        read = read_bin(raw.data, BIN_WANTED, progress)
+        return signals_from_bin(read, motors, options.water_density)
+    log = read_tlog(raw.data, TLOG_WANTED, options.system, progress)
+    return signals_from_tlog(log, motors, options.water_density)
+
+
+def _check_options(rate: float, options: LogOptions) -> None:
+    density = options.water_density
+    for name, value, low, high in (
+        ("rate", rate, 1.0, 400.0),
+        ("minimum", options.minimum, 0.5, 3600.0),
+        ("gap", options.gap, 0.01, 60.0),
+        ("water_density", 1000.0 if density is None else density, 900.0, 1100.0),
+    ):
+        if not low <= value <= high:
+            raise UserError(f"{name}: must lie between {low:g} and {high:g}, got {value:g}")

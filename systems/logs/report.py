@@ -1,0 +1,207 @@
+"""What a log holds and lacks, in plain sentences."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...models.recordings.build import Trajectory
+from ...models.recordings.kinematics import agreement
+from ...models.recordings.schema import TWIST
+from .signals import Series, Signals
+
+_SLOW_OUTPUTS_HZ, _SLOW_STATE_HZ = 25.0, 10.0
+_STILL = 0.03
+_CONSISTENT = 0.9
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """Sentences for a person; also kept in the recording's notes.
+
+    Attributes:
+        source: the file.
+        segments: what was kept, one line each.
+        has: what the log tells.
+        lacks: what it does not tell and what can't be learned from it therefore.
+        done: what was done to the data.
+        dropped: what was cut away and why.
+    """
+
+    source: str
+    segments: tuple[str, ...]
+    has: tuple[str, ...]
+    lacks: tuple[str, ...]
+    done: tuple[str, ...]
+    dropped: tuple[str, ...]
+
+    def text(self) -> str:
+        """Return the report as lines."""
+        parts = (
+            ("Kept", self.segments),
+            ("There", self.has),
+            ("Lacking", self.lacks),
+            ("Done", self.done),
+            ("Left out", self.dropped),
+        )
+        lines = [self.source]
+        for title, sentences in parts:
+            if sentences:
+                lines.append(f"{title}:")
+                lines.extend(f"  {sentence}" for sentence in sentences)
+        return "\n".join(lines)
+
+    __str__ = text
+
+    def notes(self) -> tuple[str, ...]:
+        """Return the sentences that belong to the data for good."""
+        return (*self.has, *self.lacks, *self.done, *self.dropped)
+
+
+def tell(
+    signals: Signals,
+    source: str,
+    kept: Sequence[Trajectory],
+    lines: Sequence[str],
+    dropped: Sequence[str],
+    dt: float,
+) -> ImportReport:
+    """Write the report of one import."""
+    good, bad = _consistency(kept, dt)
+    has = [
+        f"Attitude from {_at(signals.attitude)}, body rates from {_at(signals.rates)}.",
+        f"Thruster outputs from {_at(signals.outputs)}.",
+        *_motion(signals),
+        *signals.has,
+        *_battery(signals),
+        *good,
+    ]
+    return ImportReport(
+        source,
+        tuple(lines),
+        tuple(has),
+        (*bad, *_lacking(signals), *_unexcited(kept), *signals.lacks),
+        (*signals.notes, *_left_out(signals)),
+        tuple(dropped),
+    )
+
+
+def _left_out(signals: Signals) -> list[str]:
+    """A sentence on each signal of which samples were left out."""
+    found = [value for value in vars(signals).values() if isinstance(value, Series)]
+    return [
+        f"{one.source}: {one.left_out} sample{'s' * (one.left_out > 1)} left out that "
+        "were no numbers, or beyond what a vehicle does."
+        for one in found
+        if one.left_out
+    ]
+
+
+def _at(series: Series) -> str:
+    rate = series.rate
+    return f"{series.source} at {rate:.0f} Hz" if rate >= 3 else f"{series.source} at {rate:.1f} Hz"
+
+
+def _motion(signals: Signals) -> list[str]:
+    told = []
+    p = signals.position
+    if p is not None:
+        what = "Position and velocity" if np.isfinite(p.x[0]).any() else "Height and climb"
+        told.append(f"{what} from {_at(p)} (the autopilot's estimate).")
+    depth = signals.pressure_depth
+    if depth is not None:
+        told.append(f"Depth by pressure from {_at(depth)}.")
+    if p is not None and depth is not None:
+        there = (depth.t >= p.t[0]) & (depth.t <= p.t[-1])
+        below = depth.x[there]
+        estimated = -np.interp(depth.t[there], p.t, p.x[2])
+        if below.size > 10 and np.std(below) > 0.2:
+            slope, offset = np.polyfit(below, estimated, 1)
+            told.append(
+                f"Estimated depth is {slope:.3f} × depth by pressure {offset:+.2f} m. The "
+                "autopilot takes 9800 Pa/m unless BARO_SPEC_GRAV says otherwise: in sea water "
+                "depths are then 2.5 % too large (give the water's density to correct it)."
+            )
+    return told
+
+
+def _battery(signals: Signals) -> list[str]:
+    if signals.voltage is None:
+        return []
+    v = signals.voltage.x
+    return [f"Battery {v.min():.1f} to {v.max():.1f} V from {_at(signals.voltage)}."]
+
+
+def _consistency(kept: Sequence[Trajectory], dt: float) -> tuple[list[str], list[str]]:
+    """Sentences on how far the velocities explain the poses: good ones, bad ones."""
+    long = [k for k in kept if len(k) > 2]
+    found = [agreement(dt * np.arange(len(k)), k.X_WB.T, k.V_WB_B.T) for k in long]
+    sizes = np.array([len(k) for k in long])
+    good, bad = [], []
+    for part, what in ((0, "Body velocity"), (1, "Body rates")):
+        explained = np.array([f[part].explained for f in found])
+        known = np.isfinite(explained)
+        if not known.any():
+            continue
+        mean = max(float(np.average(explained[known], weights=sizes[known])), 0.0)
+        sentence = f"{what} integrated explains {100 * mean:.1f} % of the change of pose"
+        if mean > _CONSISTENT:
+            good.append(f"{sentence}.")
+        else:
+            bad.append(f"{sentence} only: the autopilot's estimate is poor here.")
+    return good, bad
+
+
+def _lacking(signals: Signals) -> list[str]:
+    told = []
+    p = signals.position
+    if p is None:
+        told.append(
+            "No position or velocity at all: only rotation can be learned; stream "
+            "LOCAL_POSITION_NED or GLOBAL_POSITION_INT."
+        )
+    elif not np.isfinite(p.x[0]).any():
+        told.append(
+            "No horizontal estimate: surge and sway velocity and position are missing and can't be "
+            "learned, heave is that of the vertical velocity; a DVL or GPS and an EKF origin give "
+            "the rest."
+        )
+    elif p.rate < _SLOW_STATE_HZ:
+        told.append(
+            f"Position and velocity at {p.rate:.1f} Hz only: motion faster than about "
+            f"{p.rate / 4:.1f} Hz is not seen; ask for LOCAL_POSITION_NED at 20 Hz or more."
+        )
+    if signals.attitude.rate < _SLOW_STATE_HZ:
+        told.append(f"Attitude at {signals.attitude.rate:.1f} Hz only: fast turns are smoothed.")
+    rate = signals.outputs.rate
+    if rate < _SLOW_OUTPUTS_HZ:
+        told.append(
+            f"Thruster outputs at {rate:.1f} Hz: thruster lag and delays below about "
+            f"{2 / rate:.1f} s can't be learned, and commands between samples are unknown; log "
+            "SERVO_OUTPUT_RAW at 50 Hz or more."
+        )
+    if signals.voltage is None:
+        told.append("No battery voltage: thrust is that of the nominal voltage.")
+    if signals.pressure_depth is None:
+        told.append("No pressure: depth is the estimator's alone.")
+    if signals.specific_force is None:
+        told.append("No accelerometer.")
+    return told
+
+
+def _unexcited(kept: Sequence[Trajectory]) -> list[str]:
+    if not kept:
+        return []
+    V = np.concatenate([k.V_WB_B for k in kept])
+    still = [
+        TWIST[i]
+        for i in range(6)
+        if np.isfinite(V[:, i]).any()
+        and np.nanpercentile(np.abs(V[:, i] - np.nanmedian(V[:, i])), 95) < _STILL
+    ]
+    if not still:
+        return []
+    return [
+        f"Hardly any motion in {', '.join(still)} (below {_STILL} m/s or rad/s): "
+        "what acts along these axes can't be learned."
+    ]

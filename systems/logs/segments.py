@@ -1,0 +1,120 @@
+"""Cutting a log into stretches in which nothing but the motion changes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...models.recordings.resample import conjugate, multiply, rotation_exp, rotation_log
+from .signals import Series, Signals, Spans
+
+_GUARD_S = 0.1
+_SLOWEST_S = 60.0
+"""s between samples of the slowest signal: fewer tell nothing of a motion."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A stretch from start to stop (s on the log's clock), named by its states; kept or why not."""
+
+    start: float
+    stop: float
+    labels: tuple[str, ...]
+
+    @property
+    def duration(self) -> float:
+        """Length (s)."""
+        return self.stop - self.start
+
+
+def segments(signals: Signals, gap: float) -> tuple[list[Segment], list[str]]:
+    """Return the stretches with constant states, without gaps or jumps, in time order.
+
+    `gap` (s) is the longest pause allowed between samples, or five typical steps if that is longer.
+    The second result tells what cut them, one sentence a kind.
+    """
+    told: list[str] = []
+    spans = [Segment(-np.inf, np.inf, ())]
+    for state in signals.spans.values():
+        spans = _intersect(spans, state)
+    armed = [s for s in spans if "disarmed" not in s.labels]
+    series = [signals.attitude, signals.rates, signals.outputs]
+    series += [s for s in (signals.position, signals.velocity) if s is not None]
+    gaps: list[tuple[float, float]] = []
+    for one in series:
+        pieces = _without_gaps(one, gap)
+        spans = _intersect(spans, pieces)
+        gaps += zip(pieces.stop[:-1].tolist(), pieces.start[1:].tolist(), strict=True)
+    felt = [(a, b) for a, b in gaps if any(a < s.stop and b > s.start for s in armed)]
+    if felt:
+        starts = np.sort([a for a, _ in felt])
+        count = 1 + int(np.count_nonzero(np.diff(starts) > gap))
+        longest = max(b - a for a, b in felt)
+        told.append(f"{count} gap{'s' * (count > 1)} of up to {longest:.1f} s")
+    cuts = [*signals.cuts, *jumps(signals)]
+    spans = _intersect(spans, _between([t for t, _ in cuts]))
+    for kind in dict.fromkeys(kind for _, kind in cuts):
+        times = np.sort([t for t, k in cuts if k == kind])
+        count = 1 + int(np.count_nonzero(np.diff(times) > 1.0))
+        told.append(f"{count} × {kind}")
+    return sorted(spans, key=lambda s: s.start), told
+
+
+def jumps(signals: Signals) -> list[tuple[float, str]]:
+    """Times at which the estimate moves as no vehicle can: filter resets and lane switches.
+
+    A position step is compared with the velocity estimate, an attitude step with the body rates.
+    """
+    found = []
+    q, omega = signals.attitude, signals.rates
+    step = np.diff(q.t)
+    turned = multiply(conjugate(q.x[:, :-1]), q.x[:, 1:])
+    middle = 0.5 * (q.t[1:] + q.t[:-1])
+    rate = np.stack([np.interp(middle, omega.t, omega.x[i]) for i in range(3)])
+    off = np.linalg.norm(
+        rotation_log(multiply(conjugate(rotation_exp(rate * step)), turned)), axis=0
+    )
+    times = middle[off > 0.06 + 1.5 * step]
+    found += [(float(t), "attitude reset of the estimator") for t in times]
+    if signals.position is None or signals.velocity is None:
+        return found
+    p, v = signals.position, signals.velocity
+    step = np.diff(p.t)
+    speed = np.stack([np.interp(p.t, v.t, v.x[i]) for i in range(3)])
+    moved = np.diff(p.x, axis=1) - 0.5 * (speed[:, 1:] + speed[:, :-1]) * step
+    off = np.linalg.norm(np.nan_to_num(moved), axis=0)
+    times = p.t[1:][off > 0.25 + 1.0 * step**2]
+    found += [(float(t), "position reset of the estimator") for t in times]
+    step = np.diff(v.t)
+    off = np.linalg.norm(np.nan_to_num(np.diff(v.x, axis=1)), axis=0)
+    times = v.t[1:][off > 0.5 + 5.0 * step]
+    found += [(float(t), "velocity reset of the estimator") for t in times]
+    return found
+
+
+def _without_gaps(one: Series, gap: float) -> Spans:
+    allowed = max(gap, min(5.0 / one.rate, _SLOWEST_S) if one.rate else gap)
+    good = np.isfinite(one.t)
+    t = one.t[good]
+    breaks = np.flatnonzero(np.diff(t) > allowed)
+    start = np.concatenate([[t[0]], t[breaks + 1]])
+    stop = np.concatenate([t[breaks], [t[-1]]])
+    return Spans(start, stop, ("",) * start.size)
+
+
+def _between(times: Sequence[float]) -> Spans:
+    edges = np.sort(np.asarray(times, float))
+    start = np.concatenate([[-np.inf], edges + _GUARD_S])
+    stop = np.concatenate([edges - _GUARD_S, [np.inf]])
+    return Spans(start, stop, ("",) * start.size)
+
+
+def _intersect(segments: Sequence[Segment], spans: Spans) -> list[Segment]:
+    result = []
+    for segment in segments:
+        for start, stop, label in zip(spans.start, spans.stop, spans.label, strict=True):
+            low, high = max(segment.start, float(start)), min(segment.stop, float(stop))
+            if high > low:
+                labels = (*segment.labels, label) if label else segment.labels
+                result.append(Segment(low, high, labels))
+    return result

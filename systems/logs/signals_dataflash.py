@@ -1,0 +1,281 @@
+"""From DataFlash records to signals."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ...models.config.errors import UserError
+from ...models.recordings.resample import linear
+from ..mavlink import codec
+from .dataflash import BinLog
+from .depth import in_water
+from .signals import (
+    Series,
+    Signals,
+    Spans,
+    event_spans,
+    parameters_of,
+    sampled_spans,
+    series,
+    thruster_outputs,
+    undelayed,
+    wiring,
+)
+from .signals_tlog import UNAIDED
+from .table import Table, whole
+
+WANTED = (
+    "ACC",
+    "ARM",
+    "ATT",
+    "BARO",
+    "BAT",
+    "EV",
+    "GYR",
+    "IMU",
+    "MODE",
+    "PARM",
+    "RATE",
+    "RCIN",
+    "RCOU",
+    "VISO",
+    "VISP",
+    "VISV",
+    "XKF1",
+    "XKF4",
+    "XKQ",
+)
+_HORIZ_VEL, _HORIZ_POS, _CONST_POS = 1 << 1, 1 << 3 | 1 << 4, 1 << 7
+_ARMED_EVENT, _DISARMED_EVENT = 10, 11
+_LATEST_S = 1e9  # of a clock that counts from the boot
+
+
+def signals_from_bin(
+    log: BinLog, motors: Sequence[float] = (1.0,) * 8, density: float | None = None
+) -> Signals:
+    """Convert an autopilot's own log; `motors` and `density` as in `import_log`.
+
+    Raises:
+        UserError: if attitude, rates or thruster outputs are not in the log.
+    """
+    usable = {name: _usable(table) for name, table in log.tables.items()}
+    tables = {name: table for name, table in usable.items() if table["t"].size}
+    core = _primary_core(tables)
+    attitude = _attitude(tables, core)
+    first, last = float(attitude.t[0]), float(attitude.t[-1])
+    table = tables.get("PARM")
+    parameters, strange = (
+        ([], []) if table is None else parameters_of(table["t"], table["Name"], table["Value"])
+    )
+    known = {p.name: p.value for p in parameters}
+    wired = wiring(parameters, first, last)
+    outputs, notes = _outputs(tables, wired, motors)
+    position, velocity = _motion(tables, core, known, density)
+    rates, rate_notes = _rates(tables, core)
+    force = _imu(tables, core, "ACC", ("AccX", "AccY", "AccZ"), "specific force")
+    if not rates.source.startswith("GYR"):  # GYR and ACC are the sensors before the filters
+        rates, delay = undelayed(rates, known, "INS_GYRO_FILTER")
+        rate_notes = (*rate_notes, *delay)
+    if force is not None and force.source != "ACC":
+        force, delay = undelayed(force, known, "INS_ACCEL_FILTER")
+        rate_notes = (*rate_notes, *delay)
+    aids = [name for name in ("VISO", "VISP", "VISV") if name in tables]
+    return Signals(
+        attitude=attitude,
+        rates=rates,
+        outputs=outputs,
+        position=position,
+        velocity=velocity,
+        specific_force=force,
+        pressure_depth=_pressure_depth(tables, known, density),
+        voltage=_voltage(tables),
+        rc=_rc(tables),
+        spans={"wiring": wired.spans, **_states(tables, first, last), **_aiding(tables, core)},
+        has=(f"Horizontal aid: {', '.join(aids)}.",) if aids else (),
+        lacks=() if aids else ("No DVL, odometry or vision record in the log.",),
+        notes=(*log.notes, *strange, *wired.notes, *notes, *rate_notes),
+    )
+
+
+def _usable(table: Table) -> Table:
+    """Messages in time order that have a time, with columns of numbers (and of names, of PARM)."""
+    kept = Table(table.name)
+    for column, values in table.items():
+        text = (table.name, column) == ("PARM", "Name")
+        if values.ndim == 1 and values.dtype.kind == ("S" if text else "f"):
+            kept[column] = values
+    kept["t"] = kept["SampleUS" if "SampleUS" in kept else "TimeUS"] * 1e-6
+    order = np.argsort(kept["t"], kind="stable")
+    return kept.rows(order[(kept["t"][order] >= 0) & (kept["t"][order] < _LATEST_S)])
+
+
+def _columns(tables: Mapping[str, Table], name: str, *columns: str) -> Sequence[tuple]:
+    table = tables.get(name)
+    return [] if table is None else list(zip(table["t"], *(table[c] for c in columns), strict=True))
+
+
+def _primary_core(tables: Mapping[str, Table]) -> int:
+    """The filter core that flew most of the log."""
+    status = tables.get("XKF4")
+    if status is None or "PI" not in status:
+        return 0
+    indices, counts = np.unique(status["PI"][status["PI"] >= 0], return_counts=True)
+    return int(indices[counts.argmax()]) if indices.size else 0
+
+
+def _of(table: Table, column: str, value: int) -> Table:
+    """Rows of one instance; all of them if the log has no such column, the first one if not it."""
+    if column not in table:
+        return table
+    rows = table[column] == value
+    if not rows.any():
+        rows = table[column] == np.fmin.reduce(table[column])
+    return table.rows(rows)
+
+
+def _attitude(tables: Mapping[str, Table], core: int) -> Series:
+    found = []
+    if "XKQ" in tables:
+        q = _of(tables["XKQ"], "C", core)
+        found.append(
+            series(q["t"], codec.attitude(q["Q1"], q["Q2"], q["Q3"], q["Q4"]), "XKQ", "attitude")
+        )
+    if "ATT" in tables:
+        e = tables["ATT"]
+        x = codec.attitude_from_euler(e["Roll"], e["Pitch"], e["Yaw"], degrees=True)
+        found.append(series(e["t"], x, "ATT", "attitude"))
+    usable = [s for s in found if s is not None]
+    if not usable:
+        raise UserError("no attitude (XKQ, ATT) in this log; set LOG_BITMASK to its default")
+    return max(usable, key=lambda s: s.rate)
+
+
+def _imu(
+    tables: Mapping[str, Table], core: int, raw: str, axes: tuple[str, str, str], quantity: str
+) -> Series | None:
+    for name in ("IMU", raw):
+        if name in tables:
+            table = _of(tables[name], "I", core)
+            return series(table["t"], codec.body_vector(*(table[a] for a in axes)), name, quantity)
+    return None
+
+
+def _rates(tables: Mapping[str, Table], core: int) -> tuple[Series, tuple[str, ...]]:
+    gyro = _imu(tables, core, "GYR", ("GyrX", "GyrY", "GyrZ"), "rate")
+    if gyro is not None:
+        if "XKF1" not in tables or "GX" not in tables["XKF1"]:
+            return gyro, ("Body rates are those of the gyro, with its bias left in.",)
+        ekf = _of(tables["XKF1"], "C", core)
+        x = np.deg2rad(codec.body_vector(ekf["GX"], ekf["GY"], ekf["GZ"]))
+        bias = series(ekf["t"], x, "XKF1", "rate")
+        if bias is None:
+            return gyro, ()
+        corrected = gyro.x - linear(gyro.t, bias.t, bias.x)
+        return replace(gyro, x=corrected, source=f"{gyro.source} less XKF1's bias"), ()
+    if "RATE" in tables:
+        table = tables["RATE"]
+        x = np.deg2rad(codec.body_vector(table["R"], table["P"], table["Y"]))
+        slow = series(table["t"], x, "RATE", "rate")
+        if slow is not None:
+            return slow, ()
+    raise UserError("no gyro (IMU, GYR, RATE) in this log; set LOG_BITMASK to its default")
+
+
+def _motion(
+    tables: Mapping[str, Table], core: int, known: Mapping[str, float], density: float | None
+) -> tuple[Series | None, Series | None]:
+    if "XKF1" not in tables:
+        return None, None
+    ekf = _of(tables["XKF1"], "C", core)
+    p = codec.world_vector(ekf["PN"], ekf["PE"], ekf["PD"])
+    v = codec.world_vector(ekf["VN"], ekf["VE"], ekf["VD"])
+    position = series(ekf["t"], p, "XKF1", "position")
+    velocity = series(ekf["t"], v, "XKF1", "velocity")
+    return in_water(position, velocity, known, density)
+
+
+def _aiding(tables: Mapping[str, Table], core: int) -> dict[str, Spans]:
+    if "XKF4" not in tables or "SS" not in tables["XKF4"]:
+        return {}
+    status = _of(tables["XKF4"], "C", core)
+    flags = whole(status["SS"])
+    aided = (flags & _HORIZ_VEL > 0) & (flags & _HORIZ_POS > 0) & (flags & _CONST_POS == 0)
+    return {"aiding": sampled_spans(status["t"], ["" if a else UNAIDED for a in aided])}
+
+
+def _states(tables: Mapping[str, Table], first: float, last: float) -> dict[str, Spans]:
+    spans = {}
+    number = "ModeNum" if "ModeNum" in tables.get("MODE", ()) else "Mode"
+    modes = tables.get("MODE")
+    if modes is not None:
+        names = [codec.mode_name(int(mode)) for mode in whole(modes[number])]
+        spans["mode"] = event_spans(modes["t"], names, first, last)
+    arming = [(t, state > 0) for t, state in _columns(tables, "ARM", "ArmState")]
+    if not arming:
+        events = {_ARMED_EVENT: True, _DISARMED_EVENT: False}
+        arming = [(t, events[i]) for t, i in _columns(tables, "EV", "Id") if i in events]
+    if arming:  # before the first change it was the other way round
+        states = [(first, not arming[0][1]), *arming]
+        spans["armed"] = event_spans(
+            np.array([t for t, _ in states]),
+            ["" if armed else "disarmed" for _, armed in states],
+            first,
+            last,
+        )
+    return spans
+
+
+def _outputs(
+    tables: Mapping[str, Table], wired: object, motors: Sequence[float]
+) -> tuple[Series, list[str]]:
+    if "RCOU" not in tables:
+        raise UserError(
+            "no RCOU in this log, so nothing tells what the thrusters did; "
+            "set LOG_BITMASK to its default"
+        )
+    table = tables["RCOU"]
+    channels = np.zeros((16, table["t"].size))
+    for n in range(1, 15):
+        if f"C{n}" in table:
+            channels[n - 1] = table[f"C{n}"]
+    outputs, notes = thruster_outputs(
+        table["t"],
+        channels,
+        wired,  # pyright: ignore[reportArgumentType]
+        motors,
+        "RCOU",
+    )
+    if outputs is None:
+        raise UserError("RCOU: a single record is no record of the thrusters")
+    return outputs, notes
+
+
+def _pressure_depth(
+    tables: Mapping[str, Table], known: Mapping[str, float], density: float | None
+) -> Series | None:
+    if "BARO" not in tables:
+        return None
+    gradient = codec.pascal_per_metre(known.get("BARO_SPEC_GRAV", 1.0), density)
+    baro = _of(tables["BARO"], "I", 1)
+    instance = int(whole(baro["I"])[0]) if "I" in baro else 0
+    surface = known.get(f"BARO{instance + 1}_GND_PRESS", 0.0) / 100
+    surface = surface if 800 < surface < 1200 else codec.SURFACE_PRESSURE_HPA
+    depth = codec.depth_from_pressure(baro["Press"] / 100.0, surface, gradient)
+    return series(baro["t"], depth, "BARO", "depth")
+
+
+def _voltage(tables: Mapping[str, Table]) -> Series | None:
+    if "BAT" not in tables:
+        return None
+    column = "Inst" if "Inst" in tables["BAT"] else "Instance"
+    battery = _of(tables["BAT"], column, 0)
+    known = battery["Volt"] > 0
+    return series(battery["t"][known], battery["Volt"][known], "BAT", "voltage")
+
+
+def _rc(tables: Mapping[str, Table]) -> Series | None:
+    if "RCIN" not in tables:
+        return None
+    table = tables["RCIN"]
+    return series(table["t"], np.stack([table[f"C{n}"] for n in range(1, 9)]), "RCIN", "channel")

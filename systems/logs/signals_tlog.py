@@ -1,0 +1,241 @@
+"""From telemetry messages to signals."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ...models.config.errors import UserError
+from ..mavlink import codec
+from .depth import in_water
+from .signals import (
+    Series,
+    Signals,
+    Spans,
+    parameters_of,
+    sampled_spans,
+    series,
+    thruster_outputs,
+    undelayed,
+    wiring,
+)
+from .table import Table
+from .tlog import TlogLog
+
+WANTED = (
+    "ATTITUDE",
+    "ATTITUDE_QUATERNION",
+    "BATTERY_STATUS",
+    "EKF_STATUS_REPORT",
+    "GLOBAL_POSITION_INT",
+    "GPS_RAW_INT",
+    "HEARTBEAT",
+    "LOCAL_POSITION_NED",
+    "PARAM_VALUE",
+    "RAW_IMU",
+    "RC_CHANNELS",
+    "SCALED_IMU",
+    "SCALED_PRESSURE",
+    "SCALED_PRESSURE2",
+    "SERVO_OUTPUT_RAW",
+    "SYSTEM_TIME",
+    "SYS_STATUS",
+)
+UNAIDED = "unaided"
+_AIDS = ("VISION_POSITION_DELTA", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE", "ODOMETRY")
+_FIX_3D = 3
+_VELOCITY_HORIZ, _POS_HORIZ, _CONST_POS = 2, 8 | 16, 128
+
+
+def signals_from_tlog(
+    log: TlogLog, motors: Sequence[float] = (1.0,) * 8, density: float | None = None
+) -> Signals:
+    """Convert a vehicle's messages; `motors` and `density` as in `import_log`.
+
+    Raises:
+        UserError: if attitude or thruster outputs are not in the log.
+    """
+    tables = log.tables
+    attitude = _attitude(tables)
+    outputs_table = tables.get("SERVO_OUTPUT_RAW")
+    if outputs_table is None:
+        raise UserError(
+            "no SERVO_OUTPUT_RAW in this log, so nothing tells what the thrusters did; "
+            "ask for it with SET_MESSAGE_INTERVAL (50 Hz or more) while logging"
+        )
+    first, last = float(attitude.t[0]), float(attitude.t[-1])
+    table = tables.get("PARAM_VALUE")
+    parameters, strange = (
+        ([], [])
+        if table is None
+        else parameters_of(table["t"], table["param_id"], table["param_value"])
+    )
+    wired = wiring(parameters, first, last)
+    known = {p.name: p.value for p in parameters}
+    outputs, notes = _outputs(outputs_table, wired, motors)
+    aiding = _aiding(tables)
+    position, velocity = _motion(tables, known, density)
+    rates, bias_note = _rates(tables, attitude)
+    rates, rate_delay = undelayed(rates, known, "INS_GYRO_FILTER")
+    force, force_delay = _specific_force(tables, known)
+    aids = sorted({name for name, _, _ in log.heard if name in _AIDS})
+    fixes = tables.get("GPS_RAW_INT")
+    if fixes is not None and np.median(fixes["fix_type"]) >= _FIX_3D:
+        aids.append("GPS")
+    has = [f"Horizontal aid: {', '.join(aids)}."] if aids else []
+    return Signals(
+        attitude=attitude,
+        rates=rates,
+        outputs=outputs,
+        position=position,
+        velocity=velocity,
+        specific_force=force,
+        pressure_depth=_pressure_depth(tables, known, density),
+        voltage=_voltage(tables),
+        rc=_rc(tables),
+        spans={"wiring": wired.spans, **_states(tables), **aiding},
+        cuts=tuple((t, "reboot of the autopilot") for t in log.boots),
+        has=tuple(has),
+        lacks=() if aids else ("No DVL, odometry, vision or GPS message in the log.",),
+        notes=(*log.notes, *strange, *wired.notes, *notes, *bias_note, *rate_delay, *force_delay),
+    )
+
+
+def _attitude(tables: Mapping[str, Table]) -> Series:
+    found = []
+    if (q := tables.get("ATTITUDE_QUATERNION")) is not None:
+        x = codec.attitude(q["q1"], q["q2"], q["q3"], q["q4"])
+        found.append(series(q["t"], x, "ATTITUDE_QUATERNION", "attitude"))
+    if (e := tables.get("ATTITUDE")) is not None:
+        x = codec.attitude_from_euler(e["roll"], e["pitch"], e["yaw"])
+        found.append(series(e["t"], x, "ATTITUDE", "attitude"))
+    usable = [s for s in found if s is not None]
+    if not usable:
+        raise UserError("no ATTITUDE in this log; stream ATTITUDE (50 Hz is good) while logging")
+    return max(usable, key=lambda s: s.t.size)
+
+
+def _rates(tables: Mapping[str, Table], attitude: Series) -> tuple[Series, tuple[str, ...]]:
+    """Body rates: with the attitude (bias removed by the filter), or from a much faster gyro."""
+    table = tables[attitude.source]
+    x = codec.body_vector(table["rollspeed"], table["pitchspeed"], table["yawspeed"])
+    own = series(table["t"], x, f"{attitude.source} rates", "rate")
+    if own is None:
+        raise UserError(f"{attitude.source}: its body rates are no numbers; log them again")
+    for name in ("RAW_IMU", "SCALED_IMU"):
+        imu = tables.get(name)
+        if imu is None:
+            continue
+        gyro = series(
+            imu["t"], codec.imu_angular_rate(imu["xgyro"], imu["ygyro"], imu["zgyro"]), name, "rate"
+        )
+        if gyro is not None and gyro.rate > 3 * own.rate:
+            return gyro, (f"Body rates are those of {name}, with the gyro's bias left in.",)
+    return own, ()
+
+
+def _specific_force(
+    tables: Mapping[str, Table], known: Mapping[str, float]
+) -> tuple[Series | None, list[str]]:
+    for name in ("RAW_IMU", "SCALED_IMU"):
+        if (imu := tables.get(name)) is not None:
+            x = codec.imu_specific_force(imu["xacc"], imu["yacc"], imu["zacc"])
+            found = series(imu["t"], x, name, "specific force")
+            return (None, []) if found is None else undelayed(found, known, "INS_ACCEL_FILTER")
+    return None, []
+
+
+def _motion(
+    tables: Mapping[str, Table], known: Mapping[str, float], density: float | None
+) -> tuple[Series | None, Series | None]:
+    local, glob = tables.get("LOCAL_POSITION_NED"), tables.get("GLOBAL_POSITION_INT")
+    if local is not None and local["t"].size > 1:
+        t, name = local["t"], "LOCAL_POSITION_NED"
+        p = codec.world_vector(local["x"], local["y"], local["z"])
+        v = codec.world_vector(local["vx"], local["vy"], local["vz"])
+    elif glob is not None:
+        t, name = glob["t"], "GLOBAL_POSITION_INT"
+        lacking = np.full(t.size, np.nan)
+        p = np.stack([lacking, lacking, codec.height_from_relative_alt(glob["relative_alt"])])
+        v = np.stack([lacking, lacking, codec.climb_from_vz(glob["vz"])])
+    else:
+        return None, None
+    position, velocity = series(t, p, name, "position"), series(t, v, name, "velocity")
+    return in_water(position, velocity, known, density)
+
+
+def _aiding(tables: Mapping[str, Table]) -> dict[str, Spans]:
+    status = tables.get("EKF_STATUS_REPORT")
+    if "LOCAL_POSITION_NED" not in tables:
+        return {"aiding": Spans(np.array([-np.inf]), np.array([np.inf]), (UNAIDED,))}
+    if status is None:
+        return {}
+    flags = status["flags"].astype(int)
+    aided = (flags & _VELOCITY_HORIZ > 0) & (flags & _POS_HORIZ > 0) & (flags & _CONST_POS == 0)
+    return {"aiding": sampled_spans(status["t"], ["" if a else UNAIDED for a in aided])}
+
+
+def _states(tables: Mapping[str, Table]) -> dict[str, Spans]:
+    beats = tables.get("HEARTBEAT")
+    if beats is None:
+        return {}
+    armed = (beats["base_mode"] & codec.ARMED_FLAG) > 0
+    return {
+        "mode": sampled_spans(beats["t"], [codec.mode_name(int(m)) for m in beats["custom_mode"]]),
+        "armed": sampled_spans(beats["t"], ["" if a else "disarmed" for a in armed]),
+    }
+
+
+def _outputs(table: Table, wired: object, motors: Sequence[float]) -> tuple[Series, list[str]]:
+    main = table["port"] == 0
+    channels = np.stack([table[f"servo{n}_raw"][main] for n in range(1, 17)])
+    outputs, notes = thruster_outputs(
+        table["t"][main],
+        channels,
+        wired,  # pyright: ignore[reportArgumentType]
+        motors,
+        "SERVO_OUTPUT_RAW",
+    )
+    if outputs is None:
+        raise UserError("SERVO_OUTPUT_RAW: a single message is no record of the thrusters")
+    return outputs, notes
+
+
+def _pressure_depth(
+    tables: Mapping[str, Table], known: Mapping[str, float], density: float | None
+) -> Series | None:
+    gradient = codec.pascal_per_metre(known.get("BARO_SPEC_GRAV", 1.0), density)
+    for name, parameter in (
+        ("SCALED_PRESSURE2", "BARO2_GND_PRESS"),
+        ("SCALED_PRESSURE", "BARO1_GND_PRESS"),
+    ):
+        table = tables.get(name)
+        if table is None or np.median(table["press_abs"]) < 500:
+            continue
+        surface = known.get(parameter, 0.0) / 100.0
+        surface = surface if 800 < surface < 1200 else codec.SURFACE_PRESSURE_HPA
+        depth = codec.depth_from_pressure(table["press_abs"], surface, gradient)
+        return series(table["t"], depth, name, "depth")
+    return None
+
+
+def _voltage(tables: Mapping[str, Table]) -> Series | None:
+    if (battery := tables.get("BATTERY_STATUS")) is not None:
+        main = battery["id"] == 0
+        volts = np.asarray(codec.pack_voltage(battery["voltages"][main].T.astype(float)))
+        known = np.isfinite(volts)
+        found = series(battery["t"][main][known], volts[known], "BATTERY_STATUS", "voltage")
+        if found is not None:
+            return found
+    if (status := tables.get("SYS_STATUS")) is not None:
+        volts = np.asarray(codec.volts(status["voltage_battery"]))
+        known = np.isfinite(volts)
+        return series(status["t"][known], volts[known], "SYS_STATUS", "voltage")
+    return None
+
+
+def _rc(tables: Mapping[str, Table]) -> Series | None:
+    if (table := tables.get("RC_CHANNELS")) is None:
+        return None
+    channels = np.stack([table[f"chan{n}_raw"] for n in range(1, 9)]).astype(float)
+    channels = np.where(channels == codec.UINT16_MAX, 0, channels)
+    return series(table["t"], channels, "RC_CHANNELS", "channel")

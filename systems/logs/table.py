@@ -1,0 +1,43 @@
+"""Columns of one kind of message of a log, as far as they can be what a sensor or a filter says."""
+
+import numpy as np
+
+from ...models.config.errors import UserError
+
+_LARGEST = 1e18
+"""Squares of numbers below it are finite in either precision; no clock counts so many µs."""
+
+
+class Table(dict[str, np.ndarray]):
+    """Columns by name, one entry a message; `name` is that of the message.
+
+    Raises:
+        UserError: a column is asked for that the messages lack.
+    """
+
+    def __init__(self, name: str, columns: dict[str, np.ndarray] | None = None):
+        super().__init__(columns or {})
+        self.name = name
+
+    def __missing__(self, column: str) -> np.ndarray:
+        raise UserError(
+            f"message {self.name} lacks the field {column!r}, so this is no log of an ArduPilot "
+            "version that is known (4.0 to 4.6)"
+        )
+
+    def rows(self, which: np.ndarray) -> "Table":
+        """The messages of these indices, or where this is true."""
+        return Table(self.name, {column: values[which] for column, values in self.items()})
+
+
+def whole(values: np.ndarray) -> np.ndarray:
+    """Flags, modes or indices as int64; 0 where they are no number."""
+    return np.nan_to_num(values, nan=0.0).astype(np.int64)
+
+
+def numbers(values: np.ndarray) -> np.ndarray:
+    """The values in float64; NaN where they are infinite or so large that bits must be damaged."""
+    with np.errstate(invalid="ignore"):  # a damaged number may signal when it is converted
+        wide = values.astype(np.float64)
+    wide[~(np.abs(wide) < _LARGEST)] = np.nan
+    return wide

@@ -1,0 +1,209 @@
+"""MAVLink telemetry log (.tlog) into arrays on the vehicle's own clock.
+
+A record is eight bytes of the logger's clock (big-endian µs) and a MAVLink 1 or 2 packet, in both
+directions and of every system on the link. `packets.py` finds them; here they become tables.
+
+Clocks. Logger clocks jump and links delay, so samples take the vehicle's time since boot:
+`time_boot_ms` as it is; the 32-bit `time_usec`, which wraps after 71.6 minutes, unwrapped next to
+the last `time_boot_ms` before it; messages without a time take that of the last one with it, plus
+what the logger's clock says has passed, at most one second. A reboot starts a new stretch.
+"""
+
+from collections import Counter
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...models.config.errors import UserError
+from .log_bytes import Progress, no_progress
+from .packets import Packets, message_id, message_name, rows_of, scan
+from .table import Table, numbers
+
+_GROUND_STATION, _NO_AUTOPILOT, _SUBMARINE, _ARDUPILOT = 6, 8, 12, 3
+_CLOCKS = ("ATTITUDE", "ATTITUDE_QUATERNION", "SYSTEM_TIME")
+_REBOOT_S = 5.0
+_BETWEEN_BOOTS_S = 10.0
+_WRAP_US_S = 2**32 * 1e-6
+_WRAP_MS_S = 2**32 * 1e-3
+
+System = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class TlogLog:
+    """Tables of one vehicle's messages by name, each with `t` (s since first boot) and its fields.
+
+    `boots` are the times at which a later boot starts (none for a log of one boot), `heard` counts
+    all messages of all systems by (name, system, component).
+    """
+
+    tables: Mapping[str, Table]
+    system: System
+    boots: tuple[float, ...]
+    heard: Mapping[tuple[str, int, int], int]
+    notes: tuple[str, ...]
+
+
+def read_tlog(
+    data: bytes,
+    wanted: Collection[str],
+    system: int | None = None,
+    progress: Progress = no_progress,
+) -> TlogLog:
+    """Decode the wanted messages of one autopilot: of `system` if given, else of the busiest.
+
+    Raises:
+        UserError: if no autopilot speaks in the log, or not the system asked for.
+    """
+    packets = scan(data, progress)
+    heard = _heard(packets)
+    chosen, notes = _choose(data, packets, heard, system)
+    own = (packets.system == chosen[0]) & (packets.component == chosen[1])
+    tables: dict[str, Table] = {}
+    index: dict[str, np.ndarray] = {}
+    broken = 0
+    names = sorted(set(wanted) | set(_CLOCKS))
+    for n, name in enumerate(names):
+        candidates = np.flatnonzero(own & (packets.message == message_id(name)))
+        if candidates.size:
+            rows, good = rows_of(data, packets, candidates, name)
+            broken += int(candidates.size - good.size)
+            if good.size:
+                index[name] = good
+                columns = {f: rows[f] for f in rows.dtype.names or ()}
+                clean = {f: numbers(x) if x.dtype.kind == "f" else x for f, x in columns.items()}
+                tables[name] = Table(name, clean)
+        progress(0.7 + 0.1 * n / len(names))
+    boots, clock_note = _put_on_vehicle_clock(tables, index, packets.stamps(data))
+    if packets.skipped:
+        notes.append(f"{packets.skipped} of {len(data)} bytes are damaged and were skipped.")
+    if broken:
+        notes.append(f"{broken} messages with a wrong checksum were left out.")
+    notes.extend(clock_note)
+    return TlogLog(tables, chosen, boots, heard, tuple(notes))
+
+
+def _heard(packets: Packets) -> dict[tuple[str, int, int], int]:
+    keys = np.stack([packets.message, packets.system, packets.component])
+    kinds, counts = np.unique(keys, axis=1, return_counts=True)
+    return {
+        (message_name(int(m)), int(s), int(c)): int(n)
+        for (m, s, c), n in zip(kinds.T, counts, strict=True)
+    }
+
+
+def _choose(
+    data: bytes,
+    packets: Packets,
+    heard: Mapping[tuple[str, int, int], int],
+    system: int | None,
+) -> tuple[System, list[str]]:
+    autopilots: dict[System, tuple[int, int]] = {}
+    beats = np.flatnonzero(packets.message == message_id("HEARTBEAT"))
+    rows, good = rows_of(data, packets, beats, "HEARTBEAT")
+    for row, i in zip(rows, good, strict=True):
+        key = (int(packets.system[i]), int(packets.component[i]))
+        if row["autopilot"] != _NO_AUTOPILOT and row["type"] != _GROUND_STATION:
+            autopilots.setdefault(key, (int(row["type"]), int(row["autopilot"])))
+    if not autopilots:  # no heartbeat: whoever reports an attitude flies
+        autopilots = {(s, c): (-1, -1) for (n, s, c) in heard if n.startswith("ATTITUDE")}
+    if not autopilots:
+        speakers = sorted({f"{s}/{c}" for _, s, c in heard})
+        raise UserError(
+            f"no autopilot speaks in this log (systems heard: {', '.join(speakers) or 'none'}); "
+            "log what the vehicle sends, not only what the ground station sends"
+        )
+    spoken = Counter()
+    for (_, s, c), n in heard.items():
+        spoken[(s, c)] += n
+    mine = [key for key in autopilots if system is None or key[0] == system]
+    if not mine:
+        raise UserError(
+            f"system {system}: not an autopilot of this log; "
+            f"there are {sorted({s for s, _ in autopilots})}"
+        )
+    submarines = [key for key in mine if autopilots[key][0] == _SUBMARINE]
+    chosen = max(submarines or mine, key=lambda key: spoken[key])
+    notes = []
+    if len(autopilots) > 1:
+        notes.append(
+            f"Several autopilots in the log ({sorted(s for s, _ in autopilots)}): "
+            f"system {chosen[0]} was taken."
+        )
+    kind, maker = autopilots[chosen]
+    if maker not in (_ARDUPILOT, -1):
+        notes.append(
+            f"The autopilot is not ArduPilot (MAV_AUTOPILOT {maker}): mode names and thruster "
+            "order are ArduSub's and may be wrong."
+        )
+    elif kind not in (_SUBMARINE, -1):
+        notes.append(f"The vehicle calls itself MAV_TYPE {kind}, not a submarine (12).")
+    return chosen, notes
+
+
+def _put_on_vehicle_clock(
+    tables: dict[str, Table], index: dict[str, np.ndarray], stamps: np.ndarray
+) -> tuple[tuple[float, ...], list[str]]:
+    """Add the column `t` to every table and sort by it; see the module's head."""
+    timed = [name for name in tables if "time_boot_ms" in tables[name]]
+    if not timed:
+        raise UserError(
+            "no message with the vehicle's time (ATTITUDE and the like) in this log; "
+            "stream ATTITUDE and LOCAL_POSITION_NED while logging"
+        )
+    at = np.concatenate([index[name] for name in timed])
+    raw = np.concatenate([tables[name]["time_boot_ms"] * 1e-3 for name in timed])
+    order = np.argsort(at, kind="stable")
+    at, raw = at[order], raw[order]
+    shift, boots = _epochs(raw)
+    base = raw + shift
+    notes = _clock_notes(base, stamps[at], boots)
+    for name, table in tables.items():
+        i = np.clip(np.searchsorted(at, index[name], side="right") - 1, 0, at.size - 1)
+        elapsed = np.clip(stamps[index[name]] - stamps[at[i]], -1.0, 1.0)
+        if "time_boot_ms" in table:
+            t = table["time_boot_ms"] * 1e-3 + shift[i]
+        elif "time_usec" in table:
+            near = base[i] - shift[i]
+            usec = table["time_usec"] * 1e-6
+            if table["time_usec"].dtype.itemsize == 4:
+                usec = usec + _WRAP_US_S * np.round((near - usec) / _WRAP_US_S)
+            t = np.where(np.abs(usec - near) < _REBOOT_S, usec, near) + shift[i]
+        else:
+            t = base[i] + elapsed
+        table["t"] = t
+        sorting = np.argsort(t, kind="stable")
+        tables[name] = table.rows(sorting)
+    return boots, notes
+
+
+def _epochs(raw: np.ndarray) -> tuple[np.ndarray, tuple[float, ...]]:
+    """What to add to each boot time so that later boots follow earlier ones, and their starts."""
+    back = np.flatnonzero(np.diff(raw) < -_REBOOT_S) + 1
+    shift = np.zeros_like(raw)
+    boots = []
+    for start in back:
+        before = raw[start - 1] + shift[start - 1]
+        if raw[start - 1] - raw[start] > _WRAP_MS_S / 2:  # the 32-bit ms counter wrapped (49.7 d)
+            shift[start:] = shift[start - 1] + _WRAP_MS_S
+            continue
+        shift[start:] = before + _BETWEEN_BOOTS_S - raw[start]
+        boots.append(float(before + _BETWEEN_BOOTS_S / 2))
+    return shift, tuple(boots)
+
+
+def _clock_notes(base: np.ndarray, stamps: np.ndarray, boots: tuple[float, ...]) -> list[str]:
+    notes = []
+    if boots:
+        notes.append(f"The autopilot booted {len(boots)} more time{'s' * (len(boots) > 1)} in it.")
+    lag = stamps - base
+    jumps = np.abs(np.diff(lag)) > 2.0
+    jumps &= ~np.isin(np.searchsorted(boots, base[1:]) - np.searchsorted(boots, base[:-1]), (1,))
+    if jumps.any():
+        worst = np.abs(np.diff(lag)[jumps]).max()
+        notes.append(
+            f"The logger's clock or link jumped by up to {worst:.0f} s; "
+            "the vehicle's own clock was used."
+        )
+    return notes

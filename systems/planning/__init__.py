@@ -1,0 +1,1 @@
+"""Plans: MPPI, references, obstacles, and the vectors that carry a plan."""

@@ -1,0 +1,158 @@
+"""The path integral planner in a diagram."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from itertools import accumulate, pairwise
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt32
+from pydrake.common import RandomDistribution
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from ..compiled.jit import Program, compiled, require_double, together, value_or_zeros
+from .mppi_core import Draw, MppiPlanner, MppiState, Rolled
+from .plan import Plan
+from .plan_samples import SampleLayout
+
+FIGURES = (
+    "cost",
+    "collision_probability",
+    "clearance",
+    "effective_samples",
+    "temperature",
+    "valid",
+)
+"""What the output port `figures` holds, in this order."""
+
+
+def key_from_gaussians(w: Float[Array, "4"]) -> UInt32[Array, "2"]:
+    """A threefry key from the bits of four unit Gaussians (float64, so some 200 random bits)."""
+    bits = jax.lax.bitcast_convert_type(w, jnp.uint32).reshape(2, 4)
+    return bits[:, 0] ^ bits[:, 1] ^ bits[:, 2] ^ bits[:, 3]
+
+
+class Mppi(LeafSystem):
+    """Plans every `config.period` with `systems.planning.mppi_core.MppiPlanner`.
+
+    `plan` is laid out by `layout` and `samples` by `samples`; both hold zeros before the first
+    call, and `plan` whenever no finite plan was found (a state estimate of NaN, say), which the
+    tracking controller takes for "no plan". `F_bias_Bo_W` is an observed wrench with the axes of
+    W, zero if not connected. `noise` is drawn anew for every call.
+
+    .. pydrake_system::
+
+        name: Mppi
+        input_ports:
+        - X_WB
+        - V_WB_B
+        - F_bias_Bo_W
+        - noise
+        output_ports:
+        - plan
+        - samples
+        - figures
+
+    """
+
+    def __init__(self, planner: MppiPlanner):
+        """The planner brings model, limits, obstacles, goal and settings.
+
+        Raises:
+            ValueError: if JAX runs in single precision.
+        """
+        super().__init__()
+        require_double()
+        config = planner.config
+        self.planner = planner
+        self.layout = config.layout
+        self.samples = SampleLayout(
+            config.horizon, config.dt, min(config.shown_paths, config.sequences)
+        )
+        self._X = self.DeclareVectorInputPort("X_WB", 7)
+        self._V = self.DeclareVectorInputPort("V_WB_B", 6)
+        self._bias = self.DeclareVectorInputPort("F_bias_Bo_W", 6)
+        self._noise = self.DeclareVectorInputPort("noise", 4, RandomDistribution.kGaussian)
+        first = eqx.filter_jit(MppiPlanner.init)(planner)
+        start: Any = np.asarray(first.F_Bo_B, float).ravel()
+        self._nominal = self.DeclareDiscreteState(start)
+        self._plan = self.DeclareDiscreteState(self.layout.size)
+        self._samples = self.DeclareDiscreteState(self.samples.size)
+        self._figures = self.DeclareDiscreteState(len(FIGURES))
+        self.DeclareStateOutputPort("plan", self._plan)
+        self.DeclareStateOutputPort("samples", self._samples)
+        self.DeclareStateOutputPort("figures", self._figures)
+        self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._update)
+        sizes = [start.size, self.layout.size, self.samples.size, len(FIGURES)]
+        ends = [0, *accumulate(sizes)]
+        self._slices = [slice(a, b) for a, b in pairwise(ends)]
+
+    @cached_property
+    def _programs(self) -> tuple[Program, list[Program], Program]:
+        """Draws, rolls out (a program for each part: of equal parts it is one) and chooses."""
+        vector = {n: jax.ShapeDtypeStruct((n,), np.float64) for n in (1, 4, 6, 7)}
+        nominal = jax.ShapeDtypeStruct((6 * self.planner.config.horizon,), np.float64)
+        now = vector[7], vector[6], vector[6]
+        of_draw = nominal, vector[6], vector[4]
+        draw = jax.eval_shape(self._draw, *of_draw)
+        roll = [compiled(self._roll, part, draw.dW, draw.before, *now) for part in draw.parts]
+        rolled = [jax.eval_shape(self._roll, p, draw.dW, draw.before, *now) for p in draw.parts]
+        choose = compiled(self._choose, vector[1], draw, rolled, *now)
+        return compiled(self._draw, *of_draw), roll, choose
+
+    def _draw(self, nominal: Array, bias: Array, noise: Array) -> Draw:
+        state = MppiState(nominal.reshape(-1, 6))
+        return self.planner.draw(state, key_from_gaussians(noise), bias)
+
+    def _roll(
+        self, part: Array, dW: Array | None, before: Array, X: Array, V: Array, bias: Array
+    ) -> Rolled:
+        return self.planner.roll(part, dW, X, V, bias, before)
+
+    def _choose(
+        self, t: Array, draw: Draw, rolled: Sequence[Rolled], X: Array, V: Array, bias: Array
+    ):
+        state, out = self.planner.choose(draw, rolled, X, V, bias)
+        wide = jax.tree.map(lambda a: a.astype(t.dtype), out)
+        plan = self.layout.pack(Plan(t[0], wide.X_WB, wide.V_WB_B, wide.F_Bo_B))
+        samples = self.samples.pack(t[0], wide.paths, wide.path_weights)
+        plan, samples = jnp.where(out.valid, plan, 0), jnp.where(out.valid, samples, 0)
+        figures = jnp.stack([getattr(wide, name) for name in FIGURES])
+        return jnp.concatenate([state.F_Bo_B.ravel().astype(t.dtype), plan, samples, figures])
+
+    def plan(
+        self,
+        t: float,
+        nominal: Float[np.ndarray, " n"],
+        X_WB: Float[np.ndarray, "7"],
+        V_WB_B: Float[np.ndarray, "6"],
+        F_bias_Bo_W: Float[np.ndarray, "6"],
+        noise: Float[np.ndarray, "4"],
+    ) -> list[Float[np.ndarray, "_"]]:
+        """One call at time t (s): the next `nominal`, and the values of the three ports.
+
+        `nominal` holds the wrenches (horizon × 6) that the call before planned from its time on.
+        """
+        draw, roll, choose = self._programs
+        now = X_WB, V_WB_B, F_bias_Bo_W
+        drawn = draw.call(nominal, F_bias_Bo_W, noise)
+        rolled = together(roll, [(part, drawn.dW, drawn.before, *now) for part in drawn.parts])
+        flat = np.asarray(choose.call(np.array([t]), drawn, rolled, *now))
+        return [flat[part] for part in self._slices]
+
+    def _update(self, context: Context, state: DiscreteValues) -> None:
+        values = self.plan(
+            context.get_time(),
+            context.get_discrete_state(self._nominal).value(),
+            self._X.Eval(context),
+            self._V.Eval(context),
+            value_or_zeros(self._bias, context),
+            self._noise.Eval(context),
+        )
+        for group, value in zip(
+            (self._nominal, self._plan, self._samples, self._figures), values, strict=True
+        ):
+            state.set_value(group, value)

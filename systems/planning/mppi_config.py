@@ -1,0 +1,184 @@
+"""Settings of the model predictive path integral planner."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from ...models.config.checks import Vector6, check_numbers, require
+from .plan import PlanLayout
+
+_SUBSTEPS = 2
+
+
+@dataclass(frozen=True)
+class MppiConfig:
+    """Cost, sampling and risk of `systems.planning.mppi_core.MppiPlanner`.
+
+    Six numbers are for x, y, z, roll, pitch, yaw.
+
+    Attributes:
+        horizon: number of steps.
+        dt: length of a step (s).
+        substeps: of the model in a step; null takes those a learned model was trained with, and 2
+            for physics. With a single one some learned models diverge.
+        period: time between calls (s), a multiple of `dt`: the warm start shifts by it.
+        sequences: control sequences sampled in a call.
+        realisations: noise paths each of them meets, an even number (pairs of opposite sign); 1
+            plans with the model's drift alone.
+            `sequences` × `realisations` is the number of rollouts.
+        pose_weight: diagonal of L in ‖log(g⁻¹ g_goal)‖²_L (1/m² and 1/rad²).
+        twist_weight: diagonal of Q in ‖ξ_goal − ξ‖²_Q (s²/m² and s²/rad²).
+        terminal_time: the running cost of the last state counts this much longer (s).
+        effort_weight: cost rate of the thrust beyond what holds the vehicle at the goal, where 1
+            is the whole of each axis' limit (0 leaves the paper's cost as it is).
+        rate_weight: the same for the change of the wrench within a second.
+        speed_limit: linear speed (m/s) above which `speed_weight` counts.
+        speed_weight: cost rate of (|v| − speed_limit)² (s²/m²).
+        noise: standard deviation of the sampled wrenches as a fraction of each axis' limit.
+        knots: numbers of spline pieces over the horizon; the sequences are shared out among
+            them, so that slow pushes and quick corrections are both tried.
+        smallest_noise: the sequences' amplitudes run from 1 down to this, geometrically.
+        wrench_fraction: part of the thrusters' feasible wrenches that a plan may use; the rest is
+            left to the tracking controller.
+        effective_samples: the temperature is set so that this many sequences carry the weight.
+        margin: distance (m) from the hull to an obstacle below which a soft cost begins.
+        margin_weight: cost rate at the obstacle's surface.
+        risk: what becomes of the costs of a sequence's realisations: their mean, the mean of the
+            worst `cvar_part` of them, or the worst.
+        cvar_part: part of the realisations that `cvar` counts.
+        collision_risk: α of the chance constraint P(g ∈ G) ≥ 1 − α over the horizon; None leaves
+            the constraint out.
+        risk_weight: cost of a violation: of a probability that exceeds α by one, and of each metre
+            by which the clearance would have to grow.
+        clearance_std: least standard deviation (m) of the clearance; stands for what the model's
+            noise leaves out (state estimate, obstacle positions).
+        tracked: the noise paths are held to the plan by the tracking controller's gains, as the
+            vehicle will be; false lets them stray over the whole horizon.
+        hold_attitude: sequences are sampled beyond the wrench with which the tracking controller's
+            gains turn the vehicle to the goal's attitude; false samples all of the wrench.
+        shown_paths: sampled paths in the output for reports.
+        threads: the sequences are rolled out in so many parts, each in a thread of its own.
+    """
+
+    horizon: int = 80
+    dt: float = 0.05
+    substeps: int | None = None
+    period: float = 0.2
+    sequences: int = 250
+    realisations: int = 4
+    pose_weight: Vector6 = (1.0, 1.0, 2.0, 20.0, 20.0, 4.0)
+    twist_weight: Vector6 = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0)
+    terminal_time: float = 2.0
+    effort_weight: float = 0.5
+    rate_weight: float = 0.02
+    speed_limit: float | None = 0.5
+    speed_weight: float = 100.0
+    noise: Vector6 = (0.35, 0.35, 0.2, 0.01, 0.02, 0.04)
+    knots: tuple[int, ...] = (2, 4, 10)
+    smallest_noise: float = 0.1
+    wrench_fraction: float = 0.8
+    effective_samples: float = 12.0
+    margin: float = 0.3
+    margin_weight: float = 20.0
+    risk: Literal["mean", "cvar", "worst"] = "mean"
+    cvar_part: float = 0.5
+    collision_risk: float | None = 0.05
+    risk_weight: float = 300.0
+    clearance_std: float = 0.08
+    tracked: bool = True
+    hold_attitude: bool = True
+    shown_paths: int = 48
+    threads: int = 2
+
+    def __post_init__(self) -> None:
+        """Check numbers."""
+        check_numbers(self)
+        for name in ("horizon", "sequences", "realisations", "shown_paths", "threads"):
+            require(getattr(self, name) >= 1, self, name, "give a whole number of 1 or more")
+        require(
+            self.substeps is None or self.substeps >= 1,
+            self,
+            "substeps",
+            "give a whole number of 1 or more, or null",
+        )
+        even = self.realisations == 1 or self.realisations % 2 == 0
+        require(even, self, "realisations", "give 1 or an even number")
+        positive = (
+            "dt",
+            "period",
+            "smallest_noise",
+            "effective_samples",
+            "margin",
+            "clearance_std",
+        )
+        for name in positive:
+            require(getattr(self, name) > 0, self, name, "give a number above zero")
+        for name in (
+            "terminal_time",
+            "effort_weight",
+            "rate_weight",
+            "speed_weight",
+            "margin_weight",
+            "risk_weight",
+        ):
+            require(getattr(self, name) >= 0, self, name, "give zero or more")
+        for name in ("pose_weight", "twist_weight", "noise"):
+            require(min(getattr(self, name)) >= 0, self, name, "give six numbers of zero or more")
+        require(
+            bool(self.knots) and min(self.knots) >= 1, self, "knots", "give counts of 1 or more"
+        )
+        require(
+            max(self.knots) <= self.horizon, self, "knots", "give no more pieces than `horizon`"
+        )
+        require(0 < self.wrench_fraction <= 1, self, "wrench_fraction", "give a part in (0, 1]")
+        require(self.smallest_noise <= 1, self, "smallest_noise", "give a part in (0, 1]")
+        require(0 < self.cvar_part <= 1, self, "cvar_part", "give a part in (0, 1]")
+        require(
+            self.effective_samples < self.sequences,
+            self,
+            "effective_samples",
+            "give fewer than `sequences`",
+        )
+        require(self.threads <= self.sequences, self, "threads", "give no more than `sequences`")
+        require(
+            self.collision_risk is None or 0 < self.collision_risk < 1,
+            self,
+            "collision_risk",
+            "give a probability in (0, 1), or null",
+        )
+        require(
+            self.speed_limit is None or self.speed_limit > 0,
+            self,
+            "speed_limit",
+            "give a speed above zero, or null",
+        )
+        shift = self.period / self.dt
+        require(
+            abs(shift - round(shift)) < 1e-6 and round(shift) >= 1,
+            self,
+            "period",
+            f"give a multiple of dt = {self.dt}",
+        )
+
+    def with_substeps_of(self, metadata: Mapping[str, Any]) -> "MppiConfig":
+        """These settings with the steps that a checkpoint's metadata names, unless given here."""
+        dt, substeps = metadata.get("dt"), metadata.get("substeps")
+        if self.substeps is not None or not dt or not substeps:
+            return self
+        return replace(self, substeps=max(1, math.ceil(self.dt / dt * substeps - 1e-6)))
+
+    @property
+    def steps_of_model(self) -> int:
+        """Steps of the model in one of the plan."""
+        return _SUBSTEPS if self.substeps is None else self.substeps
+
+    @property
+    def shift(self) -> int:
+        """Steps by which the plan moves between two calls."""
+        return round(self.period / self.dt)
+
+    @property
+    def layout(self) -> PlanLayout:
+        """Layout of the plans."""
+        return PlanLayout(self.horizon, self.dt)

@@ -1,0 +1,1 @@
+"""The simulated vehicle: plant, disturbances, sensors, thruster allocation and its limits."""

@@ -1,0 +1,288 @@
+"""The vehicle's sensors as one system with a rate for each."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from itertools import islice, pairwise
+from math import lcm
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from pydrake.common import RandomDistribution
+from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
+
+from ...models.sensors import Compass, DepthSensor, Dvl, Imu, Sensor, SensorFault
+from ...models.sensors.faults import FaultySensor
+from ..compiled.jit import VectorFunction, value_or_none, value_or_zeros
+from ..compiled.pure import Event, Inputs, Pure, State
+from ..compiled.pure import shown as shown_group
+
+Outputs = tuple[Array, ...]
+Motion = tuple[Array, Array, Array]
+NAMES = ("imu", "dvl", "depth", "compass")
+
+
+class SensorSuite(LeafSystem):
+    """Measures the true motion with each sensor at its own rate and holds what was read.
+
+    - `imu` (6): specific force (m/s²), angular rate (rad/s), every IMU period;
+    - `dvl` (7): velocity (m/s, 3), 1 if valid, altitude (m), figure of merit (m/s), time of
+      validity (s). A reading appears `latency` after its time of validity, at the next IMU period;
+    - `depth` (3): depth (m, positive down), 1 once valid, time of the measurement (s);
+    - `compass` (3): yaw (rad), 1 once valid, time of the measurement (s).
+
+    A reading is new when its time is. At initialisation `initial_noise` draws the sensors' biases,
+    offsets and scale errors. All four sensors take their unit Gaussians from `noise`, which should
+    be drawn anew every IMU period. Unconnected inputs count as zero, an unconnected pose as the
+    identity.
+
+    Faults (`models.sensors.faults`) act on what is shown; the sensors' own states and noise are
+    those without them. Faults that take chance have an input of their own, `fault_noise`, drawn as
+    `noise` is; without them there is no such port.
+
+    .. pydrake_system::
+
+        name: SensorSuite
+        input_ports:
+        - X_WB
+        - V_WB_B
+        - A_WB_B
+        - noise
+        - initial_noise
+        output_ports:
+        - imu
+        - dvl
+        - depth
+        - compass
+
+    """
+
+    def __init__(
+        self,
+        imu: Imu | None = None,
+        dvl: Dvl | None = None,
+        depth: DepthSensor | None = None,
+        compass: Compass | None = None,
+        faults: tuple[SensorFault, ...] = (),
+    ):
+        """Carry the given sensors, or their defaults, with `faults` in what they show."""
+        super().__init__()
+        imu, dvl = imu or Imu(), dvl or Dvl()
+        depth, compass = depth or DepthSensor(), compass or Compass()
+        sensors: tuple[Sensor, ...] = (imu, dvl, depth, compass)
+        self._X = self.DeclareVectorInputPort("X_WB", 7)
+        self._V = self.DeclareVectorInputPort("V_WB_B", 6)
+        self._A = self.DeclareVectorInputPort("A_WB_B", 6)
+        gaussian = RandomDistribution.kGaussian
+        sizes = [s.noise_size for s in sensors]
+        self._noise = self.DeclareVectorInputPort("noise", sum(sizes), gaussian)
+        initial_sizes = [s.initial_noise_size for s in sensors]
+        self._initial_noise = self.DeclareVectorInputPort(
+            "initial_noise", sum(initial_sizes), gaussian
+        )
+        shown = [
+            _Shown(s, tuple(f for f in faults if f.sensor == name))
+            for name, s in zip(NAMES, sensors, strict=True)
+        ]
+        fault_sizes = [part.noise_size for part in shown]
+        self._draws = [self._noise]
+        if sum(fault_sizes):
+            port = self.DeclareVectorInputPort("fault_noise", sum(fault_sizes), gaussian)
+            self._draws.append(port)
+
+        self._sizes = [*(s.state_size for s in sensors), 6, 7, 3, 3]
+        self._sizes += [part.memory_size for part in shown if part.faults]
+        groups = [self.DeclareDiscreteState(size) for size in self._sizes]
+        self._states, self._shown = groups[:4], groups[4:8]
+        for name, index in zip(NAMES, self._shown, strict=True):
+            self.DeclareStateOutputPort(name, index)
+
+        self._start = VectorFunction(
+            lambda *w: tuple(s.initial(part) for s, part in zip(sensors, w, strict=True)),
+            initial_sizes,
+            [s.state_size for s in sensors],
+        )
+        self.DeclareInitializationDiscreteUpdateEvent(self._initialise)
+        ends = np.cumsum([0, *sizes, *fault_sizes])
+        draws = [slice(a, b) for a, b in pairwise(ends)]
+        memories = iter(range(8, len(groups)))
+
+        def measured(i: int) -> _Part:
+            """A sensor's measurement; the DVL's appears between its pings and is shown apart."""
+            part, sensor = shown[i], sensors[i]
+            late = sensor is dvl
+            memory = (next(memories),) if part.faults and not late else ()
+
+            def measure(motion: Motion, t: Array, w: Array, state: Array, *kept: Array) -> Outputs:
+                state = sensor.measure(state, *motion, t, w[draws[i]])
+                if late:
+                    return (state,)
+                reading = sensor.reading(state, t)
+                if sensor is not imu:  # it goes with a valid mark and its time
+                    reading = jnp.concatenate([reading, jnp.stack([jnp.ones_like(t), t])])
+                return state, *part.show(reading, t, w[draws[4 + i]], *kept)
+
+            writes = (i,) if late else (i, 4 + i, *memory)
+            return _Part(sensor.rate, measure, (i, *memory), writes)
+
+        def dvl_appears() -> _Part:
+            part = shown[1]
+            memory = (next(memories),) if part.faults else ()
+
+            def appear(motion: Motion, t: Array, w: Array, state: Array, *kept: Array) -> Outputs:
+                del motion
+                return part.show_held(dvl.reading(state, t), w[draws[5]], *kept)
+
+            return _Part(imu.rate, appear, (1, *((5, *memory) if memory else ())), (5, *memory))
+
+        parts = [measured(0), dvl_appears(), *(measured(i) for i in (1, 2, 3))]
+        self._parts = parts
+        # Sensors whose period is a multiple of the IMU's share its events and its calls.
+        shared = [part for part in parts if _divides(part.rate, imu.rate)]
+        self._declare(shared)
+        for part in parts:
+            if part not in shared:
+                self._declare([part])
+
+    def pure(self) -> Pure:
+        """Each sensor's measurement as a pure function."""
+        base = self._parts[0].rate
+        inputs_at_rest = self._inputs_at_rest
+
+        def event(part: _Part) -> Event:
+            def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
+                X, V, A, *draws = (
+                    inputs[port.get_name()] if port.get_name() in inputs else jnp.asarray(still)
+                    for port, still in inputs_at_rest
+                )
+                w = _joined(draws)
+                own = [state[index] for index in part.reads]
+                return dict(zip(part.writes, part.measure((X, V, A), t, w, *own), strict=True))
+
+            if _divides(part.rate, base):
+                return Event(1 / base, update, round(base / part.rate))
+            return Event(1 / part.rate, update)
+
+        outputs = {name: shown_group(len(NAMES) + i) for i, name in enumerate(NAMES)}
+        noise = tuple(port.get_name() for port in self._draws)
+        return Pure(tuple(event(part) for part in self._parts), outputs, noise)
+
+    @property
+    def _inputs_at_rest(self) -> list[tuple[InputPort, np.ndarray]]:
+        """The inputs that events read, with what an unconnected one counts as."""
+        ports = (self._X, self._V, self._A, *self._draws)
+        pose = np.eye(7)[0]
+        return [(port, pose if port is self._X else np.zeros(port.size())) for port in ports]
+
+    def _declare(self, parts: list["_Part"]) -> None:
+        """Declare events at the first part's rate; the others take part in every so many."""
+        inputs_at_rest = self._inputs_at_rest
+        drawn = [port.size() for port in self._draws]
+        period = 1 / parts[0].rate
+        every = [round(parts[0].rate / part.rate) for part in parts]
+
+        @cache
+        def call(due: tuple[bool, ...]) -> tuple[VectorFunction, list[int], list[int]]:
+            """One compiled call from the motion and the states read to what is written."""
+            used = [part for part, now in zip(parts, due, strict=True) if now]
+            reads = [index for part in used for index in part.reads]
+            writes = [index for part in used for index in part.writes]
+
+            def packed(t: Array, X: Array, V: Array, A: Array, *rest: Array) -> Outputs:
+                values = iter(rest)
+                w = _joined(list(islice(values, len(drawn))))
+                return sum(
+                    (p.measure((X, V, A), t[0], w, *islice(values, len(p.reads))) for p in used), ()
+                )
+
+            inputs = [1, 7, 6, 6, *drawn, *(self._sizes[i] for i in reads)]
+            function = VectorFunction(packed, inputs, [self._sizes[i] for i in writes])
+            return function, reads, writes
+
+        cycle = lcm(*every)
+
+        @cache
+        def call_at(phase: int) -> tuple[VectorFunction, list[int], list[int]]:
+            return call(tuple(phase % m == 0 for m in every))
+
+        def update(context: Context, discrete_state: DiscreteValues) -> None:
+            t = context.get_time()
+            function, reads, writes = call_at(round(t / period) % cycle)
+            state = context.get_discrete_state()
+            parts = [np.array([t])]
+            given = [(value_or_none(port, context), still) for port, still in inputs_at_rest]
+            parts += [still if value is None else value for value, still in given]
+            parts += [state.value(index) for index in reads]
+            for index, value in zip(writes, function(*parts), strict=True):
+                discrete_state.set_value(index, value)
+
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, update)
+
+    def _initialise(self, context: Context, discrete_state: DiscreteValues) -> None:
+        w = value_or_zeros(self._initial_noise, context)
+        for index, value in zip(self._states, self._start(w), strict=True):
+            discrete_state.set_value(index, value)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What one sensor does in its event, with the state groups that it reads and writes."""
+
+    rate: float
+    measure: Callable[..., Outputs]
+    reads: tuple[int, ...]
+    writes: tuple[int, ...]
+
+
+def _divides(rate: float, of: float) -> bool:
+    ratio = of / rate
+    return ratio > 0.5 and abs(ratio - round(ratio)) < 1e-9 * ratio
+
+
+def _joined(draws: list[Array]) -> Array:
+    return jnp.concatenate(draws) if len(draws) > 1 else draws[0]
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """A sensor with the faults of what it shows."""
+
+    sensor: Sensor
+    faults: tuple[SensorFault, ...]
+
+    @property
+    def _faulty(self) -> FaultySensor:
+        return FaultySensor(self.sensor, self.faults)
+
+    @property
+    def noise_size(self) -> int:
+        """Unit Gaussians that the faults of one reading take."""
+        return self._faulty.noise_size
+
+    @property
+    def memory_size(self) -> int:
+        """Numbers that the faults remember, the DVL's also the reading that it held last."""
+        held = self.sensor.reading_size if isinstance(self.sensor, Dvl) else 0
+        return held + self._faulty.memory_size
+
+    def show(self, reading: Array, t: Array, w: Array, *memory: Array) -> Outputs:
+        """What is shown of a reading measured at t, and with faults their memory."""
+        if not self.faults:
+            return (reading,)
+        n = self.sensor.reading_size
+        marks = [jnp.stack([jnp.ones_like(t), t])] if reading.size == n else []  # the IMU's
+        kept, seen = self._faulty.show(memory[0], jnp.concatenate([reading, *marks]), t, w)
+        return seen[: reading.size], kept
+
+    def show_held(self, reading: Array, w: Array, *memory: Array) -> Outputs:
+        """The same of the DVL's reading, which a fault meets once, when it appears."""
+        if not self.faults:
+            return (reading,)
+        before, kept = memory
+        last, own = kept[: reading.size], kept[reading.size :]
+        bare = jnp.concatenate([reading[:4], reading[6:]])
+        own, seen = self._faulty.show(own, bare, reading[6], w)
+        seen = jnp.concatenate([seen[:4], reading[4:6], seen[4:]])
+        new = jnp.any(reading != last)
+        return jnp.where(new, seen, before), jnp.where(new, jnp.concatenate([reading, own]), kept)

@@ -1,0 +1,131 @@
+"""The station in numbers: vehicle, water, sensors, start, seed; a scenario without controller."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ...models.config.checks import Vector6, check_numbers, require
+from ...models.disturbances import Combined, Kind, OrnsteinUhlenbeckWrench, preset
+from ...models.dynamics import Dynamics
+from ...models.effects.effect_config import EffectConfig, check_distinct
+from ...models.effects.extended import Extended, core
+from ...models.files.checkpoint import load_model
+from ...models.sensors import Compass, DepthSensor, Dvl, Imu, SensorFault
+from ...models.spinn import Spinn
+from ...models.vehicles.vehicle import Vehicle, load_vehicle
+from ..estimation.delayed import EkfConfig
+from ..own import OwnFilter
+from ..planning.obstacles import Pylon
+from ..planning.paths import PoseConfig
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """The sensors on board, what goes wrong with them, and the filter that fuses them.
+
+    Attributes:
+        faults: of what the sensors show (`docs/sensor-faults.md`); the filter isn't told.
+        filter: of one's own, in the place of the one that `ekf` configures.
+    """
+
+    imu: Imu = field(default_factory=Imu)
+    dvl: Dvl = field(default_factory=Dvl)
+    depth: DepthSensor = field(default_factory=DepthSensor)
+    compass: Compass = field(default_factory=Compass)
+    ekf: EkfConfig = field(default_factory=EkfConfig)
+    faults: tuple[SensorFault, ...] = ()
+    filter: OwnFilter | None = None
+
+
+@dataclass(frozen=True)
+class StationConfig:
+    """What a controller is put to work in.
+
+    Attributes:
+        vehicle: a preset's name or the path of a vehicle's YAML file: hull, thrusters, physics.
+        model: a checkpoint of the dynamics to simulate; the vehicle's physics if left out.
+        effects: what the plant has besides these dynamics, by name; planners don't know of it.
+        diffusion: b of the physics' process noise (N√s and N·m√s); disturbances are usually better.
+        disturbance_set: a named set (`models.disturbances.preset`).
+        disturbances: more of them, by kind.
+        obstacles: pylons.
+        sensing: sensors and filter.
+        start: pose at t = 0.
+        start_twist: twist at t = 0, in B (m/s, rad/s).
+        voltage: of the battery, without load (V); the vehicle's nominal one if left out.
+        period: of plant, thrusters and disturbances (s).
+        substeps: Lie-group steps of the plant in a period.
+        seed: of everything that is random.
+    """
+
+    vehicle: str = "bluerov2_heavy"
+    model: Path | None = None
+    effects: tuple[EffectConfig, ...] = ()
+    diffusion: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    disturbance_set: str = "still"
+    disturbances: tuple[Kind, ...] = ()
+    obstacles: tuple[Pylon, ...] = ()
+    sensing: Sensing = field(default_factory=Sensing)
+    start: PoseConfig = field(default_factory=lambda: PoseConfig((0.0, 0.0, -1.5)))
+    start_twist: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    voltage: float | None = None
+    period: float = 0.01
+    substeps: int = 2
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check numbers and the name of the disturbance set."""
+        check_numbers(self)
+        require(min(self.diffusion) >= 0, self, "diffusion", "give six numbers of zero or more")
+        require(1e-4 <= self.period <= 1, self, "period", "give a time from 0.0001 to 1")
+        require(self.substeps >= 1, self, "substeps", "give 1 or more")
+        require(0 <= self.seed < 2**32, self, "seed", "give a whole number from 0 to 4294967295")
+        require(self.voltage is None or self.voltage > 0, self, "voltage", "give a voltage above 0")
+        preset(self.disturbance_set)
+        check_distinct(self.effects)
+
+    def load_vehicle(self) -> Vehicle:
+        """The vehicle.
+
+        Raises:
+            UserError: there is no such preset or file, or it is no vehicle.
+        """
+        return load_vehicle(self.vehicle)
+
+    def dynamics(self) -> Dynamics:
+        """The dynamics to simulate, in double precision.
+
+        Raises:
+            UserError: the vehicle or the checkpoint can't be read.
+        """
+        vehicle = self.load_vehicle()
+        if self.model is not None:
+            model = load_model(self.model, float)[0]
+        else:
+            model = vehicle.dynamics(np.array(self.diffusion))
+        if not self.effects:
+            return model
+        own = model.effects if isinstance(model, Extended) else ()
+        more = tuple(effect.build() for effect in self.effects)
+        return Extended.create(core(model), (*own, *more), vehicle.thrusters())
+
+    def disturbance(self) -> Combined:
+        """All disturbances as one, and with them the pushes that last of a learned model.
+
+        Raises:
+            UserError: the checkpoint can't be read.
+        """
+        members = (*preset(self.disturbance_set).members, *self.disturbances)
+        if self.model is not None:
+            model = core(load_model(self.model, float)[0])
+            if isinstance(model, Spinn) and model.lasting is not None:
+                std = np.asarray(model.lasting.std(model.scales.diffusion)).tolist()
+                time = np.asarray(model.lasting.time_constant).tolist()
+                members += (OrnsteinUhlenbeckWrench(tuple(std), tuple(time)),)
+        return Combined(members)
+
+    def initial_state(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6"]]:
+        """X_WB and V_WB_B at t = 0."""
+        return np.asarray(self.start.pose()), np.array(self.start_twist, float)

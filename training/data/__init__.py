@@ -1,0 +1,1 @@
+"""Data to train on: windows, groups, simulated maneuvers, provenance."""

@@ -1,0 +1,291 @@
+"""Windows of recordings: short pieces of equal length that a model is trained and judged on.
+
+Every window is one draw of a conditional law: given its own first state and its commands, how does
+the vehicle move on? Arrays are time-major, component-first, windows last (`models.se3`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from ...models.config.errors import UserError
+from ...models.effects.recorded_rollout import Commands
+from ...models.recordings.store import Recording
+
+Normalisation = Literal["heading", "identity", "none"]
+
+
+@dataclass(frozen=True)
+class Windows:
+    """W windows of T steps of `dt` (s).
+
+    Attributes:
+        X: poses at t_0 … t_T.
+        V: body twists at t_0 … t_T.
+        F: wrenches, the n-th acting from t_n to t_(n+1).
+        dt: step (s).
+        scenario: index into `names` of each window's scenario.
+        run: label of the trajectory within its scenario.
+        start: time of t_0 since the beginning of the run's own clock (s).
+        names: scenario names.
+        normalise: what was made of the windows' first pose.
+        commands: what the thrusters were commanded, and what came before, for models with effects.
+    """
+
+    X: Float[np.ndarray, "N 7 W"]
+    V: Float[np.ndarray, "N 6 W"]
+    F: Float[np.ndarray, "T 6 W"]
+    dt: float
+    scenario: Int[np.ndarray, " W"]
+    run: Int[np.ndarray, " W"]
+    start: Float[np.ndarray, " W"]
+    names: tuple[str, ...]
+    normalise: Normalisation = "heading"
+    commands: Commands | None = None
+
+    def __len__(self) -> int:
+        return self.X.shape[2]
+
+    @property
+    def steps(self) -> int:
+        """T, the number of steps of each window."""
+        return self.F.shape[0]
+
+    @property
+    def length(self) -> float:
+        """Duration of each window (s)."""
+        return self.steps * self.dt
+
+    def label(self, index: int) -> str:
+        """Name one window for a message: scenario, run and start time."""
+        name = self.names[int(self.scenario[index])]
+        return f"scenario '{name}', run {int(self.run[index])}, from {self.start[index]:.2f} s"
+
+    def take(self, indices: Sequence[int] | np.ndarray) -> "Windows":
+        """Return the windows of these indices, in this order."""
+        i = np.asarray(indices, int)
+        return replace(
+            self,
+            X=self.X[..., i],
+            V=self.V[..., i],
+            F=self.F[..., i],
+            scenario=self.scenario[i],
+            run=self.run[i],
+            start=self.start[i],
+            commands=jax.tree.map(lambda a: a[..., i], self.commands),
+        )
+
+    def thin(self, count: int) -> "Windows":
+        """Return at most `count` windows, evenly spread over all."""
+        if len(self) <= count:
+            return self
+        return self.take(np.linspace(0, len(self) - 1, count).round().astype(int))
+
+    def subdivide(self, steps: int) -> "Windows":
+        """Cut every window into ⌊T / steps⌋ shorter ones, normalised like the long ones."""
+        if not 1 <= steps <= self.steps:
+            raise ValueError(f"steps: must lie between 1 and {self.steps}, got {steps}")
+        parts = [
+            replace(
+                self,
+                X=self.X[k : k + steps + 1],
+                V=self.V[k : k + steps + 1],
+                F=self.F[k : k + steps],
+                start=self.start + k * self.dt,
+                commands=self._commands_from(k, steps),
+            )
+            for k in range(0, self.steps - steps + 1, steps)
+        ]
+        X = np.concatenate([part.X for part in parts], axis=2)
+        return replace(
+            parts[0],
+            X=_normalised(X, self.normalise),
+            V=np.concatenate([part.V for part in parts], axis=2),
+            F=np.concatenate([part.F for part in parts], axis=2),
+            scenario=np.concatenate([part.scenario for part in parts]),
+            run=np.concatenate([part.run for part in parts]),
+            start=np.concatenate([part.start for part in parts]),
+            commands=jax.tree.map(
+                lambda *a: np.concatenate(a, axis=-1), *(part.commands for part in parts)
+            ),
+        )
+
+    def _commands_from(self, k: int, steps: int) -> Commands | None:
+        """The commands of windows that begin k steps later."""
+        c = self.commands
+        if c is None:
+            return None
+        earlier = len(c.before)
+        return Commands(
+            c.level[k : k + steps],
+            c.voltage[k : k + steps],
+            np.concatenate([c.before, c.level[:k]])[-earlier:],
+            np.concatenate([c.V_before, self.V[:k]])[-earlier:],
+        )
+
+    def overlaps(self, other: "Windows") -> bool:
+        """Tell whether a window here shares a moment of the same run with one of `other`."""
+        mine = [self.names[s] for s in self.scenario]
+        theirs = [other.names[s] for s in other.scenario]
+        for i, name in enumerate(mine):
+            for j, other_name in enumerate(theirs):
+                if name != other_name or self.run[i] != other.run[j]:
+                    continue
+                first, second = float(self.start[i]), float(other.start[j])
+                margin = 0.5 * self.dt
+                if first <= second + other.length - margin and (
+                    second <= first + self.length - margin
+                ):
+                    return True
+        return False
+
+
+def make_windows(
+    recording: Recording,
+    vehicle: Any = None,
+    *,
+    length_s: float = 4.0,
+    stride_s: float | None = None,
+    normalise: Normalisation = "heading",
+    remembered: float | None = None,
+    dtype: Any = np.float32,
+) -> Windows:
+    """Cut every trajectory of a recording into windows of `length_s`, one each `stride_s`.
+
+    `normalise` moves each window's start: "heading" to the origin with zero yaw, so that gravity
+    keeps its direction; "identity" to the group's identity, as the paper does; "none" leaves it.
+    `stride_s` defaults to a quarter of the length. Trajectories shorter than a window are left
+    out; `vehicle` is what `Recording.wrench` takes. With `remembered` the windows have what the
+    thrusters were commanded too, and in so many seconds before them; the beginning of a run is
+    taken as it was for ever.
+
+    Raises:
+        UserError: no trajectory is long enough, or a channel of pose or twist is missing.
+    """
+    if recording.uneven:
+        raise UserError(
+            "recording: its samples stand at times of their own; windows need one step, so read "
+            "the CSV files with resampling"
+        )
+    steps = round(length_s / recording.dt)
+    stride = round((length_s / 4 if stride_s is None else stride_s) / recording.dt)
+    if steps < 1 or stride < 1:
+        raise UserError(
+            f"window length_s {length_s:g} and stride_s must be at least one step of "
+            f"{recording.dt:g} s"
+        )
+    lengths = recording.lengths
+    if lengths.max() < steps + 1:
+        raise UserError(
+            f"recording: its longest trajectory lasts {(lengths.max() - 1) * recording.dt:g} s, "
+            f"a window needs {steps * recording.dt:g} s; record longer or give a shorter length_s"
+        )
+    if lacking := recording.missing:
+        channels = ", ".join(f"{name} {'/'.join(which)}" for name, which in lacking.items())
+        raise UserError(
+            f"recording: {channels} is missing in some trajectory, and training needs pose and "
+            "twist; select the trajectories that have them or record with a DVL"
+        )
+    data = recording.dataset
+    X_all, V_all = data["X_WB"].to_numpy(), data["V_WB_B"].to_numpy()
+    F_all = recording.wrench(vehicle).to_numpy()
+    runs = data["trajectory"].to_numpy() if "trajectory" in data.coords else None
+    clock = data["start_time"].to_numpy() if "start_time" in data else np.zeros(lengths.shape)
+    X, V, F, scenario, run, start = [], [], [], [], [], []
+    commands: list[Commands] = []
+    thrust = None if remembered is None else recording.thrust(vehicle)
+    earlier = np.arange(-max(1, round((remembered or 0.0) / recording.dt)), 0)
+    for j, k in np.argwhere(lengths > steps):
+        for n in range(0, int(lengths[j, k]) - steps, stride):
+            X.append(X_all[j, k, n : n + steps + 1])
+            V.append(V_all[j, k, n : n + steps + 1])
+            F.append(F_all[j, k, n : n + steps])
+            scenario.append(j)
+            run.append(k if runs is None else runs[k])
+            start.append(clock[j, k] + n * recording.dt)
+            if thrust is not None:
+                level, voltage = (a[j, k] for a in thrust)
+                now, before = slice(n, n + steps), np.maximum(n + earlier, 0)
+                commands.append(
+                    Commands(level[now], voltage[now, None], level[before], V_all[j, k, before])
+                )
+    return Windows(
+        X=_normalised(np.stack(X, axis=-1), normalise).astype(dtype),
+        V=np.stack(V, axis=-1).astype(dtype),
+        F=np.stack(F, axis=-1).astype(dtype),
+        dt=recording.dt,
+        scenario=np.array(scenario, int),
+        run=np.array(run, int),
+        start=np.array(start, float),
+        names=recording.scenarios,
+        normalise=normalise,
+        commands=jax.tree.map(lambda *a: np.stack(a, axis=-1).astype(dtype), *commands)
+        if commands
+        else None,
+    )
+
+
+def _normalised(
+    X_WB: Float[np.ndarray, "N 7 W"], normalise: Normalisation
+) -> Float[np.ndarray, "N 7 W"]:
+    """Poses seen from the frame that `normalise` attaches to each window's start."""
+    if normalise == "none":
+        return X_WB
+    w, x, y, z = X_WB[0, :4].astype(np.float64)
+    if normalise == "heading":
+        half = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) / 2
+        w, x, y, z = np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)
+    # the inverse of the start's rotation, applied to all poses; NumPy, as it keeps double precision
+    u = np.stack([-x, -y, -z])
+    q, p = X_WB[:, :4].astype(np.float64), (X_WB[:, 4:] - X_WB[:1, 4:]).astype(np.float64)
+    scalar = w * q[:, 0] - np.sum(u * q[:, 1:], axis=1)
+    vector = w * q[:, 1:] + q[:, :1] * u + np.cross(u[None], q[:, 1:], axis=1)
+    turned = np.concatenate([scalar[:, None], vector], axis=1)
+    t = 2 * np.cross(u[None], p, axis=1)
+    moved = p + w * t + np.cross(u[None], t, axis=1)
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    return np.concatenate([turned, moved], axis=1).astype(X_WB.dtype)
+
+
+def split_windows(
+    recording: Recording,
+    vehicle: Any = None,
+    *,
+    held_out: float = 0.25,
+    by: Literal["auto", "time", "run"] = "auto",
+    gap_s: float = 1.0,
+    length_s: float = 4.0,
+    stride_s: float | None = None,
+    normalise: Normalisation = "heading",
+    dtype: Any = np.float32,
+) -> tuple[Windows, Windows]:
+    """Windows to learn from and windows held out, which share no moment of any run.
+
+    The recording is split first (`Recording.split`: by whole runs where every scenario has
+    several, else each run's last part is held out after a gap) and cut afterwards. Held-out
+    windows don't overlap one another either (their stride is their length).
+
+    Raises:
+        UserError: one of the two sides has no trajectory as long as a window.
+    """
+    learn, test = recording.split(held_out, by, gap_s)
+    parts = []
+    for part, side, stride in ((learn, "training", stride_s), (test, "held-out", length_s)):
+        try:
+            parts.append(
+                make_windows(
+                    part,
+                    vehicle,
+                    length_s=length_s,
+                    stride_s=stride,
+                    normalise=normalise,
+                    dtype=dtype,
+                )
+            )
+        except UserError as error:
+            raise UserError(f"{side} part (held_out {held_out:g}): {error}") from error
+    return parts[0], parts[1]

@@ -1,0 +1,1 @@
+"""Structure without a name: what a wrench could depend on besides."""

@@ -1,0 +1,145 @@
+"""When to say `unknown`: structure that no name, nor all names together, explain as well."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from ..disturbance.found import best_law
+from ..filter.problem import Bench, Look
+from ..filter.sensitivities import respond
+from ..findings import result
+from ..selection.hypotheses import Design, Fit
+from ..selection.model_selection import Choice, admissible, parameters_of
+from ..selection.search import Found
+from .groups import described, groups, refined
+from .structures import Matched, Screen
+
+BEATS = 1.5
+"""Times the best name's gain that structure without a name must win."""
+_TOGETHER, _OF_A_LAW = 1.1, 0.7
+"""Times what all names win together; share of what the best law wins."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The best structure under one set of parameters, in nats of all data, and what names win."""
+
+    screen: Screen
+    matched: Matched
+    gain: float
+    name_gain: float
+
+
+def responses_of(bench: Bench, look: Look, rows: list[int]) -> Float[np.ndarray, "m N12 R"] | None:
+    """Whitened responses to parameters, one small probe each."""
+    if not rows:
+        return None
+    design = Design.of(bench.library, look.theta, rows)
+    first = [int(np.flatnonzero(design.owner == i)[0]) for i in rows]
+    probes = design.probes[first]
+    z = respond(
+        bench.model, bench.library, look.theta, probes, bench.data, look.predictions, look.kalman
+    )
+    return z[1:]
+
+
+def screened(
+    bench: Bench,
+    look: Look,
+    rows: list[int],
+    alpha: float,
+    rng: np.random.Generator,
+    quiet: Sequence[str] = (),
+) -> tuple[Screen, Matched, float] | None:
+    """The structure that wins most beside `rows`, of those that noise alone can't make."""
+    screen = Screen(bench, look, responses_of(bench, look, rows))
+    share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
+    tried = list(groups(bench, look, quiet))
+    best: Matched | None = None
+    for group in tried:
+        m = screen.match(group, alpha / len(tried), rng)
+        if m.gain > m.threshold and (best is None or m.gain > best.gain):
+            best = m
+    if best is None:
+        return None
+    # of as many as were tried
+    best = replace(best, p_value=min(1.0, best.p_value * len(tried)))
+    return screen, best, best.gain * share
+
+
+def _best_name(bench: Bench, look: Look, fits: dict) -> float:
+    gains = [f.heldout_gain for f in fits.values() if admissible(bench.library, look.theta, f)]
+    return max([0.0, *gains])
+
+
+def seek(
+    bench: Bench,
+    nuisance: list[int],
+    found: Found,
+    alpha: float,
+    rng: np.random.Generator,
+    quiet: Sequence[str] = (),
+) -> Seen | None:
+    """Structure in what the names leave; where it wins more than they do, in place of them.
+
+    In the second case `found` is set back to the belief without names. Of estimated states none is
+    sought: what their estimator does has structure of its own; nor in how `quiet` axes move.
+    """
+    if found.current.noise.estimated:
+        return None
+    rows = [*parameters_of(bench.library, found.hypotheses), *nuisance]
+    left = screened(bench, found.current, rows, alpha, rng, quiet)
+    if left is None:
+        return None
+    screen, best, gain = left
+    name = _best_name(bench, found.current, found.left)
+    law = best_law(bench, found.current)
+    if gain < BEATS * name or gain < _OF_A_LAW * law:
+        return None
+    known = [h for h in found.hypotheses if h[0] != "unknown"]
+    if known and len(known) == len(found.hypotheses):
+        at_first = screened(bench, found.first, nuisance, alpha, rng, quiet)
+        evidence = found.first.evidence
+        owned = set(evidence.design.owner.tolist())
+        own = [i for i in parameters_of(bench.library, known) if i in owned]
+        together = evidence.fit(own, nuisance).heldout_gain if own else np.inf
+        alone = _best_name(bench, found.first, found.fits)
+        if at_first is not None and at_first[2] > max(BEATS * alone, _TOGETHER * together):
+            found.accepted, found.current = [], found.first
+            return Seen(*at_first, alone)
+    return Seen(screen, best, gain, name)
+
+
+def accept(
+    bench: Bench, nuisance: list[int], found: Found, seen: Seen, rng: np.random.Generator
+) -> Bench:
+    """Add the structure to the model, refit it with all that was accepted; the new bench."""
+    effect = refined(seen.screen, seen.matched, rng)
+    rivals = sorted(found.left.items(), key=lambda item: -item[1].heldout_gain)[:5]
+    wider = bench.with_effect(effect)
+    theta = wider.moved(found.current.theta, bench.library)
+    hypothesis = ("unknown", effect.acts_on)
+    own = wider.library.at(*hypothesis)
+    free = [wider.library.index(*_key(bench.library.entries[i])) for i in nuisance]
+    rows = [*own, *parameters_of(wider.library, found.hypotheses), *free]
+    theta, _, joint = wider.polish(theta, rows, rounds=6)
+    heldout = seen.matched.heldout * seen.gain / max(seen.matched.gain, 1e-300)
+    p = seen.matched.p_value
+    fit = Fit(tuple(own), theta[own], {}, joint.errors[: len(own)], seen.gain, heldout, p)
+    ranked = tuple((h, f.heldout_gain) for h, f in rivals)
+    found.accepted.append(Choice(hypothesis, fit, (), ranked, p))
+    found.current = wider.look(theta)
+    return wider
+
+
+def structure(bench: Bench, where: str, theta: np.ndarray, seen: Seen) -> result.Structure:
+    """What was found, in words."""
+    effect = next(e for e in bench.library.effects if e.name == "unknown" and e.places == (where,))
+    told = described(effect, theta[bench.library.at("unknown", where)], bench)  # pyright: ignore[reportArgumentType]
+    return result.Structure(**told, heldout_gain=seen.gain, best_name_gain=seen.name_gain)
+
+
+def _key(entry: tuple) -> tuple[str, str, str]:
+    return entry[0], entry[1], entry[2].name

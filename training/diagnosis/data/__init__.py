@@ -1,0 +1,1 @@
+"""Recordings as arrays, and what is wrong with them before any physics."""

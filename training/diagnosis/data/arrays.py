@@ -1,0 +1,248 @@
+"""Recordings as the arrays that a diagnosis works on."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ....models.config.errors import UserError
+from ....models.recordings.kinematics import dead_reckoned
+from ....models.recordings.store import Recording
+from ....models.vehicles.vehicle import Vehicle
+
+SEGMENT = 256
+"""Longest piece (samples) that a run is cut into; pieces are filtered side by side."""
+_BLOCKS, _LEAST = 8, 16
+"""Pieces that a single run is cut into at least, and samples of a piece at least."""
+REMEMBERED, _OF_A_RUN = 0.5, 0.1
+"""Time (s) before a piece whose commands its actuators may remember; share of a run at most."""
+_BEYOND = 8.0
+"""Times a thruster's largest force that no command asks for."""
+_MOST_FOLDS = 10
+_FEW_RUNS = 6
+_EVEN = 1e-6
+"""Share of a step by which equal steps may differ."""
+
+
+def all_equal(step: np.ndarray, dt: float) -> bool:
+    """Whether steps (s) are all equal, `dt` in the mean."""
+    return bool(np.ptp(step) <= _EVEN * dt)
+
+
+@dataclass(frozen=True)
+class Data:
+    """R pieces of runs, N steps each, component first and pieces last; short pieces are padded.
+
+    Attributes:
+        X: recorded poses (N + 1, 7, R).
+        V: recorded twists (N + 1, 6, R).
+        u: commanded thruster forces (N), held from n to n + 1 (N, 8, R).
+        past: those of the steps before (N), oldest first (P, 8, R): what actuators remember.
+        past_step: how long each of these was held (s) (P, R).
+        voltage: relative to the vehicle's nominal one (N, R).
+        step: from sample n to n + 1 (s) (N, R).
+        weight: 1 for steps that exist, else 0 (N, R).
+        scenario: index into `names` (R,).
+        run: which run a piece was cut from (R,).
+        names: scenarios.
+        dt: mean step (s).
+        command: what the commands were made of: thruster_force, pwm or F_Bo_B.
+        has_voltage: whether the voltage was recorded.
+        unmeasured: coordinates of the position that are integrals of the velocity alone. Then no
+            coordinate tells of errors: in B they are mixed.
+    """
+
+    X: Float[np.ndarray, "M 7 R"]
+    V: Float[np.ndarray, "M 6 R"]
+    u: Float[np.ndarray, "N n R"]
+    past: Float[np.ndarray, "P n R"]
+    past_step: Float[np.ndarray, "P R"]
+    voltage: Float[np.ndarray, "N R"]
+    step: Float[np.ndarray, "N R"]
+    weight: Float[np.ndarray, "N R"]
+    scenario: Int[np.ndarray, " R"]
+    run: Int[np.ndarray, " R"]
+    names: tuple[str, ...]
+    dt: float
+    command: str
+    has_voltage: bool
+    unmeasured: tuple[str, ...] = ()
+
+    @property
+    def told(self) -> Float[np.ndarray, "12"]:
+        """1 for errors (pose in B, twist) that records tell, 0 for others."""
+        found = np.ones(12)
+        found[:3] = not self.unmeasured
+        return found
+
+    @property
+    def left_out(self) -> Literal["scenario", "run", "block"]:
+        """What is left out of a fit in turn: scenarios, of one scenario runs, of one run blocks."""
+        if len(np.unique(self.scenario)) > 1:
+            return "scenario"
+        return "run" if len(np.unique(self.run)) > 1 else "block"
+
+    @property
+    def fold(self) -> Int[np.ndarray, " R"]:
+        """Which pieces are left out together."""
+        if self.left_out == "scenario":
+            return self.scenario
+        number = np.unique(self.cluster, return_inverse=True)[1]
+        return number * min(_MOST_FOLDS, number.max() + 1) // (number.max() + 1)
+
+    @property
+    def cluster(self) -> Int[np.ndarray, " R"]:
+        """Within which pieces may depend on each other: runs; of a few long runs their pieces.
+
+        A test between clusters needs more of them than a handful.
+        """
+        few = len(np.unique(self.run)) < _FEW_RUNS
+        return np.arange(len(self.run)) if few else self.run
+
+    @property
+    def even(self) -> bool:
+        """Whether all steps are equal."""
+        return all_equal(self.step, self.dt)
+
+    def own_steps(
+        self, pieces: Int[np.ndarray, " K"] | slice = slice(None)
+    ) -> Float[np.ndarray, "N _"]:
+        """Steps of some pieces (s), as one column where all are equal."""
+        return self.step[:, :1] if self.even else self.step[:, pieces]
+
+    def past_steps(
+        self, pieces: Int[np.ndarray, " K"] | slice = slice(None)
+    ) -> Float[np.ndarray, "P _"]:
+        """Likewise of the steps before."""
+        return self.past_step[:, :1] if self.even else self.past_step[:, pieces]
+
+    @property
+    def longest(self) -> float:
+        """The longest step (s)."""
+        return float(self.step.max())
+
+    @property
+    def times(self) -> Float[np.ndarray, "M R"]:
+        """Times of the samples since each piece's first (s), M = N + 1."""
+        return np.concatenate([np.zeros((1, self.step.shape[1])), np.cumsum(self.step, axis=0)])
+
+    @property
+    def steps(self) -> int:
+        """Steps that exist."""
+        return int(self.weight.sum())
+
+
+def make_data(
+    recording: Recording,
+    vehicle: Vehicle,
+    segment: int = SEGMENT,
+    without: Sequence[int] = (),
+    remembered: float = REMEMBERED,
+) -> Data:
+    """Cut a recording into pieces and turn its commands into thruster forces.
+
+    Thruster forces are taken as they are; PWM goes through the vehicle's curve at the recorded
+    voltage; a wrench is split over the thrusters with the least effort. Runs `without` (by number,
+    scenario by scenario) are left out, unless none would remain. What thrusters did before a run is
+    not known: its first `remembered` s (a tenth of it at most) are only what they remember.
+    Positions that were not measured are dead-reckoned.
+
+    Raises:
+        UserError: attitude or a channel of the twist is missing, or no run has two samples.
+    """
+    lacking = recording.missing
+    of_pose = lacking.get("X_WB", ())
+    unmeasured = tuple(c for c in of_pose if c in ("x", "y", "z"))
+    if "V_WB_B" in lacking or unmeasured != of_pose:
+        channels = ", ".join(f"{name} {'/'.join(which)}" for name, which in lacking.items())
+        raise UserError(
+            f"recording: {channels} is missing; a diagnosis needs attitude and all of the twist. "
+            "Without a DVL give u, v, w from measured positions (differences, turned into B)"
+        )
+    data = recording.dataset
+    thrust, volts = recording.thrust(vehicle)
+    lengths = recording.lengths
+    names = ("X", "V", "u", "past", "past_step", "voltage", "step")
+    pieces: dict[str, list[Any]] = {name: [] for name in names}
+    scenario, run, sizes = [], [], []
+    has_voltage = "voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any())
+    kept = lengths >= 3
+    for number, at in enumerate(np.argwhere(lengths > 0)):
+        kept[tuple(at)] &= number not in without
+    kept = kept if kept.any() else lengths >= 3
+    behind = max(1, round(remembered / recording.dt))
+    if kept.sum() == 1:
+        segment = min(segment, max(int(lengths.max()) // _BLOCKS, _LEAST))
+    for number, (j, k) in enumerate(np.argwhere(kept).tolist()):
+        length = int(lengths[j, k])
+        times = recording.elapsed(j, k)
+        V = data["V_WB_B"].to_numpy()[j, k, :length]
+        values = {
+            "X": dead_reckoned(times, data["X_WB"].to_numpy()[j, k, :length], V),
+            "V": V,
+        }
+        u = thrust[j, k, :length]
+        held = np.diff(times)
+        first = min(behind, int(_OF_A_RUN * (length - 1))) if remembered else 0
+        count = -(-(length - 1 - first) // segment)
+        edges = np.linspace(first, length - 1, count + 1).round().astype(int)
+        for a, b in itertools.pairwise(edges):
+            before = np.maximum(np.arange(a - behind, a), 0)
+            pieces["past"].append(u[before])
+            pieces["past_step"].append(held[before])
+            pieces["X"].append(values["X"][a : b + 1])
+            pieces["V"].append(values["V"][a : b + 1])
+            pieces["u"].append(u[a:b])
+            pieces["voltage"].append(volts[j, k, a:b])
+            pieces["step"].append(held[a:b])
+            sizes.append(b - a)
+            scenario.append(j)
+            run.append(number)
+    if not sizes:
+        raise UserError("recording: no run is long enough for a diagnosis")
+    _refuse_units(recording, vehicle, thrust)
+    N = int(max(sizes))
+    weight = (np.arange(N)[:, None] < np.array(sizes)).astype(float)
+    step = _stack(pieces["step"], N)
+    mean = float((step * weight).sum() / weight.sum()) if recording.uneven else recording.dt
+    return Data(
+        X=_stack(pieces["X"], N + 1),
+        V=_stack(pieces["V"], N + 1),
+        u=_stack(pieces["u"], N),
+        past=np.stack(pieces["past"], axis=-1),
+        past_step=np.stack(pieces["past_step"], axis=-1),
+        voltage=_stack(pieces["voltage"], N),
+        step=step if recording.uneven else np.full(weight.shape, mean),
+        weight=weight,
+        scenario=np.array(scenario, int),
+        run=np.array(run, int),
+        names=recording.scenarios,
+        dt=mean,
+        command=recording.thrust_from,
+        has_voltage=has_voltage,
+        unmeasured=unmeasured,
+    )
+
+
+def _refuse_units(
+    recording: Recording, vehicle: Vehicle, thrust: Float[np.ndarray, "S K N n"]
+) -> None:
+    """Forces far beyond what the thrusters give are no newtons."""
+    most = np.maximum(*(np.abs(np.asarray(f)) for f in vehicle.thrusters().force_limits()))
+    share = np.nanmax(np.abs(thrust), axis=(0, 1, 2)) / most
+    k = int(np.argmax(share))
+    if share[k] > _BEYOND:
+        raise UserError(
+            f"{recording.thrust_from} asks thruster {k + 1} for {share[k] * most[k]:.4g} N, "
+            f"{share[k]:.0f} times what one of {vehicle.name} gives: give newtons (pulses in µs "
+            "belong into columns pwm1, pwm2 …), or the --vehicle"
+        )
+
+
+def _stack(parts: list[np.ndarray], length: int) -> np.ndarray:
+    """Parts side by side, the last value held to the common length."""
+    padded = [np.concatenate([p, np.repeat(p[-1:], length - len(p), axis=0)]) for p in parts]
+    return np.stack(padded, axis=-1)

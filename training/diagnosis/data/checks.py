@@ -1,0 +1,279 @@
+"""Data at fault, and what data can't tell, found before anything is explained by physics."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from ....models.config.errors import UserError
+from ....models.effects.base import AXES
+from ....models.recordings.kinematics import spikes
+from ....models.recordings.schema import UNEVEN
+from ....models.recordings.store import Recording
+from .arrays import Data
+
+_STUCK = 0.5  # s
+_FILLED = 3  # samples on a straight line
+_HELD = 0.25
+"""Share of the samples that repeat the one before where an instrument is slower than the rows."""
+_INSTRUMENTS = {"x,y,z": slice(4, 7), "u,v,w": slice(7, 10), "p,q,r": slice(10, 13)}
+_LEAST_ROWS, _LEAST_SECONDS = 60, 3.0
+"""Data below which nothing is told."""
+_NAMED = 3
+"""Runs that are named."""
+_EVEN_SHARE, _SURE = 0.9, 5.0
+"""Share of even steps among which a longer one is odd; noises of a step that are no noise."""
+_STILL = 0.02
+"""Share of the strongest axis' command below which an axis counts as not driven."""
+_CHANNELS = {
+    "X_WB": ("qw", "qx", "qy", "qz", "x", "y", "z"),
+    "V_WB_B": ("u", "v", "w", "p", "q", "r"),
+}
+
+
+def problems(recording: Recording) -> tuple[list[str], list[int]]:
+    """Sensors that stand still, jumps of pose and clock, outliers, stretches without samples.
+
+    One sentence each, and the runs (by number, scenario by scenario) that have them. A channel is
+    stuck where it repeats one value exactly for longer than half a second while others change; it
+    is no fault if it does so in every run and is part of the pose (a vehicle held in place).
+    Samples on a straight line in all velocities were filled in: a gap or a jump of the clock. A
+    clock jumps in a step that is longer than others, though the vehicle moves as in one of them. An
+    outlier is a single velocity far from both its neighbours, which agree: no blow is that short.
+    Where a quarter of the samples repeat those before, an instrument is slower than the rows.
+
+    Raises:
+        UserError: a velocity has the sign opposite to the motion of the pose.
+    """
+    stuck: dict[str, list[int]] = {}
+    jumps: list[int] = []
+    clock: list[int] = []
+    spiked: list[int] = []
+    filled: list[int] = []
+    held: dict[str, list[float]] = {name: [] for name in _INSTRUMENTS}
+    agreeing = np.zeros((3, 6))
+    longest, late, names = 0.0, 0.0, []
+    for number, run in enumerate(recording.trajectories()):
+        names.append(run.scenario)
+        for name, values in (("X_WB", run.X_WB), ("V_WB_B", run.V_WB_B)):
+            for label, column in zip(_CHANNELS[name], values.T, strict=True):
+                still = _longest(np.diff(column) == 0) * recording.dt
+                if still > _STUCK and np.isfinite(column).all():
+                    stuck.setdefault(label, []).append(number)
+        state = np.concatenate([run.X_WB, run.V_WB_B], axis=1)
+        for name, columns in _INSTRUMENTS.items():
+            same = (np.diff(state[:, columns], axis=0) == 0).all(axis=1)
+            held[name].append(float((same & run.V_WB_B[1:].any(axis=1)).mean()))
+        elapsed = run.sensors.get(UNEVEN)
+        step = np.full(len(state) - 1, recording.dt) if elapsed is None else np.diff(elapsed)
+        moved = motion(run.X_WB)
+        expected = (run.V_WB_B[1:] + run.V_WB_B[:-1]) / 2
+        both = np.isfinite(moved + expected)
+        per = np.where(both, moved, 0.0) / step[:, None]
+        of = np.where(both, expected, 0.0)
+        agreeing += np.array([(per * of).sum(axis=0), (of**2).sum(axis=0), (per**2).sum(axis=0)])
+        distance = np.linalg.norm(moved[:, :3], axis=1)
+        excess = np.abs(distance - np.linalg.norm(run.V_WB_B[:-1, :3], axis=1) * step)
+        excess = excess[np.isfinite(excess)]
+        if excess.size and np.any(excess > 30 * np.median(excess) + 0.1):
+            jumps.append(number)
+        elif too_long := clock_jump(moved, expected, step):
+            clock.append(number)
+            late = max(late, too_long)
+        if spikes(run.V_WB_B.T).any():
+            spiked.append(number)
+        bend = np.abs(np.diff(run.V_WB_B, 2, axis=0)).max(axis=1, initial=0.0)
+        line = _longest(bend < 1e-7 * np.nanstd(run.V_WB_B))
+        if line >= _FILLED:
+            filled.append(number)
+            longest = max(longest, (line + 1) * recording.dt)
+    _refuse_signs(agreeing, int(recording.lengths.sum()))
+    twist = _CHANNELS["V_WB_B"]
+    stuck = {c: r for c, r in stuck.items() if len(r) < len(names) or c in twist}
+
+    def which(runs: list[int]) -> str:
+        """Their scenarios, with the repetition where there are several."""
+        told = []
+        for number in runs[:_NAMED]:
+            first = names.index(names[number])
+            several = names.count(names[number]) > 1
+            told.append(names[number] + (f" (run {number - first + 1})" if several else ""))
+        more = f" and {len(runs) - _NAMED} more" if len(runs) > _NAMED else ""
+        return f"{', '.join(told)}{more}"
+
+    found = [
+        f"{channel} repeats one value for {_STUCK:g} s or more in {which(runs)}: stuck? Give the "
+        "column without it, or leave the run out"
+        for channel, runs in stuck.items()
+    ]
+    found += [
+        f"{name} repeat the sample before in {np.median(shares):.0%} of the rows: the instrument "
+        "is slower, and what is late by that is no cause; give rows at its rate"
+        for name, shares in held.items()
+        if np.median(shares) > _HELD and not any(c in channel for channel in stuck for c in name)
+    ]
+    if jumps:
+        found.append(f"the position jumps by far more than the velocity says in {which(jumps)}")
+    if clock:
+        found.append(
+            f"time stamps jump by {late:.2g} s in {which(clock)}, while the vehicle moves on as in "
+            "one step: a jump of the clock; mend the column t"
+        )
+    if filled:
+        found.append(
+            f"samples were filled in on a straight line, for up to {longest:.2g} s, in "
+            f"{which(filled)}: lost samples or a jump of the clock"
+        )
+    if spiked:
+        found.append(
+            f"single velocities lie far from both their neighbours in {which(spiked)}: outliers"
+        )
+    found += [
+        f"samples are missing, or the clock jumped: {note}"
+        for note in recording.notes
+        if "cut at" in note
+    ]
+    bad = sorted({*jumps, *clock, *filled, *spiked, *(n for runs in stuck.values() for n in runs)})
+    if bad and len(bad) < len(names):
+        found[0] += f" (left out: {len(bad)} of {len(names)} runs)"
+    return found, bad
+
+
+def motion(X_WB: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "M 6"]:
+    """Displacement and rotation vector from sample to sample, in the B in between."""
+    turns = Rotation.from_quat(np.nan_to_num(X_WB[:, [1, 2, 3, 0]], nan=1.0))
+    turn = (turns[:-1].inv() * turns[1:]).as_rotvec()
+    middle = turns[:-1] * Rotation.from_rotvec(turn / 2)
+    turn[~np.isfinite(np.diff(X_WB[:, :4], axis=0)).all(axis=1)] = np.nan
+    moved = np.diff(X_WB[:, 4:], axis=0)
+    return np.concatenate([middle.inv().apply(moved), turn], axis=1)
+
+
+def clock_jump(
+    moved: Float[np.ndarray, "M 6"], V: Float[np.ndarray, "M 6"], step: Float[np.ndarray, " M"]
+) -> float:
+    """By how much (s) the longest step, among even ones, is too long for what moved in it; or 0."""
+    usual = float(np.median(step))
+    even = np.abs(step - usual) < 0.1 * usual
+    if even.mean() < _EVEN_SHARE:
+        return 0.0
+    longest = 0.0
+    for part in (slice(0, 3), slice(3, 6)):
+        off = np.linalg.norm(moved[:, part] - V[:, part] * step[:, None], axis=1)
+        as_usual = np.linalg.norm(moved[:, part] - V[:, part] * usual, axis=1)
+        if not np.isfinite(off[even]).any():
+            continue  # positions that were not measured
+        noise = np.nanmedian(off[even])
+        jumped = (step > 1.5 * usual) & (off > _SURE * noise) & (as_usual < off / 2)
+        longest = max(longest, float(step[jumped].max(initial=usual)) - usual)
+    return longest
+
+
+def _refuse_signs(agreeing: Float[np.ndarray, "3 6"], samples: int) -> None:
+    """`agreeing`: sums of motion times velocity, and of the squares of both."""
+    product, square, moved = agreeing
+    slope = product / np.maximum(square, 1e-12)
+    left = np.maximum(moved - slope * product, 0.0) / max(samples, 1)
+    error = np.sqrt(left / np.maximum(square, 1e-12))
+    turned = [c for c, s, e in zip("uvwpqr", slope, error, strict=True) if s < -max(0.5, 5 * e)]
+    if turned:
+        raise UserError(
+            f"{', '.join(turned)}: the recorded sign is opposite to the motion of the pose. B is x "
+            "forward, y left, z up, rates are right-handed about these axes, W is z up: turn the "
+            "sign of the column, or state the frames of the files (frames: NED/FRD)"
+        )
+
+
+def require_enough(data: Data) -> None:
+    """Refuse data that tell nothing.
+
+    Raises:
+        UserError: they are too few.
+    """
+    seconds = data.steps * data.dt
+    if data.steps < _LEAST_ROWS or seconds < _LEAST_SECONDS:
+        raise UserError(
+            f"recording: runs that are long enough have {data.steps} samples, {seconds:.2g} s in "
+            f"all: too little for a diagnosis. Give runs of some seconds, at least "
+            f"{_LEAST_SECONDS:g} s and {_LEAST_ROWS} samples together"
+        )
+
+
+def _longest(holds: np.ndarray) -> int:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(int)))
+    return int((edges[1::2] - edges[::2]).max()) if edges.size else 0
+
+
+_ABOVE = 0.5
+"""Height (m) above the surface from which a vehicle does not dive."""
+SPARSE = 1.5
+"""Steps between samples of commands from which these count as sparse."""
+
+
+def unexcited(data: Data, wrench_of: np.ndarray) -> list[str]:
+    """Axes that were not driven: what acts along them can't be told from these data.
+
+    `wrench_of` (6, n) is the wrench of unit thruster forces.
+    """
+    w = data.weight[:, None]
+    if not np.any((data.u != data.u[:1, :, :1]) & (w > 0)):
+        return list(AXES)
+    F = np.einsum("ij,njr->nir", wrench_of, data.u)
+    rms = np.sqrt((F**2 * w).sum(axis=(0, 2)) / data.weight.sum())
+    scale = np.repeat([rms[:3].max(), rms[3:].max()], 3)
+    return [a for a, f, s in zip(AXES, rms, scale, strict=True) if f <= _STILL * s]
+
+
+def limits(
+    data: Data,
+    quiet: list[str],
+    resampled: bool,
+    estimated: bool = False,
+    command_period: float = 0.0,
+) -> list[str]:
+    """What these data can't tell, one sentence each."""
+    found = [
+        f"{axis} was not driven: its drag and inertia are not identifiable from these data"
+        for axis in quiet
+    ]
+    height = float(np.median(data.X[:-1, 6][data.weight > 0]))
+    if height > _ABOVE:
+        found.append(
+            f"positions lie {height:.1f} m above the surface (z is up, 0 there): what depends on "
+            "depth can't be told; if z is down in the files, give frames: NED/FRD"
+        )
+    if data.command == "F_Bo_B":
+        found.append("commands are wrenches: single thrusters can't be told apart")
+    if data.unmeasured:
+        found.append(
+            f"{', '.join(data.unmeasured)} of the position were not measured (dead-reckoned from "
+            "the velocities): what velocities and positions tell together can't be told: the "
+            "scale and direction of the DVL, errors of the heading"
+        )
+    if not data.has_voltage:
+        found.append("no voltage was recorded: voltage_sag can't be told")
+    if resampled:
+        found.append(
+            "time steps were uneven: effects of a tenth of a step in time, and rare blows, can't "
+            "be told from the resampling"
+        )
+    if command_period > SPARSE * data.dt:
+        found.append(
+            f"commands were logged at {1 / command_period:.3g} Hz: what they did in between is not "
+            f"known, so lags and delays below {command_period:.2g} s and what turns settle to "
+            "within that time are uncertain beyond their intervals; log outputs at 50 Hz or more"
+        )
+    if estimated:
+        found.append(
+            "the states are a filter's estimate, with slow errors of its own: laws of the "
+            "disturbance and structure without a name can't be told from them, and samples count "
+            "for fewer than there are"
+        )
+    if data.left_out == "run":
+        found.append(
+            "there is one scenario: runs were left out in turn, so other motions stay unknown"
+        )
+    if data.left_out == "block":
+        found.append(
+            "there is one run: blocks of it were left out in turn, so other runs stay unknown"
+        )
+    return found

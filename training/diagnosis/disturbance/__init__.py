@@ -1,0 +1,1 @@
+"""Laws of the disturbance: level, memory, tails, waves, varying currents."""

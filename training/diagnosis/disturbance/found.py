@@ -1,0 +1,189 @@
+"""Laws of the disturbance in what is left: which there are, and which are told."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from ....models.effects.base import AXES
+from ..data.repeats import repeating
+from ..filter.noise import estimate
+from ..filter.problem import Bench, Look
+from ..filter.transition import Transition
+from ..selection.model_selection import margin
+from ..validation.validation import white_part
+from .laws import Law, estimated, find_laws, growth_alone, run_constants
+from .levels import LEVEL, beside_slow, find_levels, process_share
+from .waves import are_waves, find_current, find_waves
+
+_BLOW = 4.0
+"""Standard deviations beyond which an error is a blow's."""
+_SHORTEST, _SMALLEST = 3.0, 0.1
+"""Steps that a colour must last, share by which a level must differ."""
+_MOST_AXES = 3
+"""Axes on which errors repeat from which it is no water that moves at random."""
+SLOW = ("waves", "disturbance_colour", "current_varying")
+_AS_WELL = 1.0
+"""Nats by which growth with the speed may explain less than a level to explain it as well."""
+OF_OTHERS = 1e-3
+"""Share of what others win that a law must win besides: they leave some of their own."""
+
+
+def laws_of(bench: Bench, look: Look) -> list[Law]:
+    """Laws of the disturbance in what is left, largest gain first.
+
+    None where states were estimated: errors of an estimator are no disturbance.
+    """
+    if look.noise.estimated:
+        return []
+    data = bench.data
+    speed = np.linalg.norm(data.V[:-1, :3], axis=1)
+    found = find_laws(
+        look.z.astype(float), speed, data.weight, data.fold, data.dt, process_share(bench, look)
+    )
+    rows = bench.library.at("current_steady", "W")
+    evidence = look.plain
+    if set(rows) <= set(evidence.design.owner.tolist()) and len(evidence.runs) > 2:
+        columns = [evidence.column(i) for i in rows]
+        sizes = np.array([bench.library.entries[i].parameter.probes[0] for i in rows])
+        gain, values, loss = run_constants(evidence.runs, columns, sizes, evidence.fold)
+        found.append(Law("current_varying", "W", values, gain, loss))
+    return sorted(found, key=lambda law: -law.heldout_gain)
+
+
+def won_by(name: str, laws: Sequence[Law]) -> float:
+    """What a law wins on all axes together (nats)."""
+    return sum((max(law.heldout_gain, 0.0) for law in laws if law.name == name), 0.0)
+
+
+def best_law(bench: Bench, look: Look) -> float:
+    """What the best law of the disturbance wins on data left out (nats)."""
+    return max((law.heldout_gain for law in laws_of(bench, look)), default=0.0)
+
+
+def all_laws(bench: Bench, look: Look, least: float) -> list[Law]:
+    """Laws of what is left, waves and level included, largest gain first."""
+    found = laws_of(bench, look)
+    alike = repeating(look.z, bench.data)
+    slow = [law for law in found if law.name == "disturbance_colour"]
+    if max((law.heldout_gain for law in slow), default=0.0) > least:
+        waves, current = find_waves(bench, look), find_current(bench, look)
+        if are_waves(waves, slow):
+            found.append(waves)
+        # one motion of the water against pushes on every axis, or against one that stays
+        stays = won_by("current_varying", found)
+        if current.heldout_gain > max(won_by("disturbance_colour", slow), stays + margin(stays)):
+            found = [law for law in found if law.name != "current_varying"]
+            found.append(current)
+    # what repeats with the commands is no chance
+    water = {"W"} if len(alike) >= _MOST_AXES else set()
+    found = [law for law in found if law.name not in SLOW or law.where not in {*alike, *water}]
+    found += find_levels(bench, look, least)
+    return sorted(found, key=lambda law: -law.heldout_gain)
+
+
+def passing(laws: Sequence[Law], bench: Bench, least: float) -> list[Law]:
+    """Laws that win more than `least` nats by more than the noise levels alone can be in error."""
+    return [law for law in laws if law.heldout_gain > least and _is_apart(law, bench)]
+
+
+def told(laws: Sequence[Law], bench: Bench, look: Look, least: float) -> list[list[Law]]:
+    """Which of the laws that pass are told, in groups of one name each, largest first.
+
+    Of laws with a structure one name is told. Levels differ with any of them: a slow one disturbs
+    the estimate of b, one that comes and goes is a part of it. A level stands beside a slow one
+    if the believed one loses more than `least` nats beside pushes that last; beside growth with
+    the speed if that alone explains less than the level alone, beside blows if it holds between
+    them, and then if it is the larger part of the change. A structure must win more than what the
+    level leaves of its own.
+    """
+    passed = passing(laws, bench, least)
+    levels = [law for law in passed if law.name == LEVEL]
+    shaped = [law for law in passed if law.name != LEVEL]
+    if not shaped:
+        return [levels] if levels else []
+    shaped = [law for law in shaped if law.name == shaped[0].name]
+    if shaped[0].name == "disturbance_state_dependence":
+        shaped, levels = _grown(laws, shaped, levels, bench, look)
+    if levels and shaped[0].name in SLOW:
+        levels = beside_slow(levels, bench, look, least)
+    kept = []
+    for law in levels:
+        rest = _level_beside(law, shaped, bench, look)
+        if rest is not None and _is_apart(rest, bench):
+            kept.append(rest)
+    if not kept:
+        return [shaped]
+    least = OF_OTHERS * sum(law.heldout_gain for law in kept)
+    beside = [law for law in shaped if law.heldout_gain > least]
+    both = [kept, beside] if beside else [kept]
+    return sorted(both, key=lambda group: -group[0].heldout_gain)
+
+
+def _level_beside(law: Law, shaped: Sequence[Law], bench: Bench, look: Look) -> Law | None:
+    """A level with what is left of its change beside laws of one name, if it stands."""
+    i, name = AXES.index(law.where), shaped[0].name
+    if name in SLOW:
+        return law
+    own = [other for other in shaped if other.where == law.where]
+    if not own:
+        return law
+    all_of_it = 1 + law.parameters["change"]
+    if name == "disturbance_impacts":
+        rest = all_of_it * _without_blows(bench, look)[i] / look.noise.diffusion[i]
+    else:
+        rest = all_of_it * float(white_part(own, bench)[i])
+    if abs(np.log(rest)) < abs(np.log(all_of_it / rest)):
+        return None
+    return replace(law, parameters={"change": float(rest - 1)})
+
+
+def _grown(
+    laws: Sequence[Law], shaped: Sequence[Law], levels: Sequence[Law], bench: Bench, look: Look
+) -> tuple[list[Law], list[Law]]:
+    """Axes that grow with the speed, and levels beside them.
+
+    Where growth from the believed levels wins more than levels without it, levels of these axes are
+    a part of it, and so are those of others that the speed explains as well. Growth is told of
+    those others where it wins on data left out.
+    """
+    data = bench.data
+    speed = np.linalg.norm(data.V[:-1, :3], axis=1)
+    share, won = process_share(bench, look), {}
+    for law in levels:
+        i, rest = AXES.index(law.where), 1 / (1 + law.parameters["change"])
+        z = look.z[:, 6 + i].astype(float)
+        won[law.where] = growth_alone(z, speed, data.weight, rest, share[i])
+    grows = {law.where for law in shaped}
+    if sum(won.get(axis, 0.0) for axis in grows) <= 0:
+        return list(shaped), list(levels)
+    also = {axis for axis, gain in won.items() if gain > -_AS_WELL} - grows
+    of_others = [law for law in laws if law.name == shaped[0].name and law.where in also]
+    more = [law for law in of_others if law.heldout_gain > 0 and law.parameters["growth"] > 0]
+    return [*shaped, *more], [law for law in levels if law.where not in grows | also]
+
+
+def _without_blows(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
+    """Diffusion estimated from the steps without a blow at their begin, at their end or before."""
+    data = bench.data
+    error, jacobian = np.asarray(look.predictions.error), np.asarray(look.predictions.jacobian)
+    exists = data.weight > 0
+    spread = 1.4826 * np.median(np.abs(error[:, 6:].swapaxes(1, 2)[exists]), axis=0)
+    hit = np.any(np.abs(error[:, 6:]) > _BLOW * spread[:, None], axis=1)
+    near = hit.copy()
+    near[1:] |= hit[:-1]
+    near[:-1] |= hit[1:]
+    weight = data.weight * ~near
+    steps = Transition.along(jacobian, weight, look.predictions.late)
+    mass = bench.mass(look.theta)
+    return estimate(error, weight, steps, mass, data.dt, estimated=False).diffusion
+
+
+def _is_apart(law: Law, bench: Bench) -> bool:
+    """Whether a law differs from what the noise levels alone can be in error."""
+    if law.name == "disturbance_colour" and law.loss is not None:
+        return float(np.exp(estimated(law, bench.data.cluster)[0][0])) > _SHORTEST * bench.data.dt
+    if law.name == LEVEL:
+        return abs(law.parameters["change"]) > _SMALLEST
+    return True

@@ -1,0 +1,131 @@
+"""Whether the white disturbance is stronger or weaker than the belief says."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+
+from ....models.effects.base import AXES
+from ..filter.likely_noise import beside_pushes
+from ..filter.noise import Noise, estimate, score_of, unit_processes
+from ..filter.problem import Bench, Look
+from ..filter.transition import Transition
+from .laws import Law
+
+LEVEL = "disturbance_level"
+
+
+def believed_levels(bench: Bench) -> Float[np.ndarray, "6"]:
+    """Diffusion b that the belief states; zero where it states none."""
+    return np.asarray(bench.model.base.mass_and_diffusion(jnp.zeros(6))[1])
+
+
+def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
+    """Levels axis by axis, none where the belief states none.
+
+    The gain is that of the level estimated on the other folds over the believed one, all other
+    levels being estimated. Where it is above `least`, the others are estimated again with the
+    believed one held, for noise of the instruments may stand in for it. The error of a level is
+    that of its likelihood or, if larger, that by the jackknife over folds.
+    """
+    believed = believed_levels(bench)
+    if not np.any(believed > 0):
+        return []
+    data = bench.data
+    error, jacobian = np.asarray(look.predictions.error), np.asarray(look.predictions.jacobian)
+    mass, labels = bench.mass(look.theta), np.unique(data.fold)
+    inverse = np.linalg.inv(mass)
+    gain = np.zeros((6, len(data.fold)))
+    levels = np.zeros((len(labels), 6))
+    judged = []
+
+    def score(own: np.ndarray, noise: Noise, steps: Transition) -> Float[np.ndarray, " r"]:
+        given = data.dt, data.step[:, own], data.weight[:, own]
+        return score_of(error[:, :, own], jacobian[..., own], noise, steps, inverse, *given)
+
+    for k, label in enumerate(labels):
+        own = data.fold == label
+        rest = data.weight * (~own if not own.all() else 1)
+        steps = Transition.along(jacobian, rest, look.predictions.late)
+        noise = estimate(error, rest, steps, mass, data.dt, estimated=False)
+        levels[k] = noise.diffusion
+        best = score(own, noise, steps)
+        judged.append((own, rest, steps, best))
+        for i in np.flatnonzero(believed > 0):
+            other = noise.with_diffusion({int(i): believed[i]})
+            gain[i, own] = best - score(own, other, steps)
+    found, n = [], len(labels)
+    for i in np.flatnonzero(believed > 0):
+        if gain[i].sum() > least:
+            for own, rest, steps, best in judged:
+                held = {int(i): believed[i]}
+                other = estimate(error, rest, steps, mass, data.dt, held, estimated=False)
+                gain[i, own] = best - score(own, other, steps)
+        spread = np.sqrt((n - 1) / n * np.sum((levels[:, i] - levels[:, i].mean()) ** 2))
+        change = float(look.noise.diffusion[i] / believed[i] - 1)
+        error_of = {"change": float(max(spread, look.noise.error[i]) / believed[i])}
+        law = Law(LEVEL, AXES[i], {"change": change}, gain[i], errors=error_of)
+        found.append(law)
+    return found
+
+
+def beside_slow(levels: Sequence[Law], bench: Bench, look: Look, least: float) -> list[Law]:
+    """Those that stand beside pushes that last, with the level that is left there.
+
+    They lose more than `least` nats where the believed one is held, and differ to the same side.
+    """
+    data, believed = bench.data, believed_levels(bench)
+    p = look.predictions
+    steps = Transition.along(np.asarray(p.jacobian), data.weight, p.late)
+    inverse = np.linalg.inv(bench.mass(look.theta))
+    left, lost = beside_pushes(
+        np.asarray(p.error),
+        data.weight,
+        steps,
+        unit_processes(steps, inverse, data.dt),
+        _pushed(steps, inverse, data.dt),
+        data.dt,
+        np.concatenate([look.noise.record, look.noise.diffusion]) ** 2,
+        believed,
+        [AXES.index(law.where) for law in levels],
+    )
+    found = []
+    for law in levels:
+        i = AXES.index(law.where)
+        change = float(left[i] / believed[i] - 1)
+        if lost[i] > least and change * law.parameters["change"] > 0:
+            share = min(1.0, lost[i] / law.heldout_gain)
+            found.append(replace(law, parameters={"change": change}, heldout=share * law.heldout))
+    return found
+
+
+def process_share(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
+    """Share of the variance of each twist's innovation that the process on its axis makes."""
+    p = look.predictions
+    steps = Transition.along(np.asarray(p.jacobian), bench.data.weight, p.late)
+    inverse = np.linalg.inv(bench.mass(look.theta))
+    own = unit_processes(steps, inverse, bench.data.dt)
+    own *= look.noise.diffusion[:, None, None] ** 2
+    # whitened squares are divided by `memory`: one as many would be
+    whiten = look.kalman.whiten.mean(axis=-1) * np.sqrt(look.kalman.memory)[:, None]
+    P = np.zeros_like(own)
+    for keep in look.kalman.keep.mean(axis=-1):
+        A = steps.mean @ keep
+        P = A @ P @ A.T + own
+    axis = np.arange(6)
+    return np.clip((whiten[-1] @ P @ whiten[-1].T)[axis, 6 + axis, 6 + axis], 0.0, 1.0)
+
+
+def _pushed(
+    transition: Transition, mass_inverse: Float[np.ndarray, "6 6"], dt: float
+) -> Float[np.ndarray, "6 12"]:
+    """What a constant unit wrench makes of an error within a step: ∫ exp(J s) ds [0; M⁻¹]."""
+    J = np.real(scipy.linalg.logm(transition.mean)) / dt
+    both = np.zeros((18, 18))
+    both[:12, :12] = J
+    both[:6, 12:] = -transition.late[:, None] * mass_inverse
+    both[6:12, 12:] = mass_inverse
+    return scipy.linalg.expm(both * dt)[:12, 12:].T

@@ -1,0 +1,1 @@
+"""One-step predictions, their innovations, noise and sensitivities to effects."""

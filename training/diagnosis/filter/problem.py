@@ -1,0 +1,379 @@
+"""What one set of parameters shows: innovations, noise, responses; fits by exact predictions."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+import scipy.linalg
+from jaxtyping import Array, Bool, Float
+
+from ....models.config.checks import require_double
+from ....models.dynamics import Dynamics
+from ....models.effects.base import AXES, XYZ, Effect
+from ....models.effects.extended import Extended
+from ....models.effects.library import KINDS, Library
+from ....models.recordings.store import Recording
+from ....models.rigid_body import FossenDynamics
+from ....models.vehicles.vehicle import Vehicle
+from ..data.arrays import Data, make_data
+from ..selection.correlated_noise import Beside
+from ..selection.hypotheses import Design, Evidence, Fit
+from ..selection.model_selection import parameters_of
+from .gram import gram
+from .innovations import Predictions, predict
+from .noise import Filter, Noise, estimate, judging_filter
+from .sensitivities import respond
+from .transition import Transition
+
+_RANDOM = ("waves", "current_varying")
+"""Causes that are sought as laws: their motion differs from run to run."""
+
+
+_DRAG = ("linear_drag", "quadratic_drag")
+_HALVINGS = 4
+"""Steps that may fail before a fit ends."""
+WILD = 1e3
+"""m, rad, m/s, rad/s, and slopes, beyond which a prediction over one step has diverged."""
+_WORSE = 20.0
+"""Nats by which one-step errors may become less likely: the filter weighs them otherwise."""
+_LATEST, _STEPS = 0.25, (6, 16)
+"""Delay (s) of commands that is told from a longer one, and least and most steps that hold it."""
+_LIGHTEST = 0.1
+"""Share of the believed mass along any direction below which a step is too long."""
+
+
+class Look(NamedTuple):
+    """All that one set of parameters shows; `z` are the whitened innovations as they are.
+
+    `evidence` is beside the bench's random structure, `plain` without it.
+    """
+
+    theta: Float[np.ndarray, " p"]
+    predictions: Predictions
+    noise: Noise
+    kalman: Filter
+    evidence: Evidence
+    plain: Evidence
+    z: Float[np.ndarray, "N 12 R"]
+    loss: float
+
+    def likelihood(self, weight: Float[np.ndarray, "N R"]) -> Float[np.ndarray, " R"]:
+        """Log density of each piece's innovations up to a constant (nats)."""
+        square = (self.z.astype(float) ** 2).sum(axis=(0, 1))
+        return -square / 2 - (self.kalman.log_det * weight).sum(axis=0)
+
+    @property
+    def correlation(self) -> Float[np.ndarray, "12"]:
+        """Of neighbouring innovations; those of samples that do not exist are zero."""
+        z = self.z.astype(float)
+        square = np.maximum((z**2).sum(axis=(0, 2)), 1e-300)
+        return (z[1:] * z[:-1]).sum(axis=(0, 2)) / square
+
+
+@dataclass(frozen=True)
+class Bench:
+    """One recording beside one believed model.
+
+    Attributes:
+        data: the runs.
+        vehicle: whose thrusters they are.
+        model: the believed model without effects.
+        library: every effect that may explain a difference.
+        believed: θ of the belief: zero but for effects that it holds already (p,).
+        bounds: ranges of parameters that are narrower than those of their effects.
+        beside: a random structure beside which parameters are fitted and causes judged.
+    """
+
+    data: Data
+    vehicle: Vehicle
+    model: Extended
+    library: Library
+    believed: Float[np.ndarray, " p"]
+    bounds: Mapping[tuple[str, str, str], tuple[float, float]] = field(default_factory=dict)
+    beside: Beside | None = None
+
+    @classmethod
+    def of(
+        cls,
+        recording: Recording,
+        vehicle: Vehicle,
+        base: Dynamics | None = None,
+        without: Sequence[int] = (),
+    ) -> "Bench":
+        """`base` is believed in place of the vehicle's preset; runs `without` are faulty.
+
+        Raises:
+            ValueError: if JAX runs in single precision.
+        """
+        require_double("a diagnosis computes", "anything of it is made")
+        data = make_data(recording, vehicle, without=without)
+        believed = vehicle.dynamics() if base is None else base
+        effects = believed.effects if isinstance(believed, Extended) else ()
+        core = believed.base if isinstance(believed, Extended) else believed
+        library, theta = _library(data, effects)
+        return cls(data, vehicle, Extended.create(core, (), vehicle.thrusters()), library, theta)
+
+    def with_effect(self, effect: Effect) -> "Bench":
+        """The same with one more effect, absent so far, behind those of the library."""
+        library = Library([*self.library.effects, effect])
+        old = [library.index(*_key(e)) for e in self.library.entries]
+        theta = np.zeros(library.size)
+        theta[old] = self.believed
+        return replace(self, library=library, believed=theta)
+
+    def within(self, bounds: Mapping[int, tuple[float, float]]) -> "Bench":
+        """The same with narrower ranges of some parameters, by their place in θ."""
+        named = {_key(self.library.entries[i]): both for i, both in bounds.items()}
+        return replace(self, bounds={**self.bounds, **named})
+
+    def limits(self, rows: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest admissible values; drag stays passive, unless it is believed not to."""
+        rows = list(rows)
+        entries = [self.library.entries[i] for i in rows]
+        both = [self.bounds.get(_key(e), (e.parameter.low, e.parameter.high)) for e in entries]
+        least = [-self.believes(e.cause, e.where) if e.cause in _DRAG else -np.inf for e in entries]
+        low = np.maximum([b[0] for b in both], np.minimum(least, self.believed[rows]))
+        return low, np.array([b[1] for b in both])
+
+    def moved(self, theta: Float[np.ndarray, " q"], library: Library) -> Float[np.ndarray, " p"]:
+        """A θ of another library in this one's order."""
+        found = np.zeros(self.library.size)
+        for value, entry in zip(theta, library.entries, strict=True):
+            found[self.library.index(*_key(entry))] = value
+        return found
+
+    def believes(self, cause: str, where: str) -> float:
+        """The believed model's own coefficient that a cause changes; 0 where it has none."""
+        core = self.model.base
+        if not isinstance(core, FossenDynamics):
+            return 0.0
+        if cause == "net_buoyancy":
+            return float(core.buoyancy - core.weight)
+        if cause == "centre_of_buoyancy":
+            return float(core.p_BoCb_B[XYZ.index(where)])
+        if where not in AXES:
+            return 0.0
+        i = AXES.index(where)
+        if cause == "added_mass":
+            return float(core.mass.matrix()[i, i] - core.rigid_inertia[i, i])
+        if cause in ("linear_drag", "quadratic_drag"):
+            return float(getattr(core, cause).dense[i, i])
+        return 0.0
+
+    def mass(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "6 6"]:
+        """The mass matrix under θ (kg, kg·m, kg·m²)."""
+        return mass(self.model, self.library, theta)
+
+    # ------------------------------------------------------------------------------- looking
+
+    def predict(
+        self, theta: Float[np.ndarray, " p"], kalman: Filter | None = None
+    ) -> tuple[Predictions, Noise, Filter]:
+        """Predictions with the noise that they ask for, and its filter unless one is given."""
+        p = predict(self.model, self.library, theta, self.data)
+        error, weight = np.asarray(p.error), self.data.weight
+        if not np.isfinite(error[:, :, weight.any(axis=0)]).all():
+            raise FloatingPointError("predictions diverge")
+        jacobian = np.asarray(p.jacobian)
+        steps = Transition.along(jacobian, weight, p.late)
+        mass = self.mass(theta)
+        noise = estimate(error, weight, steps, mass, self.data.dt)
+        if kalman is not None:
+            return p, noise, kalman
+        data, inverse = self.data, np.linalg.inv(mass)
+        return p, noise, judging_filter(noise, steps, inverse, data.dt, data.step, jacobian)
+
+    def errors(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "N 12 R"]:
+        """Errors of one-step predictions, zero where a piece has no sample."""
+        p = predict(self.model, self.library, theta, self.data)
+        return np.asarray(p.error) * self.data.weight[:, None]
+
+    def look(
+        self,
+        theta: Float[np.ndarray, " p"],
+        chosen: Sequence[int] | None = None,
+        kalman: Filter | None = None,
+        again: Look | None = None,
+    ) -> Look:
+        """Innovations at θ and the responses to the parameters chosen.
+
+        By default all but those in single thrusters of causes that may be in all of them, and all
+        coefficients that have a range of their own (`within`). A look at the same θ may be handed
+        over to look `again`: its predictions, noise and filter serve once more.
+        """
+        if again is None:
+            p, noise, kalman = self.predict(theta, kalman)
+        else:
+            p, noise, kalman = again.predictions, again.noise, again.kalman
+        if chosen is None:
+            first = parameters_of(self.library, self.library.hypotheses(single=False))
+            ranged = (i for i, e in enumerate(self.library.entries) if _key(e) in self.bounds)
+            chosen = sorted({*first, *np.flatnonzero(theta).tolist(), *ranged})
+        design = Design.of(self.library, theta, chosen)
+        z = respond(self.model, self.library, theta, design.probes, self.data, p, kalman)
+        data = self.data
+
+        def evidence(products: np.ndarray) -> Evidence:
+            return Evidence(self.library, theta, design, products, data.cluster, data.fold)
+
+        plain = evidence(gram(z))
+        judged = plain if self.beside is None else evidence(self.beside.products(z))
+        own_z = z[0].reshape(len(data.u), 12, -1) * np.sqrt(kalman.memory)[:, None]
+        return Look(theta, p, noise, kalman, judged, plain, own_z, float(judged.total[0, 0]) / 2)
+
+    def polish(
+        self,
+        theta: Float[np.ndarray, " p"],
+        chosen: Sequence[int],
+        kalman: Filter | None = None,
+        rounds: int = 4,
+        origin: Look | None = None,
+    ) -> tuple[np.ndarray, Look, Fit]:
+        """Gauss–Newton on the parameters chosen, with exact predictions at every step.
+
+        A step that makes one-step errors clearly larger is halved; so is the way to the start from
+        `origin`, if one is given. The fit returned is at the θ returned: its
+        errors are joint, clustered by run.
+        """
+        chosen = list(chosen)
+        low, high = self.limits(chosen)
+        theta = theta.copy()
+        theta[chosen] = np.clip(theta[chosen], low, high)
+        best: tuple[np.ndarray, Look, Fit] | None = None
+        back = self.believed if origin is None else origin.theta
+        bar = np.inf if origin is None else self.loss_of(origin)
+        done = failed = 0
+        while done < rounds and failed < _HALVINGS:
+            seen = self._seen(theta, chosen, kalman)
+            if seen is None or not self.loss_of(seen) <= bar + _WORSE:
+                # a step too far: back towards what was good
+                theta = (theta + (back if best is None else best[0])) / 2
+                failed += 1
+                continue
+            fit = seen.evidence.fit(chosen)
+            best, bar = (theta.copy(), seen, fit), self.loss_of(seen)
+            done += 1
+            step = seen.evidence.step(chosen, low - theta[chosen], high - theta[chosen])
+            theta[chosen] = self._stepped(theta, chosen, step, low, high)
+            if np.all(np.abs(step) < 0.15 * fit.errors + 1e-12):
+                break
+        if best is None:
+            seen = self.look(back, chosen, kalman)
+            best = back.copy(), seen, seen.evidence.fit(chosen)
+        return best
+
+    def _seen(self, theta: np.ndarray, chosen: list[int], kalman: Filter | None) -> Look | None:
+        """A look, or None where predictions diverge."""
+        try:
+            return self.look(theta, chosen, kalman)
+        except (FloatingPointError, np.linalg.LinAlgError):
+            return None
+
+    def loss_of(self, seen: Look) -> float:
+        """Minus the log likelihood of one-step errors under a covariance of their own.
+
+        It asks for no filter, whose noise levels change with what is fitted.
+        """
+        error = np.asarray(seen.predictions.error) * self.data.weight[:, None]
+        return self.merit(self.covariance(error, seen.noise.estimated))
+
+    def loss(self, theta: Float[np.ndarray, " p"]) -> float:
+        """That at θ, pose and twist apart: what poses lack is an instrument's."""
+        return self.merit(self.covariance(self.errors(theta), apart=True))
+
+    def covariance(self, error: np.ndarray, apart: bool) -> Float[np.ndarray, "12 12"]:
+        """Of one-step errors; pose and twist `apart`: what estimated poses lack is no wrench's."""
+        C = np.einsum("nir,njr->ij", error, error) / self.data.weight.sum()
+        if apart:
+            C[:6, 6:], C[6:, :6] = 0.0, 0.0
+        return C + np.diag(self.data.told == 0)
+
+    def merit(self, C: Float[np.ndarray, "12 12"]) -> float:
+        """Minus the log likelihood of errors of that covariance."""
+        if not np.isfinite(C).all():
+            return np.inf
+        return float(self.data.weight.sum() * np.linalg.slogdet(C)[1] / 2)
+
+    def _stepped(
+        self, theta: np.ndarray, chosen: list[int], step: np.ndarray, low: np.ndarray,
+        high: np.ndarray,
+    ) -> Float[np.ndarray, " k"]:  # fmt: skip
+        """θ after a step, halved until the mass matrix keeps a share of the believed one."""
+        believed = self.mass(self.believed)
+        moved, share = theta.copy(), 1.0
+        while True:
+            moved[chosen] = np.clip(theta[chosen] + share * step, low, high)
+            least = scipy.linalg.eigh(self.mass(moved), believed, eigvals_only=True)[0]
+            if least > _LIGHTEST or share < 1e-3:
+                return moved[chosen] if least > 0 else theta[chosen]
+            share /= 2
+
+    def without_each(self, look: Look, chosen: Sequence[int]) -> Float[np.ndarray, "p R"]:
+        """θ of each piece, the parameters chosen refitted without the pieces it is left out with.
+
+        One Gauss–Newton step from the fit to all data, which is exact to first order in what a
+        fold weighs; values stay in their admissible range, and steps whose predictions diverge are
+        halved.
+        """
+        data, chosen = self.data, list(chosen)
+        theta = np.repeat(look.theta[:, None], len(data.fold), axis=1)
+        evidence = look.evidence
+        if not chosen or len(evidence.folds) < 2:
+            return theta
+        low, high = (bound - look.theta[chosen] for bound in self.limits(chosen))
+        low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
+        for number, label in enumerate(np.unique(data.fold)):
+            values = look.theta[chosen] + evidence.step(chosen, low, high, without=number)
+            theta[np.ix_(chosen, data.fold == label)] = values[:, None]
+        for share in (*(0.5 for _ in range(_HALVINGS)), 1.0):
+            wild = np.isin(data.fold, data.fold[self._wild(theta)])
+            if not wild.any():
+                break
+            theta[:, wild] += share * (look.theta[:, None] - theta[:, wild])
+        return theta
+
+    def _wild(self, theta: Float[np.ndarray, "p R"]) -> Bool[np.ndarray, " R"]:
+        """Pieces whose predictions diverge, each under its own θ."""
+        p = predict(self.model, self.library, theta, self.data)
+        here = self.data.weight > 0
+        sizes = (
+            np.abs(np.asarray(a)).max(axis=(1, *range(2, a.ndim - 1)))
+            for a in (p.error, p.jacobian)
+        )
+        return np.any([np.any(~(size < WILD) & here, axis=0) for size in sizes], axis=0)
+
+
+def mass(
+    model: Extended, library: Library, theta: Float[np.ndarray, " p"]
+) -> Float[np.ndarray, "6 6"]:
+    """The mass matrix with a library's effects (kg, kg·m, kg·m²)."""
+    return np.asarray(_mass(model, library.filled(theta)))
+
+
+@eqx.filter_jit
+def _mass(model: Extended, effects: tuple[Effect, ...]) -> Float[Array, "6 6"]:
+    return model.with_effects(effects).inertia().matrix
+
+
+def _key(entry: tuple) -> tuple[str, str, str]:
+    return entry[0], entry[1], entry[2].name
+
+
+def _library(data: Data, effects: Sequence[Effect]) -> tuple[Library, np.ndarray]:
+    low, high = data.X[:, 4:].min(axis=(0, 2)) - 0.3, data.X[:, 4:].max(axis=(0, 2)) + 0.3
+    walls = (low[0], high[0], low[1], high[1])
+    options: dict[str, dict[str, Any]] = {
+        "proximity": {"floor": float(low[2]), "walls": tuple(map(float, walls))},
+        "actuation_delay": {"steps": int(np.clip(np.ceil(_LATEST / data.dt - 1e-6) + 1, *_STEPS))},
+    }
+    left_out = set(_RANDOM) | (set() if data.has_voltage else {"voltage_sag"})
+    kinds = [k for k in KINDS.values() if k.family != "disturbance" and k.name not in left_out]
+    own = [e for e in effects if e.name not in {k.name for k in kinds}]
+    library = Library([*(k.neutral(**options.get(k.name, {})) for k in kinds), *own])
+    theta = np.zeros(library.size)
+    for effect in effects:
+        rows = [i for where in effect.places for i in library.at(effect.name, where)]
+        theta[rows] = np.asarray(effect.values)
+    return library, theta

@@ -1,0 +1,179 @@
+"""How the innovations would change if an effect were there: probes through the same filter."""
+
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ....models import se3
+from ....models.effects.base import Effect
+from ....models.effects.extended import Extended
+from ....models.effects.library import Library, kind
+from ....models.effects.recent import Recent
+from ..data.arrays import Data
+from .innovations import Arrays, Predictions, as_arrays, settle
+from .noise import Filter
+
+LANES, FEW, INSTRUMENTS = 28, 8, 18
+"""Probes that one call of the compiled program runs side by side, besides the base."""
+AHEAD = 4
+"""Calls that wait or run while the results of one are taken: each holds its probes' innovations."""
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    """A program runs in the thread that calls it and leaves other cores idle."""
+    return ThreadPoolExecutor(AHEAD, thread_name_prefix="responses")
+
+
+@eqx.filter_jit
+def _respond(
+    model: Extended,
+    effects: Any,
+    predictions: Predictions,
+    arrays: Arrays,
+    filters: tuple[Array, Array, Array],
+    lanes: int,
+    instruments: bool,
+) -> Float[Array, "L N12 R"]:
+    """Whitened innovations of lane 0 (the base) and changes of them in the other lanes."""
+    model = model.with_effects(effects)
+    if not instruments:
+        model, predictions, arrays, filters = _single((model, predictions, arrays, filters))
+    first, predictions = predictions.first, predictions._replace(first=None, late=None)
+    (X, V, u, voltage, step, past, past_step), (keep, whiten, weight) = arrays, filters
+    inertia = model.inertia()
+
+    def body(carry: Any, given: Any) -> Any:
+        memory, nu, recent = carry
+        p, X0, V0, command, volts, h, gap, white, exists = given
+        dt = h[None, None]
+        kept = through(gap, nu)
+        if instruments:
+            # states that instruments show otherwise go their way, and are read at its end
+            away = _apart(model.infer(X0[:, None], V0[:, None], _wide(recent)))
+            away = jnp.sum(p.jacobian[:, :, None] * away[None], axis=1)
+            x, v = se3.retract(p.X[:, None], away[:6]), p.V[:, None] + away[6:]
+            recent = recent.after(p.latest)
+            direct = _apart(model.observe(x, v, _wide(recent)))
+            moved = kept
+        else:
+            x, v = (a[:, None] for a in p.start)
+            middle_V = (v + p.V[:, None]) / 2
+            middle_X = se3.retract(x, dt / 4 * (v + middle_V))
+            memory, level = model.actuate(memory, command[:, None], dt, 1)
+            memory, push = model.feel(memory, v, dt)
+            a = model.drift(inertia, middle_X, middle_V, level[..., 0], volts[None, None], push)
+            direct = dt / 2 * jnp.concatenate([jnp.zeros_like(a), a - a[:, :1]])
+            moved = kept - direct
+        nu = jnp.sum(p.jacobian[:, :, None] * moved[None], axis=1) - direct
+        nu = nu.at[:, 0].add(p.error)
+        # lane 0 carries the base's own innovation: nothing was changed there
+        return (memory, nu, recent), through(white, nu) * exists[None, None]
+
+    zero = jnp.zeros((12, lanes, V.shape[2]), V.dtype)
+    memory = () if instruments else settle(model, past[:, :, None], past_step[:, None, None])
+    start = (memory, zero, first)
+    xs = (predictions, X[:-1], V[:-1], u, voltage, step, keep, whiten, weight)
+    z = jax.lax.scan(body, start, xs)[1].astype(jnp.float32)
+    return jnp.moveaxis(z, 2, 0).reshape(lanes, -1, z.shape[3])
+
+
+def _wide(recent: Recent) -> Recent:
+    """The same for all lanes."""
+    return jax.tree.map(lambda a: a[..., None, :], recent)
+
+
+def _single(tree: Any) -> Any:
+    """Numbers of single precision: enough for changes of a wrench, in 0.7 of the time."""
+    return jax.tree.map(lambda a: a.astype(jnp.float32) if eqx.is_inexact_array(a) else a, tree)
+
+
+def through(M: Float[Array, "12 12 #R"], x: Float[Array, "12 L R"]) -> Float[Array, "12 L R"]:
+    """M x, one matrix for all pieces or one for each."""
+    if M.shape[2] == 1:
+        return jnp.tensordot(M[..., 0], x, 1)
+    return jnp.einsum("ijr,jlr->ilr", M, x)
+
+
+def respond(
+    model: Extended,
+    library: Library,
+    theta: Float[np.ndarray, " p"],
+    probes: Float[np.ndarray, "k p"],
+    data: Data,
+    predictions: Predictions,
+    kalman: Filter,
+) -> Float[np.ndarray, "m N12 R"]:
+    """Whitened innovations at `theta`, then the changes that each row of `probes` makes in them.
+
+    Rows of `probes` are differences from `theta`. Those of instruments go through one compiled
+    program in double precision, which poses take, all others through another one, `LANES` (or
+    `FEW`) at a time. Calls run side by side on as many cores as there are.
+    """
+    arrays = as_arrays(data)
+    filters = (jnp.asarray(kalman.keep), jnp.asarray(kalman.whiten), jnp.asarray(data.weight))
+    reads = np.array([kind(e.cause).family == "measurement" for e in library.entries])
+    of_instruments = np.any((probes != 0) & reads, axis=1)
+    steps = data.u.shape[0] * 12
+    found = np.empty((1 + len(probes), steps, data.u.shape[2]), np.float32)
+    believed = library.filled(theta[:, None, None])
+    running: deque[tuple[np.ndarray, Future[np.ndarray]]] = deque()
+
+    def run(*arguments: Any) -> np.ndarray:
+        return np.asarray(_respond(*arguments))
+
+    def collect() -> None:
+        some, z = running.popleft()
+        seen = z.result()
+        found[1 + some] = seen[1 : 1 + len(some)]
+        found[0] = seen[0]
+
+    for instruments in (False, True):
+        rows = np.flatnonzero(of_instruments == instruments)
+        size = FEW if len(rows) <= FEW else INSTRUMENTS if instruments else LANES
+        alone = not len(probes) and not instruments  # the base is asked for in any case
+        for first in range(0, max(len(rows), alone), size):
+            some = rows[first : first + size]
+            chunk = np.zeros((size + 1, library.size))
+            chunk[1 : 1 + len(some)] = probes[some]
+            lanes = library.filled((theta + chunk).T[:, :, None])
+            effects = _of_family(lanes, believed, instruments)
+            arguments = predictions, arrays, filters, size + 1, instruments
+            call = _threads().submit(run, model, effects, *arguments)
+            running.append((some, call))
+            if len(running) > AHEAD:
+                collect()
+    while running:
+        collect()
+    return found
+
+
+def _of_family(
+    lanes: tuple[Effect, ...], alike: tuple[Effect, ...], instruments: bool
+) -> tuple[Effect, ...]:
+    """Effects whose values differ from lane to lane, those of the other family alike in all."""
+    return tuple(
+        a if (a.family == "measurement") == instruments else b
+        for a, b in zip(lanes, alike, strict=True)
+    )
+
+
+def _apart(state: tuple[Array, Array]) -> Float[Array, "12 L R"]:
+    """How far the states of all lanes are from lane 0's, for angles well below a radian."""
+    X, V = state
+    inverse = se3.inverse(X[:, :1])
+    w, x, y, z = jnp.unstack(inverse[:4])
+    a, b, c, d = jnp.unstack(X[:4])
+    turned = [w * b + x * a + y * d - z * c, w * c - x * d + y * a + z * b,
+              w * d + x * c - y * b + z * a]  # fmt: skip
+    moved = se3.rotate_inverse(X[:, :1], X[4:] - X[4:, :1])
+    parts = [moved, 2 * jnp.stack(turned), V - V[:, :1]]
+    batch = jnp.broadcast_shapes(*(p.shape[1:] for p in parts))
+    return jnp.concatenate([jnp.broadcast_to(p, (p.shape[0], *batch)) for p in parts])

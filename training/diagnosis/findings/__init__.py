@@ -1,0 +1,1 @@
+"""What a diagnosis says: causes, ratios, text, next experiments."""

@@ -1,0 +1,204 @@
+"""What to do next: the maneuver of a set that would tell names apart, or tell a name best.
+
+Every maneuver of `trials` is simulated by the model that the diagnosis ends with, without noise,
+and looked at through the filter of the data. Were a cause A with parameters θ_A not there, the
+innovations would be -J_A θ_A; another name B, and all that is free beside it, explain what they can
+of that. What they can't, in the data that there are and in a maneuver together,
+
+    D = min_b ½ |J_A θ_A - J_B b|²,
+
+is the expected log likelihood ratio of A against B (Hunter and Reiner 1965, with the filter's
+innovations as responses). A maneuver is worth what it adds to D in a minute.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from ....models.effects.library import kind
+from ..disturbance.laws import Law
+from ..filter.gram import gram
+from ..filter.innovations import predict
+from ..filter.noise import judging_filter
+from ..filter.problem import WILD, Bench, Look
+from ..filter.sensitivities import respond
+from ..filter.transition import Transition
+from ..selection.hypotheses import Evidence
+from ..selection.model_selection import Choice, Hypothesis, parameters_of
+from .maneuver_library import TRIALS, simulated
+
+_NOTHING = 1.0
+"""Nats a minute below which a maneuver tells nothing."""
+_MOST = 4
+"""Names that a cause is to be told from."""
+_BY_ITSELF = {
+    "actuation": "measure the thrust at the bollard with a scale",
+    "body": "weigh the vehicle in air and in water and measure where its weights are",
+    "environment": "measure the water with an instrument of its own, or go where it is still",
+    "disturbance": "record ten minutes without commands",
+    "measurement": "hold the instrument against another one",
+}
+"""What tells where no maneuver does, by the family of a cause."""
+_SLOW = ("current_varying", "waves", "disturbance_colour")
+_DEPTHS = "repeat at two depths and several headings"
+"""What tells water that moves from slow pushes."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What to do next for one cause.
+
+    Attributes:
+        text: in words.
+        nats: expected nats a minute by maneuver, against the names it is to be told from; empty for
+            laws of the disturbance, which depend on no maneuver.
+    """
+
+    text: str
+    nats: dict[str, float]
+
+
+def experiments(
+    bench: Bench, final: Look, accepted: Sequence[Choice], nuisance: Sequence[int]
+) -> dict[Hypothesis, Experiment]:
+    """The next experiment for every cause that was accepted; `final` is the look with all of them.
+
+    A cause is to be told from its ties, or else from its closest rival, or else from nothing.
+    """
+    if not accepted:
+        return {}
+    names = [choice.hypothesis for choice in accepted]
+    against = {choice.hypothesis: _opponents(choice, names) for choice in accepted}
+    tried = [*names, *(other for others in against.values() for other in others)]
+    rows = sorted({*nuisance, *parameters_of(bench.library, tried)})
+    there = bench.look(final.theta, rows, final.kalman, again=final).plain
+    flown = _looked_at(bench, final, there)
+    change = final.theta - bench.believed
+    found = {}
+    for a in names:
+        own = bench.library.at(*a)
+        beside = [i for i in rows if i not in own and (i in nuisance or _of(bench, i) in names)]
+        opponents = against[a]
+        value = {
+            trial: min(
+                _added(there, T, own, [*beside, *_rows(bench, b, beside)], change)
+                for b in (opponents or [None])
+            ) / minutes
+            for trial, (T, minutes) in flown.items()
+        }  # fmt: skip
+        found[a] = Experiment(_told(a, opponents, value), value)
+    return found
+
+
+def _of(bench: Bench, i: int) -> Hypothesis:
+    return bench.library.entries[i][:2]
+
+
+def _rows(bench: Bench, b: Hypothesis | None, taken: Sequence[int]) -> list[int]:
+    return [] if b is None else [i for i in bench.library.at(*b) if i not in taken]
+
+
+def _opponents(choice: Choice, named: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Ties that are no causes themselves, or else the closest rival that is none.
+
+    What has the cause as a part of itself explains it whatever is driven.
+    """
+    own = choice.hypothesis[0]
+
+    def apart(h: Hypothesis) -> bool:
+        return h not in named and h[0] != own and own not in kind(h[0]).simpler
+
+    ties = [h for h in choice.ties if apart(h)]
+    return ties[:_MOST] or [h for h, _ in choice.rivals if apart(h)][:1]
+
+
+def _looked_at(
+    bench: Bench, final: Look, there: Evidence
+) -> dict[str, tuple[Float[np.ndarray, "m m"], float]]:
+    """Products of responses in each maneuver, as those that are `there`, and its minutes."""
+    inverse, design = np.linalg.inv(bench.mass(final.theta)), there.design
+    products: dict[str, np.ndarray] = {}
+    minutes: dict[str, float] = {}
+    for names, data in simulated(bench, final.theta):
+        p = predict(bench.model, bench.library, final.theta, data)
+        tame = (np.abs(np.asarray(p.jacobian)) < WILD).all(axis=(0, 1, 2))
+        jacobian = np.where(tame, np.asarray(p.jacobian), 0.0)
+        data = replace(data, weight=data.weight * tame)
+        if not data.weight.any():
+            continue
+        steps = Transition.along(jacobian, data.weight, p.late)
+        kalman = judging_filter(final.noise, steps, inverse, data.dt, data.step, jacobian)
+        z = respond(bench.model, bench.library, final.theta, design.probes, data, p, kalman)
+        seconds = (data.step * data.weight).sum(axis=0)
+        for r, (name, G) in enumerate(zip(names, there.scaled(gram(z)), strict=True)):
+            if name and np.isfinite(G).all():
+                products[name] = products.get(name, 0.0) + G
+                minutes[name] = minutes.get(name, 0.0) + seconds[r] / 60
+    return {name: (G, minutes[name]) for name, G in products.items() if minutes[name] > 0}
+
+
+def _added(
+    there: Evidence,
+    flown: Float[np.ndarray, "m m"],
+    own: Sequence[int],
+    free: Sequence[int],
+    change: Float[np.ndarray, " p"],
+) -> float:
+    """Nats that a maneuver adds to those by which the cause `own` beats all that is `free`.
+
+    `change` is by how much the parameters differ from those without the cause.
+    """
+    rows = [i for i in own if there.shows(i)]
+    absent = np.eye(len(flown))
+    absent[0, 0] = 0.0
+    absent[0, [there.column(i) for i in rows]] = -change[rows]
+    before, new = (absent @ T @ absent.T for T in (there.total, flown))
+    return max(there.least(before + new, free) - there.least(before, free), 0.0)
+
+
+def _told(a: Hypothesis, opponents: Sequence[Hypothesis], value: Mapping[str, float]) -> str:
+    best = max(value, key=lambda trial: value[trial])
+    family = kind(a[0]).family
+    names = list(dict.fromkeys(name for name, _ in opponents))
+    apart = f"to tell it from {', '.join(names)}" if names else "to measure it better"
+    if value[best] < _NOTHING:
+        return f"{apart}: {_BY_ITSELF[family]}; no maneuver of the set does"
+    return f"{apart}: {TRIALS[best].text} (expected: {value[best]:.0f} nats a minute)"
+
+
+def of_law(law: Law, rivals: Sequence[Law], bench: Bench, final: Look) -> Experiment:
+    """The next experiment for a law of the disturbance.
+
+    Noise is the same whatever is driven, but for growth with the speed: there the maneuver is
+    taken whose speeds vary most, by the expected likelihood ratio ½ E[ρ - 1 - log ρ] of a variance
+    that follows the speed against one that doesn't.
+    """
+    slow = [r.name for r in rivals if r.name in _SLOW]
+    if law.name in _SLOW and slow:
+        return Experiment(f"to tell it from {slow[0]}: {_DEPTHS}", {})
+    if law.name == "disturbance_state_dependence":
+        k = law.parameters["growth"]
+        value = {t: _of_growth(k, v) / bench.data.dt * 60 for t, v in _speeds(bench, final).items()}
+        best = max(value, key=lambda trial: value[trial])
+        text = f"{TRIALS[best].text} (expected: {value[best]:.0f} nats a minute)"
+        return Experiment(f"to measure it better: {text}", value)
+    return Experiment(_BY_ITSELF[kind(law.name).family], {})
+
+
+def _of_growth(k: float, speed: Float[np.ndarray, " n"]) -> float:
+    grown = 1 + k * speed**2
+    ratio = grown / grown.mean()
+    return float(np.mean(ratio - 1 - np.log(ratio)) / 2)
+
+
+def _speeds(bench: Bench, final: Look) -> dict[str, Float[np.ndarray, " n"]]:
+    found: dict[str, list[np.ndarray]] = {}
+    for names, data in simulated(bench, final.theta):
+        speed = np.linalg.norm(data.V[:-1, :3], axis=1)
+        for r, name in enumerate(names):
+            if name:
+                found.setdefault(name, []).append(speed[data.weight[:, r] > 0, r])
+    joined = {name: np.concatenate(parts) for name, parts in found.items()}
+    return {name: v for name, v in joined.items() if len(v)}

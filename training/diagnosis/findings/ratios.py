@@ -1,0 +1,136 @@
+"""What motion tells of a vehicle whatever its mass: coefficients over inertia.
+
+Forces and masses that are all larger by one factor move alike, so data tell coefficients in
+proportion to inertia only. Intervals are those of the likelihood (inverse of its curvature, the
+correlation of errors in time taken off) by the delta method or, where they are wider, of scores
+that differ from piece to piece (Huber 1967); a coefficient at its physical limit is taken for
+known.
+"""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ....models import se3
+from ....models.effects.base import AXES
+from ....models.effects.extended import Extended
+from ....models.rigid_body import FossenDynamics
+from ..filter.problem import Bench, Look
+from . import result
+
+_TILT = 1e-3
+_HALF = 200.0
+"""µs from neutral at half command."""
+_STEP = 0.1
+"""Standard errors by which parameters are moved for the derivative of a ratio."""
+_SMALL = 1e-9
+_UNITS = {
+    "inertia": ("1", "1"),
+    "quadratic_drag": ("1/m", "1"),
+    "linear_drag": ("1/s", "1/s"),
+    "half_thrust": ("m/s²", "rad/s²"),
+    "thrust": ("m/s²", "rad/s²"),
+    "restoring": ("", "rad/s²"),
+    "net_buoyancy": ("m/s²", ""),
+}
+"""Of translations and of rotations."""
+
+
+def ratios(bench: Bench, look: Look, rows: Sequence[int]) -> list[result.Ratio]:
+    """Believed and found ratios by axis; `rows` are the parameters that were fitted.
+
+    `inertia` is in proportion to surge's (of rotations to roll's), everything else over the
+    axis' inertia; `half_thrust` is the acceleration when all thrusters push along the axis at
+    half command, for commands by PWM, `thrust` that at the commands' RMS where they are forces or
+    wrenches. Empty for a base without constant coefficients.
+    """
+    if not isinstance(bench.model.base, FossenDynamics) or not rows:
+        return []
+    numbers, theta = _numbers(bench), look.theta
+    mean, before = numbers(theta), numbers(bench.believed)
+    low, high = bench.limits(rows)
+    at = theta[list(rows)]
+    free = [
+        i for i, a, b, x in zip(rows, low, high, at, strict=True) if a < x - _SMALL < b - _SMALL
+    ]
+    columns = [look.evidence.column(i) for i in free]
+    H = look.evidence.total[np.ix_(columns, columns)] + np.diag(look.evidence.prior(free))
+    # principal directions, each moved by a share of its standard error
+    values, vectors = np.linalg.eigh(H)
+    roots = vectors / np.sqrt(np.maximum(values, 1e-300))
+    scores = look.evidence.runs[:, columns, 0] @ roots
+    scores = scores - scores.mean(axis=0)
+    slopes: dict[tuple[str, str], list[float]] = {key: [] for key in mean}
+    for direction in roots.T:
+        moved = theta.copy()
+        moved[free] += _STEP * direction
+        for key, after in numbers(moved).items():
+            slopes[key].append((after - mean[key]) / _STEP)
+    found = []
+    for (name, where), value in mean.items():
+        slope = np.array(slopes[name, where])
+        error = 1.96 * float(np.sqrt(max(slope @ slope, np.sum((scores @ slope) ** 2))))
+        unit = _UNITS[name][where in AXES[3:]]
+        told = result.Value(value, unit, (value - error, value + error))
+        found.append(result.Ratio(name, where, before[name, where], told))
+    return found
+
+
+def _numbers(bench: Bench) -> Callable[[np.ndarray], dict[tuple[str, str], float]]:
+    """A function from θ to all ratios."""
+    data = bench.data
+    thrusters = bench.vehicle.thrusters()
+    volts = float((data.voltage * data.weight).sum() / data.weight.sum())
+    nominal = float(thrusters.nominal_voltage)
+    identity = se3.identity(jnp.float64)
+    B = np.asarray(bench.model.allocate(jnp.eye(data.u.shape[1])))
+    along = np.sign(np.round(B, 9))
+    usual = np.sqrt((data.u**2 * data.weight[:, None]).sum(axis=(0, 2)) / data.weight.sum())
+
+    @eqx.filter_jit
+    def at_rest(model: Extended, effects: tuple, X: Array) -> Array:
+        """Wrench without motion and command."""
+        still, model = jnp.zeros(6), model.with_effects(effects)
+        _, wrench = model.base.balance(X, still, jnp.zeros(6))
+        return wrench + model.extra_wrench(X, still)
+
+    @eqx.filter_jit
+    def pushed(model: Extended, effects: tuple, commands: Array) -> Array:
+        """Wrenches (6, 6) of commands for all thrusters (6, n)."""
+        still, model = jnp.zeros(6), model.with_effects(effects)
+
+        def wrench(command: Array) -> Array:
+            volt = jnp.full(len(command), volts * nominal)
+            force = thrusters.force(command, volt) if data.command == "pwm" else command
+            given = model.thrust(force, still, jnp.array([volts]))
+            return model.together(model.allocate(given))
+
+        return jax.vmap(wrench)(commands)
+
+    def numbers(theta: Float[np.ndarray, " p"]) -> dict[tuple[str, str], float]:
+        effects = bench.library.filled(theta)
+        inertia = np.diag(bench.mass(theta))
+        level = at_rest(bench.model, effects, identity)
+        found = {("inertia", a): inertia[i] / inertia[i // 3 * 3] for i, a in enumerate(AXES)}
+        for name in ("quadratic_drag", "linear_drag"):
+            for i, axis in enumerate(AXES):
+                change = theta[bench.library.index(name, axis, "change")]
+                value = bench.believes(name, axis) + change
+                found[name, axis] = float(value / inertia[i])
+        pwm = data.command == "pwm"
+        commands = 1500.0 + _HALF * along if pwm else usual * along
+        F = np.asarray(pushed(bench.model, effects, jnp.asarray(commands)))
+        for i, axis in enumerate(AXES):
+            found["half_thrust" if pwm else "thrust", axis] = float(F[i, i] / inertia[i])
+        for i, axis in ((3, "roll"), (4, "pitch")):
+            tilted = se3.retract(identity, jnp.zeros(6).at[i].set(_TILT))
+            less = level[i] - at_rest(bench.model, effects, tilted)[i]
+            found["restoring", axis] = float(less / _TILT / inertia[i])
+        found["net_buoyancy", "heave"] = float(level[2] / inertia[2])
+        return found
+
+    return numbers

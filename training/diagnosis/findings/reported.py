@@ -1,0 +1,356 @@
+"""A finding in words and numbers: causes with intervals, what is left, what was refitted."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+from jaxtyping import Float
+
+from ....models.effects.base import AXES, Effect
+from ....models.effects.library import kind
+from ..data.repeats import repeating
+from ..disturbance.laws import Law, estimated, run_constants
+from ..filter.problem import Bench, Look
+from ..selection.hypotheses import Fit
+from ..selection.model_selection import Choice, parameters_of
+from ..selection.search import Found
+from . import result
+from .experiments import Experiment, of_law
+
+CHANNELS = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
+_NAN = float("nan")
+_SCALE = 0.01
+"""Spread of thrust between runs that is tried first."""
+_FOLLOWING, _SEVERAL = 0.5, 3
+"""Correlation of neighbouring errors that is no chance, and velocities that have it."""
+
+
+def quantile(fit: Fit) -> float:
+    """Of Student's t for 95 % intervals: clusters less parameters are its degrees of freedom."""
+    return float(scipy.stats.t.ppf(0.975, max(len(fit.heldout) - len(fit.parameters), 1)))
+
+
+def unit(of: str, where: str) -> str:
+    """The unit at one place, of a parameter whose unit differs between moving and turning.
+
+    A coefficient of one axis by the motion on another (`sway_from_yaw`) has the units of both.
+    """
+    both = of.split(" or ")
+    axis, _, source = where.partition("_from_")
+    if len(both) == 2:
+        return both[axis in AXES[3:] or where == "munk"]
+    if source:
+        force, _, speed = of.partition("/")
+        force = force.replace("N", "N·m") if axis in AXES[3:] else force
+        speed = speed.replace("m", "rad") if source in AXES[3:] else speed
+        return f"{force}/{speed}"
+    return of
+
+
+def values_of(
+    bench: Bench, theta: Float[np.ndarray, " p"], rows: Sequence[int], joint: Fit
+) -> dict[str, result.Value]:
+    """Parameters with intervals from the joint fit of all that is free, clustered by run."""
+    t = quantile(joint)
+    found = {}
+    for i in rows:
+        p = bench.library.entries[i].parameter
+        v = p.usual + float(theta[i])
+        error = t * float(joint.errors[joint.parameters.index(i)])
+        told = unit(p.unit, bench.library.entries[i].where)
+        found[p.name] = result.Value(v, told, (v - error, v + error))
+    return found
+
+
+def _assumed(bench: Bench, name: str, where: str) -> dict[str, result.Value]:
+    """What a cause's parameters refer to, without an interval."""
+    own = (e for e in bench.library.effects if e.name == name and where in e.places)
+    told = next(own).assumed(where)
+    return {what: result.Value(at, unit, (_NAN, _NAN)) for what, (at, unit) in told.items()}
+
+
+def cause(
+    choice: Choice,
+    bench: Bench,
+    look: Look,
+    joint: Fit,
+    experiment: Experiment,
+    structure: result.Structure | None = None,
+) -> result.Cause:
+    """A named cause; `joint` is the fit of all accepted parameters together."""
+    name, where = choice.hypothesis
+    rivals = [result.Rival(h[0], h[1], float(g)) for h, g in choice.rivals]
+    return result.Cause(
+        name=name,
+        where=where,
+        parameters=values_of(bench, look.theta, bench.library.at(name, where), joint)
+        | _assumed(bench, name, where),
+        evidence=result.Support(choice.p_value, choice.fit.heldout_gain),
+        rivals=rivals,
+        indistinguishable_from=list(
+            dict.fromkeys(other if other != name else f"{name} ({at})" for other, at in choice.ties)
+        ),
+        next_experiment=experiment.text,
+        experiments=experiment.nats,
+        structure=structure,
+    )
+
+
+def refitted(bench: Bench, look: Look, rows: Sequence[int], joint: Fit) -> list[result.Refitted]:
+    """Coefficients that were fitted beside the causes: believed and found."""
+    found = []
+    t = quantile(joint) if rows else 0.0
+    for i in rows:
+        e = bench.library.entries[i]
+        old = bench.believes(e.cause, e.where)
+        new = old + float(look.theta[i] - bench.believed[i])
+        error = t * float(joint.errors[joint.parameters.index(i)])
+        value = result.Value(new, unit(e.parameter.unit, e.where), (new - error, new + error))
+        found.append(result.Refitted(e.cause, e.where, e.parameter.name, old, value))
+    return found
+
+
+def residual(bench: Bench, look: Look) -> dict[str, result.AxisResidual]:
+    """What is left, channel by channel; not a number where nothing was measured."""
+    n, correlation = bench.data.weight.sum(), look.correlation
+    found = {}
+    for i, name in enumerate(CHANNELS):
+        z = look.z[:, i]
+        mean = float(z.sum() / np.sqrt(n))
+        values = float((z**2).sum()) / n, float(correlation[i]), mean
+        found[name] = result.AxisResidual(*(values if bench.data.told[i] else [np.nan] * 3))
+    return found
+
+
+def left_over(
+    residual: Mapping[str, result.AxisResidual],
+    causes: Sequence[result.Cause],
+    bench: Bench,
+    look: Look,
+    least: float,
+) -> list[str]:
+    """What the causes leave that is no noise, in words."""
+    left = following(residual, causes)
+    if look.noise.estimated:
+        return left
+    alike = repeating(look.z, bench.data)
+    if alike:
+        left.append(
+            f"errors of {', '.join(alike)} repeat from run to run under the same commands (up to "
+            f"{max(alike.values()):.1f} times what chance makes): the simulation lacks something "
+            "there that follows the commands"
+        )
+    gain, std = thrust_by_run(bench, look)
+    if gain > max(least, *(c.evidence.heldout_gain for c in causes if _is_random(c.name)), 0.0):
+        when = "within the run" if bench.data.left_out == "block" else "from run to run"
+        left.append(
+            f"thrust differs {when} (by {100 * std:.1f} %, standard deviation), as with a supply "
+            "voltage that was not recorded or a thruster that fails"
+        )
+    return left
+
+
+def _is_random(name: str) -> bool:
+    return name in ("waves", "current_varying") or kind(name).family == "disturbance"
+
+
+def thrust_by_run(bench: Bench, look: Look) -> tuple[float, float]:
+    """Nats that a thrust scale of each run's own wins on data left out, and how they spread."""
+    evidence, at = look.plain, bench.library.at("thrust_scale", "all")
+    if not set(at) <= set(evidence.design.owner.tolist()) or len(evidence.runs) < 3:
+        return 0.0, 0.0
+    columns, size = [evidence.column(i) for i in at], np.array([_SCALE])
+    gain, values, _ = run_constants(evidence.runs, columns, size, evidence.fold)
+    return float(gain.sum()), values["std"]
+
+
+def following(
+    residual: Mapping[str, result.AxisResidual], causes: Sequence[result.Cause]
+) -> list[str]:
+    """What errors that follow each other say: velocities' alone, and of no law that was named.
+
+    A filter's estimates err slowly in the positions too.
+    """
+    lasting = ("disturbance", "environment")
+    if any(kind(c.name).family in lasting for c in causes if c.name != "unknown"):
+        return []
+    alike = {name: residual[name].autocorrelation for name in CHANNELS}
+    of = [name for name in CHANNELS[6:] if alike[name] > _FOLLOWING]
+    if len(of) < _SEVERAL or any(abs(alike[name]) > _FOLLOWING / 2 for name in CHANNELS[:3]):
+        return []
+    return [
+        f"errors of {', '.join(of)} follow each other (correlations up to "
+        f"{max(alike[n] for n in of):.2f}): the simulation lacks something large that has no name "
+        "here, or commands have other units, signs or frames than it believes"
+    ]
+
+
+# ------------------------------------------------------------------------------------- laws
+
+
+def law_cause(
+    laws: Sequence[Law], rivals: Sequence[Law], bench: Bench, look: Look
+) -> tuple[result.Cause, Effect]:
+    """Laws of one name as a cause, axis by axis, and the effect that has them."""
+    same = sorted(laws, key=lambda law: law.where in AXES[3:])  # newtons before newton metres
+    top = max(laws, key=lambda law: law.heldout_gain)
+    experiment = of_law(top, rivals, bench, look)
+    parameters: dict[str, result.Value] = {}
+    cls = kind(top.name)
+    values = np.zeros(cls.size())
+    for number, law in enumerate(same):
+        for name, told in _law_values(law, bench, look).items():
+            parameters[name if number == 0 else f"{name}_{law.where}"] = told
+            values[cls.index(law.where, name)] = told.value
+    named = result.Cause(
+        name=top.name,
+        where=", ".join(law.where for law in same),
+        parameters=parameters,
+        evidence=result.Support(float(np.exp(-top.heldout_gain)), top.heldout_gain),
+        rivals=[result.Rival(r.name, r.where, r.heldout_gain) for r in rivals[:4]],
+        indistinguishable_from=[],
+        next_experiment=experiment.text,
+        experiments=experiment.nats,
+    )
+    return named, cls(jnp.asarray(values))
+
+
+def _law_values(law: Law, bench: Bench, look: Look) -> dict[str, result.Value]:
+    """A law's numbers in the units of its effect, with intervals by the delta method."""
+    data = bench.data
+    units = {p.name: unit(p.unit, law.where) for p in kind(law.name).parameters}
+    if law.errors is not None:
+        spreads = {name: 1.96 * law.errors[name] for name in law.parameters}
+        return {
+            name: result.Value(v, units[name], (v - spreads[name], v + spreads[name]))
+            for name, v in law.parameters.items()
+        }
+    cluster = data.cluster
+    if law.loss is not None and len(law.heldout) != len(cluster):
+        cluster = np.arange(len(law.heldout))
+    at, covariance = estimated(law, cluster)
+    once, steady = _responses(bench, look, law.where)
+
+    def physical(x: np.ndarray) -> np.ndarray:
+        v = np.exp(x)
+        if law.name == "disturbance_impacts":
+            share, size, rest = v[:3]
+            return np.array([np.sqrt(max(size**2 - rest**2, 1e-12)) / once, share / data.dt])
+        if law.name == "disturbance_colour":
+            tau, kappa = v[0], min(v[1], 0.99)
+            rho = np.exp(-data.dt / tau)
+            square = (kappa / (1 - kappa) - rho**2 * kappa) / (1 - rho**2)
+            return np.array([np.sqrt(square) / steady, tau])
+        return v
+
+    values, D = physical(at), []
+    for d in 1e-4 * np.eye(len(at)):
+        D.append((np.log(physical(at + d)) - np.log(physical(at - d))) / 2e-4)
+    spread = np.sqrt(np.maximum(np.diag(np.array(D).T @ covariance @ np.array(D)), 0))
+    found = {}
+    for name, value, s in zip(units, values, spread, strict=False):
+        low, high = value * np.exp(-1.96 * s), value * np.exp(1.96 * s)
+        found[name] = result.Value(float(value), units[name], (float(low), float(high)))
+    if law.name == "current_varying":
+        least = float(data.weight.sum(axis=0).mean() * data.dt)  # it stays over a run
+        found["time_constant"] = result.Value(least, "s", (_NAN, _NAN))
+    return found
+
+
+def _responses(bench: Bench, look: Look, axis: str) -> tuple[float, float]:
+    """Whitened innovation on an axis for a unit impulse, and in the end for a unit wrench."""
+    if axis not in AXES:
+        return 1.0, 1.0
+    i, dt = AXES.index(axis), bench.data.dt
+    a = np.linalg.inv(bench.mass(look.theta))[:, i]
+    d = np.concatenate([dt * dt / 2 * a, dt * a])
+    w = bench.data.weight
+    A = np.einsum("nijr,nr->ij", np.asarray(look.predictions.jacobian), w) / w.sum()
+    white, keep = (k[-1].mean(axis=-1) for k in (look.kalman.whiten, look.kalman.keep))
+    lasting = np.linalg.solve(np.eye(12) - A @ keep, d)
+    return abs(float((white @ d)[6 + i])) / dt, abs(float((white @ lasting)[6 + i]))
+
+
+# -------------------------------------------------------------------------------- sentences
+
+
+def verdict(causes: Sequence[result.Cause], left: Sequence[str] = ()) -> result.Verdict:
+    """What the causes amount to, and what they leave (`left_over`)."""
+    unknown = [c.name == "unknown" for c in causes]
+    if not causes:
+        return "unexplained" if left else "adequate"
+    if not any(unknown):
+        return "partly_explained" if left else "explained"
+    return "unexplained" if all(unknown) else "partly_explained"
+
+
+def sentence(
+    causes: Sequence[result.Cause],
+    problems: Sequence[str],
+    refitted: bool = False,
+    left: Sequence[str] = (),
+) -> str:
+    """The finding in a line or two; `refitted` if coefficients were fitted first."""
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    first = f"The data have faults: {problems[0]}{more}. " if problems else ""
+    if not causes and left:
+        return first + f"No name explains the data: {left[0]}."
+    if not causes and refitted:
+        return first + "With its coefficients refitted, your model is adequate at this noise."
+    if not causes:
+        return first + "Your model is adequate at this noise."
+    named = ", ".join(f"{c.name} ({c.where})" for c in causes if c.name != "unknown")
+    subject = "your model, its coefficients refitted," if refitted else "your model"
+    told = f"The data differ from {subject} by: {named}." if named else ""
+    for c in causes:
+        if c.structure is not None:
+            told += f" No name explains {c.structure.description}."
+    told += "".join(f" But {one}." for one in left)
+    return first + told.strip()
+
+
+def with_coefficients_off(diagnosis: result.Diagnosis) -> result.Diagnosis:
+    """The finding on a belief whose coefficients explain what it gets wrong."""
+
+    def factor(r: result.Ratio) -> float:
+        """How far off; what has the other sign counts for most."""
+        share = r.found.value / r.believed
+        return abs(np.log(share)) if share > 0 else np.inf
+
+    off: dict[str, result.Ratio] = {}  # of each kind the one that is off most
+    for r in diagnosis.ratios:
+        low, high = r.found.interval95
+        turned = r.believed * r.found.value < 0 and not low <= 0 <= high
+        if turned or (r.believed * r.found.value > 0 and not low <= r.believed <= high):
+            off[r.name] = max(off.get(r.name, r), r, key=factor)
+    units = {"1": ""}
+    told = "; ".join(
+        f"{r.name} of {r.where} {r.found.value:.3g} {units.get(r.found.unit, r.found.unit + ' ')}"
+        f"(believed: {r.believed:.3g})"
+        for r in sorted(off.values(), key=factor, reverse=True)
+    )
+    most = f" Over inertia, of each kind the most: {told}." if told else ""
+    return replace(
+        diagnosis,
+        sentence=f"Your model is wrong in most of its coefficients.{most} {diagnosis.sentence}",
+        verdict="explained" if diagnosis.verdict == "adequate" else diagnosis.verdict,
+    )
+
+
+def noise_words(bench: Bench, look: Look) -> dict[str, float]:
+    """Levels of noise, mean over the axes of a sensor."""
+    groups = ("position_m", "attitude_rad", "velocity_m_s", "rate_rad_s")
+    found = {g: float(np.mean(look.noise.record[3 * i : 3 * i + 3])) for i, g in enumerate(groups)}
+    if bench.data.unmeasured:
+        del found["position_m"]
+    return found | {
+        f"diffusion_{a}": float(b) for a, b in zip(AXES, look.noise.diffusion, strict=True)
+    }
+
+
+def joint_rows(found: Found, nuisance: Sequence[int], bench: Bench) -> list[int]:
+    """All parameters that are free in the end."""
+    rows = [*parameters_of(bench.library, found.hypotheses), *nuisance]
+    return list(dict.fromkeys(rows))

@@ -1,0 +1,347 @@
+"""What a diagnosis says: the content of `diagnosis.json`, and its schema."""
+
+import dataclasses
+import inspect
+import json
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from ....models.files.atomic import atomic_path
+
+Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
+VERSION = 4
+
+
+@dataclass(frozen=True)
+class Value:
+    """An estimate with its 95 % interval.
+
+    Attributes:
+        value: the estimate, in `unit`.
+        unit: as text; 1 where it has none.
+        interval95: lower and upper end, in `unit`; of Student's t, clustered by runs.
+    """
+
+    value: float
+    unit: str
+    interval95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Support:
+    """Why a cause is believed: a p value for all names together, and nats on data left out.
+
+    The p value is of a test clustered by runs; where few runs bound it, and the gain is clear (1.5
+    to 5 times what noise wins), of the gain less that factor in noise alone.
+
+    Attributes:
+        p_value: probability that noise alone makes one of all names look so good; 0 where below
+            1e-300.
+        heldout_gain: log likelihood won on data left out of the fit (nats, in all).
+    """
+
+    p_value: float
+    heldout_gain: float
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another name and what it would have won.
+
+    Attributes:
+        name: of the effect.
+        where: axis, thruster or frame, as of a cause.
+        heldout_gain: what it would have won in the cause's place on data left out (nats, in all).
+    """
+
+    name: str
+    where: str
+    heldout_gain: float
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What no name explains, as far as data tell where it lives.
+
+    Attributes:
+        acts_on: axes, thruster or frame that feel it.
+        variables: what it depends on, most telling first.
+        description: one sentence.
+        lag: time over which it remembers (s), if it does.
+        frequency: at which it rings (Hz), if it does.
+        region: of each variable, where it was seen: 2nd and 98th percentile (m, rad, m/s, rad/s,
+            N).
+        heldout_gain: won on data left out (nats, in all).
+        best_name_gain: what the best name would have won of them (nats, in all).
+    """
+
+    acts_on: str
+    variables: list[str]
+    description: str
+    lag: float | None
+    frequency: float | None
+    region: dict[str, tuple[float, float]]
+    heldout_gain: float
+    best_name_gain: float
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One named cause.
+
+    Attributes:
+        name: of the effect, or `unknown` for structure without a name.
+        where: axis, thruster (1 to n, or `all`) or frame it is in.
+        parameters: estimates by name, each with its unit.
+        evidence: why it is believed.
+        rivals: names that would have won most in its place, best first.
+        indistinguishable_from: names that these data can't tell it from; of its own also the place.
+        next_experiment: what would tell it from what it is confused with, in words.
+        experiments: nats a minute that each maneuver of a set is expected to tell by; empty where
+            maneuvers make no difference.
+        structure: what is known of structure without a name; null for a name.
+    """
+
+    name: str
+    where: str
+    parameters: dict[str, Value]
+    evidence: Support
+    rivals: list[Rival]
+    indistinguishable_from: list[str]
+    next_experiment: str
+    experiments: dict[str, float] = field(default_factory=dict)
+    structure: Structure | None = None
+
+
+@dataclass(frozen=True)
+class AxisResidual:
+    """What is left on an axis, against what the noise explains.
+
+    Attributes:
+        variance_ratio: innovations' variance over the predicted one, dimensionless; 1 is all
+            explained, null (all three) what was not measured.
+        autocorrelation: of innovations one step apart, dimensionless; 0 for white.
+        mean: of innovations, in standard errors of a mean of independent numbers.
+    """
+
+    variance_ratio: float
+    autocorrelation: float
+    mean: float
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number with its 95 % interval by bootstrap over what was left out in turn.
+
+    Attributes:
+        value: in the unit of the field that holds it; null of simulations that diverged.
+        interval95: lower and upper end, in the same unit.
+    """
+
+    value: float
+    interval95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class ModelGain:
+    """A model on data left out of its fit; horizons are seconds as text.
+
+    Attributes:
+        log_score: log density of the innovations (nats a sample); larger is better.
+        log_score_gain: what it wins over the base (nats a sample).
+        energy_score: by horizon, of simulations with noise: their mean distance from the record
+            less half their mean distance from each other, m, rad, m/s and rad/s counted alike;
+            smaller is better.
+        position_rmse: by horizon, root mean square error of noise-free simulations (m).
+        rotation_rmse: by horizon, of the rotation (rad).
+        velocity_rmse: by horizon, of the velocity (m/s).
+        coverage: by band (`50 %`, `90 %`) and horizon, share of records inside the band, 0 to 1,
+            mean over axes.
+    """
+
+    log_score: Interval
+    log_score_gain: Interval
+    energy_score: dict[str, Interval]
+    position_rmse: dict[str, Interval]
+    rotation_rmse: dict[str, Interval]
+    velocity_rmse: dict[str, Interval]
+    coverage: dict[str, dict[str, Interval]]
+
+
+@dataclass(frozen=True)
+class Refitted:
+    """A coefficient that was fitted before any cause was named: believed and fitted value.
+
+    Attributes:
+        name: of the effect that changes it.
+        where: axis or thruster.
+        parameter: of the effect.
+        believed: value of the belief, in the unit of `fitted`.
+        fitted: value found.
+    """
+
+    name: str
+    where: str
+    parameter: str
+    believed: float
+    fitted: Value
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A coefficient over inertia, which data tell whatever the mass: believed and found.
+
+    Attributes:
+        name: of the coefficient.
+        where: axis.
+        believed: value of the belief, in the unit of `found`.
+        found: value found.
+    """
+
+    name: str
+    where: str
+    believed: float
+    found: Value
+
+
+@dataclass(frozen=True)
+class DataSummary:
+    """What was there, what was missing, what could not be told.
+
+    Attributes:
+        scenarios: names.
+        runs: how many were looked at.
+        seconds: time of theirs that is predicted (s).
+        step: mean time between samples (s).
+        command: what commands were made of: thruster_force, pwm or F_Bo_B.
+        problems: faults of the data, a sentence each.
+        limits: what these data can't tell, a sentence each.
+        noise: estimated levels: standard deviations of the records, mean over axes (`position_m`,
+            `attitude_rad`, `velocity_m_s` in m/s, `rate_rad_s` in rad/s), and the diffusion of
+            the disturbance (`diffusion_surge`, sway, heave in N√s; roll, pitch, yaw in N·m√s).
+    """
+
+    scenarios: list[str]
+    runs: int
+    seconds: float
+    step: float
+    command: str
+    problems: list[str]
+    limits: list[str]
+    noise: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The whole finding.
+
+    Attributes:
+        version: of this format.
+        verdict: adequate (no cause), explained (all by names, or by coefficients), partly_explained
+            (names and `unknown`), unexplained (`unknown` alone).
+        sentence: the verdict in words.
+        causes: what is named, first found first.
+        refitted: coefficients fitted before any cause was named.
+        ratios: what such a fit tells whatever the mass; with `--refit all` only.
+        residual: what the causes leave, by channel: x, y, z, roll, pitch, yaw, u, v, w, p, q, r.
+        gain: of base (the belief), refitted (its coefficients fitted, no cause named), extended
+            (with the causes, where there are any) and black_box (a regression beside the belief).
+        left_out: what was left out in turn, for gains here and in causes.
+        data: what was looked at.
+        tested: names tried.
+        threshold: what noise alone wins of so many names as often as `alpha` says (nats, in all).
+        alpha: rate of false alarms over all names together.
+        seconds: that it took (s).
+    """
+
+    version: int
+    verdict: Verdict
+    sentence: str
+    causes: list[Cause]
+    refitted: list[Refitted]
+    ratios: list[Ratio]
+    residual: dict[str, AxisResidual]
+    gain: dict[str, ModelGain]
+    left_out: Literal["scenario", "run", "block", "nothing"]
+    data: DataSummary
+    tested: int
+    threshold: float
+    alpha: float
+    seconds: float = field(default=0.0)
+
+    def as_json(self) -> str:
+        """Text of `diagnosis.json`; numbers that are not finite become null."""
+        return json.dumps(_plain(dataclasses.asdict(self)), indent=2, ensure_ascii=False) + "\n"
+
+    def save(self, path: Path) -> None:
+        """Write it as JSON; whole or not at all."""
+        with atomic_path(path) as partial:
+            partial.write_text(self.as_json(), encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def schema(cls: Any = Diagnosis) -> dict[str, Any]:
+    """JSON Schema (2020-12) of `diagnosis.json`, from the dataclasses themselves."""
+    definitions: dict[str, Any] = {}
+    body = _schema(cls, definitions)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **body, "$defs": definitions}
+
+
+def described(cls: type) -> dict[str, str]:
+    """Each field's description, from the attributes in a dataclass' docstring."""
+    text = inspect.cleandoc(cls.__doc__ or "").partition("Attributes:\n")[2]
+    entries = re.findall(r"^    (\w+): (.*(?:\n        .*)*)", text, re.MULTILINE)
+    return {name: " ".join(words.split()) for name, words in entries}
+
+
+def _schema(kind: Any, definitions: dict[str, Any]) -> dict[str, Any]:
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+        name = kind.__name__
+        if name not in definitions:
+            definitions[name] = {}
+            hints, told = get_type_hints(kind), described(kind)
+            definitions[name] = {
+                "type": "object",
+                "description": (kind.__doc__ or "").split("\n")[0],
+                "properties": {
+                    k: {**_schema(v, definitions), "description": told.get(k, "")}
+                    for k, v in hints.items()
+                },
+                "required": [f.name for f in dataclasses.fields(kind)],
+                "additionalProperties": False,
+            }
+        return {"$ref": f"#/$defs/{name}"}
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return {"enum": list(arguments)}
+    if origin is list:
+        return {"type": "array", "items": _schema(arguments[0], definitions)}
+    if origin is tuple:
+        size = len(arguments)
+        items = _schema(arguments[0], definitions)
+        return {"type": "array", "items": items, "minItems": size, "maxItems": size}
+    if origin is dict:
+        return {"type": "object", "additionalProperties": _schema(arguments[1], definitions)}
+    if origin in (Union, UnionType):
+        return {"anyOf": [_schema(a, definitions) for a in arguments]}
+    plain = {
+        float: ["number", "null"],
+        int: "integer",
+        str: "string",
+        bool: "boolean",
+        type(None): "null",
+    }
+    return {"type": plain[kind]}

@@ -1,0 +1,423 @@
+"""From a recording and a belief to named causes."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ...models.config.checks import check_numbers, require, require_rate
+from ...models.config.errors import UserError
+from ...models.dynamics import Dynamics
+from ...models.effects.base import AXES, Effect
+from ...models.effects.extended import Extended
+from ...models.effects.library import Library
+from ...models.effects.thrust import AxisThrust
+from ...models.recordings.store import Recording
+from ...models.vehicles.vehicle import Vehicle
+from .candidates.unknowns import accept, seek, structure
+from .data.arrays import Data
+from .data.checks import SPARSE, limits, problems, require_enough, unexcited
+from .disturbance.found import OF_OTHERS, all_laws, best_law, passing
+from .disturbance.found import told as told_laws
+from .disturbance.laws import Law
+from .disturbance.levels import LEVEL
+from .filter.problem import Bench, Look
+from .findings import reported as telling
+from .findings import result
+from .findings.experiments import experiments
+from .findings.ratios import ratios
+from .selection.hypotheses import Fit
+from .selection.model_selection import Hypothesis, parameters_of
+from .selection.refit_all import identify, with_coefficients
+from .selection.search import Found, Search, refitted
+from .validation.blackbox import train
+from .validation.validation import Contender, Simulated, judge, told, white_part
+
+Progress = Callable[[float, str], None]
+Refit = Literal["auto", "none", "scales", "linear", "command", "all"]
+_CLEARLY, _MANY = 0.05, 3
+"""Nats a sample that coefficients fitted to other runs must win over all causes together before a
+belief counts as wrong in most of them, and causes beyond which it may be."""
+_MOST_UNKNOWN, _NAMES_FIRST = 2, 2
+"""Structures without a name at most, and names after which the first is looked for where more names
+are to come: what has none takes many."""
+_RIVALS = 0.25
+"""Share of what the best law wins below which names leave it to structure without a name."""
+_RESAMPLED, _OF_A_STEP, _NO_TIME = 0.02, 0.1, 0.06
+"""Nats a sample that a law, and share of a step that a time must have, in resampled data; share of
+a step below which a time is none in any: a simulation of ten substeps a sample whose pose feels a
+push half a substep late shows, without noise, as a clock that is off by a twentieth of a step."""
+_OF_A_COMMAND = 0.1
+"""Share of the time between sparse commands that a time must have: interpolation shows as one."""
+_FINEST = 0.02
+"""Steps (s) of data that the extended model will be used on at least: delays are told by them."""
+_LAW_MARGIN = 5.0
+"""Nats above the threshold of names that a law must win: it is tried on a grid on every axis."""
+
+
+@dataclass(frozen=True)
+class DiagnoseConfig:
+    """How to look.
+
+    Attributes:
+        alpha: rate of false alarms over all names together.
+        refit: what is fitted before and beside every cause: `none` (every difference from the
+            belief is a cause), `scales` (one factor on all thrust), `linear` (added masses,
+            drag, buoyancy), `command` (a factor on the wrench of each axis, drag, buoyancy: for
+            commands of unknown scale; the inertia stays as believed) or `all` (these, the
+            thrusters' curve and levers, the centre of buoyancy: `identify`). `auto` is `none`
+            unless refitted coefficients forecast left-out runs clearly better than the causes
+            found: names don't explain a belief that is wrong in most of them, and `all` are fitted.
+        most: causes at most.
+        horizon: length of the simulations that the gain is told by (s).
+        seed: of bootstraps and simulated noise.
+    """
+
+    alpha: float = 0.01
+    refit: Refit = "auto"
+    most: int = 6
+    horizon: float = 4.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+        require_rate(self.alpha, "DiagnoseConfig.alpha")
+        require(self.most >= 1, self, "most", "give at least 1")
+        require(self.horizon > 0, self, "horizon", "give a positive time")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The diagnosis with what reports and the extended model need."""
+
+    diagnosis: result.Diagnosis
+    extended: Extended
+    library: Library
+    theta: Float[np.ndarray, " p"]
+    data: Data
+    base: Look
+    final: Look
+    fits: dict[Hypothesis, Fit]
+    laws: list[Law]
+    simulated: dict[str, Simulated]
+
+
+class Diagnoser:
+    """One recording under one belief, looked at once: a `refit` of `auto` is `none` here."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        vehicle: Vehicle,
+        base: Dynamics | None = None,
+        config: DiagnoseConfig | None = None,
+        progress: Progress = lambda fraction, remark: None,
+    ):
+        config = DiagnoseConfig() if config is None else config
+        self.config = replace(config, refit="none") if config.refit == "auto" else config
+        self.furthest = 0.0
+        self.tell = progress
+        self.faults, faulty = problems(recording)
+        self.bench = Bench.of(recording, vehicle, base, faulty)
+        require_enough(self.bench.data)
+        if self.config.refit == "command" and not self.bench.library.has("axis_thrust"):
+            self.bench = self.bench.with_effect(AxisThrust.neutral())
+        self.resampled = any("resampled" in note for note in recording.notes)
+        self.command_period = recording.command_period
+        directions = np.asarray(self.bench.model.allocate(jnp.eye(self.bench.data.u.shape[1])))
+        self.quiet = unexcited(self.bench.data, directions)
+        self.driven = len(self.quiet) < len(AXES)
+        if not self.driven:
+            self.faults.append(
+                f"{recording.commands[0]} never changes: what follows the commands can't be told; "
+                "check that the outputs of the runs were logged"
+            )
+        self.rng = np.random.default_rng(self.config.seed)
+
+    def progress(self, fraction: float, remark: str) -> None:
+        """Tell how far it is; it never goes back."""
+        self.furthest = max(self.furthest, fraction)
+        self.tell(self.furthest, remark)
+
+    def run(self) -> Finding:
+        """All of it."""
+        started = time.monotonic()
+        config, bench = self.config, self.bench
+        self.progress(0.02, "one-step predictions")
+        if config.refit == "all":
+            bench = self.bench = with_coefficients(bench)
+        base = first = self._believed(bench)
+        nuisance = refitted(bench, config.refit)
+        if nuisance:
+            first = self._refitted(bench)
+        found = Found(base, first, first)
+        bench, nuisance, structures = self._search(bench, nuisance, found)
+        self.progress(0.72, "all causes together")
+        rows = telling.joint_rows(found, nuisance, bench)
+        final = fitted = found.current
+        joint = None
+        if rows:
+            theta, fitted, joint = self._together(bench, found, rows)
+            final = bench.look(theta)
+        self.progress(0.78, "laws of the disturbance")
+        least = found.threshold + _LAW_MARGIN
+        if self.resampled:  # interpolation makes the noise uneven
+            least += _RESAMPLED * bench.data.steps
+        # what the names leave of their own is no law
+        least = max(least, OF_OTHERS * sum(choice.fit.heldout_gain for choice in found.accepted))
+        least = max(least, found.left_undescribed)
+        laws = [] if final.noise.estimated else all_laws(bench, final, least)
+        groups = told_laws(laws, bench, final, least)
+        shaped = [law for group in groups for law in group if law.name != LEVEL]
+        passed = passing(laws, bench, least)
+        tested = len(found.fits) + len(laws)
+        causes, stirring = [], []
+        if joint is not None:
+            self.progress(0.8, "what to do next")
+            following = experiments(bench, final, found.accepted, nuisance)
+            causes = [
+                telling.cause(
+                    a, bench, final, joint, following[a.hypothesis], structures.get(a.hypothesis)
+                )
+                for a in found.accepted
+            ]
+        for group in groups:
+            rivals = [law for law in passed if law.name != group[0].name]
+            law_cause, effect = telling.law_cause(group, rivals, bench, final)
+            causes.append(law_cause)
+            stirring.append(effect)
+        gain, simulated = self._gain(
+            bench, found, fitted, rows, shaped, tuple(stirring), bool(causes)
+        )
+        residual = telling.residual(bench, final)
+        left = telling.left_over(residual, causes, bench, final, least)
+        if not self.driven:
+            left.insert(0, "commands never change, so what follows them can't be told")
+        d = bench.data
+        diagnosis = result.Diagnosis(
+            version=result.VERSION,
+            verdict=telling.verdict(causes, left),
+            sentence=telling.sentence(causes, self.faults, bool(nuisance), left),
+            causes=causes,
+            refitted=[] if joint is None else telling.refitted(bench, final, nuisance, joint),
+            ratios=ratios(bench, fitted, rows) if config.refit == "all" else [],
+            residual=residual,
+            gain=gain,
+            left_out=d.left_out if len(np.unique(d.fold)) > 1 else "nothing",
+            data=result.DataSummary(
+                scenarios=list(d.names),
+                runs=len(np.unique(d.run)),
+                seconds=d.steps * d.dt,
+                step=d.dt,
+                command=d.command,
+                problems=self.faults,
+                limits=limits(
+                    d, self.quiet, self.resampled, final.noise.estimated, self.command_period
+                ),
+                noise=telling.noise_words(bench, final),
+            ),
+            tested=tested,
+            threshold=found.threshold,
+            alpha=config.alpha,
+            seconds=time.monotonic() - started,
+        )
+        extended = Extended.create(
+            bench.model.base,
+            (*bench.library.used(final.theta), *stirring),
+            bench.vehicle.thrusters(),
+        ).for_steps_of(_FINEST)
+        return Finding(
+            diagnosis, extended, bench.library, final.theta, d, base, final, found.fits, laws,
+            simulated,
+        )  # fmt: skip
+
+    def _believed(self, bench: Bench) -> Look:
+        try:
+            return bench.look(bench.believed)
+        except FloatingPointError as error:
+            raise UserError(
+                f"{error} within a step of {bench.data.longest:.3g} s from recorded states: the "
+                "believed model is unstable on these data; check units of commands and twists, or "
+                "give a --vehicle or --model that is near"
+            ) from error
+
+    def _refitted(self, bench: Bench) -> Look:
+        """The belief with the coefficients fitted that are asked for."""
+        if self.config.refit == "all":
+            remark = "all coefficients together"
+            return bench.look(identify(bench, lambda f: self.progress(0.03 + 0.07 * f, remark)))
+        rows = refitted(bench, self.config.refit)
+        return bench.look(bench.polish(bench.believed, rows)[0])
+
+    def _together(
+        self, bench: Bench, found: Found, rows: list[int]
+    ) -> tuple[np.ndarray, Look, Fit]:
+        """All causes and what is refitted beside them, fitted jointly."""
+        if self.config.refit != "all":
+            return bench.polish(found.current.theta, rows)
+        causes = parameters_of(bench.library, found.hypotheses)
+        theta = identify(bench, start=found.current.theta, also=causes)
+        fitted = bench.look(theta, rows)
+        return theta, fitted, fitted.evidence.fit(rows)
+
+    def _within(self, low: float, high: float) -> Progress:
+        return lambda fraction, remark: self.progress(low + (high - low) * fraction, remark)
+
+    def _names(self, bench: Bench, nuisance: list[int], low: float, high: float) -> Search:
+        config, within = self.config, self._within(low, high)
+        shortest = (_OF_A_STEP if self.resampled else _NO_TIME) * bench.data.dt
+        if self.command_period > SPARSE * bench.data.dt:
+            shortest = max(shortest, _OF_A_COMMAND * self.command_period)
+        return Search(
+            bench, nuisance, config.alpha, config.most, self.rng, within, self.quiet, shortest
+        )
+
+    def _search(
+        self, bench: Bench, nuisance: list[int], found: Found
+    ) -> tuple[Bench, list[int], dict[Hypothesis, result.Structure]]:
+        """Names, structure without a name, and names beside it; it widens the library by an effect.
+
+        Where a law of the disturbance wins far more than any name, structure is looked for first;
+        where more than two names are needed, it is looked for before the third.
+        """
+        config, structures = self.config, {}
+        search = self._names(bench, nuisance, 0.1, 0.5)
+        choice, found.left = search.next(found)
+        found.fits = found.left
+        best = 0.0 if choice is None else choice.fit.heldout_gain
+        law = best_law(bench, found.first)
+        seen = None
+        if _RIVALS * law < max(best, found.threshold + _LAW_MARGIN):
+            bench = search.run(found, _NAMES_FIRST).bench
+            if len(found.accepted) == _NAMES_FIRST and search.next(found)[0] is not None:
+                found.left = search.next(found)[1]
+                seen = seek(bench, nuisance, found, config.alpha, self.rng, self.quiet)
+            if found.accepted or seen is None:  # else in place of names
+                seen = None
+                bench = search.run(found).bench
+        for number in range(_MOST_UNKNOWN):
+            self.progress(0.52 + 0.1 * number, "structure without a name")
+            if seen is None:
+                seen = seek(bench, nuisance, found, config.alpha, self.rng, self.quiet)
+            taken = {e.places[0] for e in bench.library.effects if e.name == "unknown"}
+            if seen is None or seen.matched.group.effect.acts_on in taken:
+                if number == 0 and not found.accepted:
+                    bench = search.run(found).bench
+                break
+            bench = accept(bench, nuisance, found, seen, self.rng)
+            nuisance = refitted(bench, config.refit)
+            where = found.hypotheses[-1][1]
+            structures["unknown", where] = structure(bench, where, found.current.theta, seen)
+            again = self._names(bench, nuisance, 0.55 + 0.1 * number, 0.6 + 0.1 * number)
+            bench, seen = again.run(found).bench, None
+        return bench, nuisance, structures
+
+    def _gain(
+        self,
+        bench: Bench,
+        found: Found,
+        fitted: Look,
+        rows: list[int],
+        laws: list[Law],
+        stirring: tuple[Effect, ...],
+        extended: bool,
+    ) -> tuple[dict[str, result.ModelGain], dict[str, Simulated]]:
+        """Base, base refitted, extended model and black box on data left out of their fits.
+
+        `fitted` is the look of the final fit, with responses to the parameters of `rows`.
+        """
+        horizon, seed = self.config.horizon, self.config.seed
+        self.progress(0.82, "gain: the belief")
+        R = len(bench.data.fold)
+        still = np.repeat(bench.believed[:, None], R, axis=1)
+        contenders = {"base": Contender(still)}
+        if self.config.refit in ("none", "scales"):
+            belief = refitted(bench, "linear")
+            _, look, _ = bench.polish(bench.believed, belief, rounds=3)
+        else:
+            belief = refitted(bench, self.config.refit)
+            look = bench.look(bench.moved(found.first.theta, self.bench.library), belief)
+        contenders["refitted"] = Contender(bench.without_each(look, belief))
+        if extended:
+            won = np.zeros(R)
+            for law in laws:
+                won += law.heldout if len(law.heldout) == R else 0.0
+            white = white_part(laws, bench)
+            # the level is estimated for every contender
+            laws_of_it = tuple(e for e in stirring if e.name != LEVEL)
+            contenders["extended"] = Contender(
+                bench.without_each(fitted, rows), won=won, stirring=laws_of_it, white=white
+            )
+        contenders["black_box"] = Contender(
+            still, train(found.base.predictions, bench.data, self.rng)
+        )
+        judged, estimated = {}, fitted.noise.estimated
+        for number, (name, contender) in enumerate(contenders.items()):
+            self.progress(0.84 + 0.04 * number, f"gain: {name.replace('_', ' ')}")
+            in_use = [] if contender.box is not None else [*belief, *rows]
+            judged[name] = judge(bench, contender, horizon, seed, in_use, estimated)
+        gain = {
+            name: told(j, judged["base"], bench, horizon, np.random.default_rng(seed))
+            for name, j in judged.items()
+        }
+        return gain, {name: j.simulated for name, j in judged.items()}
+
+
+def diagnose(
+    recording: Recording,
+    vehicle: Vehicle,
+    base: Dynamics | None = None,
+    config: DiagnoseConfig | None = None,
+    progress: Progress = lambda fraction, remark: None,
+) -> Finding:
+    """What the belief (`base`, or the vehicle's preset) gets wrong about a recording.
+
+    Raises:
+        UserError: the recording lacks pose or twist, or is too short.
+    """
+    # threads of BLAS wait for each other in a loop: beside other work that is five times slower
+    from threadpoolctl import threadpool_limits  # it sets a variable as it is imported
+
+    with threadpool_limits(1, user_api="blas"):
+        return _diagnose(recording, vehicle, base, config or DiagnoseConfig(), progress)
+
+
+def _diagnose(
+    recording: Recording,
+    vehicle: Vehicle,
+    base: Dynamics | None,
+    config: DiagnoseConfig,
+    progress: Progress,
+) -> Finding:
+    diagnoser = Diagnoser(recording, vehicle, base, config, progress)
+    found = diagnoser.run()
+    first = found.diagnosis
+    if config.refit != "auto" or not diagnoser.driven or not coefficients_are_off(first):
+        progress(1.0, "done")
+        return found
+    progress(0.0, "again with all coefficients fitted, for most are off")
+    again = Diagnoser(recording, vehicle, base, replace(config, refit="all"), progress).run()
+    progress(1.0, "done")
+    second = again.diagnosis
+    if best_gain(second) < best_gain(first) + _CLEARLY:
+        return found
+    told = telling.with_coefficients_off(second)
+    return replace(again, diagnosis=replace(told, seconds=first.seconds + second.seconds))
+
+
+def coefficients_are_off(diagnosis: result.Diagnosis) -> bool:
+    """Whether refitted coefficients win what causes do not, or it takes many causes."""
+    causes = diagnosis.gain.get("extended")
+    won = 0.0 if causes is None else max(causes.log_score_gain.value, 0.0)
+    refitted = diagnosis.gain["refitted"].log_score_gain
+    return refitted.interval95[0] > won + _CLEARLY or len(diagnosis.causes) > _MANY
+
+
+def best_gain(diagnosis: result.Diagnosis) -> float:
+    """Nats a sample that the better of refit and extended model wins on data left out."""
+    models = (diagnosis.gain.get(name) for name in ("refitted", "extended"))
+    return max(m.log_score_gain.value for m in models if m is not None)

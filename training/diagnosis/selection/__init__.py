@@ -1,0 +1,1 @@
+"""Which causes are there together: hypotheses, search, model selection, refits."""

@@ -1,0 +1,83 @@
+"""Causes beside a random structure: least squares where innovations depend on each other.
+
+Pushes that last, a current that differs from run to run, and swell make innovations depend on each
+other. Names that only bend the mean then seem to explain them, for the state depends on past pushes
+too. Beside such a structure innovations and responses alike are made independent first: a slow push
+is predicted from the innovations before (an ARMA(1, 1), as `laws.colour` has it), and what is drawn
+anew for each piece is integrated out (Woodbury 1950), its size being known from its law.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from ..filter.gram import gram
+
+
+@dataclass(frozen=True)
+class Beside:
+    """A random structure with known numbers.
+
+    Attributes:
+        slow: of axes with slow pushes, by number: ρ, κ, and what each of the twelve innovations
+            has of the push that is predicted.
+        scale: standard deviations of the innovations without the pushes.
+        drawn: whitened responses to what is drawn for each piece (k, N·12, R).
+        precision: of each of these draws (k,).
+    """
+
+    slow: dict[int, tuple[float, float, Float[np.ndarray, "12"]]] = field(default_factory=dict)
+    scale: Float[np.ndarray, "12"] = field(default_factory=lambda: np.ones(12))
+    drawn: Float[np.ndarray, "k N12 R"] | None = None
+    precision: Float[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0))
+
+    def products(self, z: Float[np.ndarray, "m N12 R"]) -> Float[np.ndarray, "R m m"]:
+        """Inner products of innovations and responses by piece, once they are independent."""
+        if self.drawn is not None:
+            z = np.concatenate([z, self.drawn])
+        G = gram(self._unslowed(z))
+        if self.drawn is None:
+            return G
+        m = len(z) - len(self.drawn)
+        own, cross = G[:, :m, :m], G[:, m:, :m]
+        inner = G[:, m:, m:] + np.diag(self.precision)
+        return own - cross.swapaxes(1, 2) @ np.linalg.solve(inner, cross)
+
+    @classmethod
+    def slowly(
+        cls, z: Float[np.ndarray, "N 12 R"], numbers: dict[int, tuple[float, float]]
+    ) -> "Beside":
+        """Slow pushes with ρ and κ by axis, the rest of their numbers from innovations `z`."""
+        slow, left = {}, z.copy()
+        for axis, (rho, kappa) in numbers.items():
+            m = _predicted(z[None, :, 6 + axis], rho, kappa)[0]
+            share = np.einsum("njr,nr->j", z, m) / max(float((m**2).sum()), 1e-300)
+            share[6 + axis] = 1.0
+            slow[axis] = rho, kappa, share
+            left -= share[:, None] * m[:, None]
+        before, after = (np.sqrt((e**2).sum(axis=(0, 2))) for e in (z, left))
+        count = np.sqrt(np.maximum((z != 0).sum(axis=(0, 2)), 1))
+        scale = np.where(before > 0, np.maximum(after / count, 1.0), 1.0)
+        return cls(slow, scale)
+
+    def _unslowed(self, z: np.ndarray) -> np.ndarray:
+        if not self.slow:
+            return z
+        before = z.reshape(len(z), -1, 12, z.shape[2])
+        found = before / self.scale[:, None].astype(z.dtype)
+        for axis, (rho, kappa, share) in self.slow.items():
+            m = _predicted(before[:, :, 6 + axis], rho, kappa)
+            for j in np.flatnonzero(share):
+                found[:, :, j] -= float(share[j] / self.scale[j]) * m
+        return found.reshape(z.shape)
+
+
+def _predicted(
+    z: Float[np.ndarray, "m N R"], rho: float, kappa: float
+) -> Float[np.ndarray, "m N R"]:
+    """What lasts of a slow part before each step."""
+    m = np.zeros_like(z)
+    for n in range(z.shape[1] - 1):
+        m[:, n + 1] = rho * (m[:, n] + kappa * (z[:, n] - m[:, n]))
+    return m

@@ -1,0 +1,140 @@
+"""Which name to give: vetoes, nesting, echoes, ties."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ....models.effects.library import Library, kind
+from .hypotheses import Chance, Fit
+
+Hypothesis = tuple[str, str]
+"""(cause, where)"""
+
+MARGIN_NATS, MARGIN_SHARE = 10.0, 0.02
+ECHO_SHARE = 0.01
+CLEAR, CLEAR_OF_FEW = 5.0, 1.5
+"""Multiples of the threshold from which the robust p value is not asked: few clusters (runs, or
+pieces of a handful of runs) bound it, so few that only some of them show an effect bound it to
+nothing."""
+_CLEARLY = 3.0
+"""Standard errors from which a parameter differs from zero."""
+_FEW = 12
+"""Clusters that are few."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The name given, what it could as well be, who came next; a p value for all names tried."""
+
+    hypothesis: Hypothesis
+    fit: Fit
+    ties: tuple[Hypothesis, ...]
+    rivals: tuple[tuple[Hypothesis, float], ...]
+    p_value: float = 1.0
+
+
+def admissible(library: Library, theta: Float[np.ndarray, " p"], fit: Fit) -> bool:
+    """Whether every estimate lies in its range; a sign that physics forbids vetoes a name."""
+    for i, change, error in zip(fit.parameters, fit.values, fit.errors, strict=True):
+        p = library.entries[i].parameter
+        value = theta[i] + change
+        one = len(fit.parameters) == 1
+        slack = 0.0 if one else 2 * float(error)
+        if not p.low - slack <= value <= p.high + slack or (one and value == 0):
+            return False
+    return True
+
+
+def is_itself(library: Library, theta: Float[np.ndarray, " p"], fit: Fit) -> bool:
+    """Whether an essential parameter of the name clearly differs from zero, if it has any."""
+    values = theta[list(fit.parameters)] + fit.values
+    made_of = [
+        abs(value) > _CLEARLY * error
+        for i, value, error in zip(fit.parameters, values, fit.errors, strict=True)
+        if library.entries[i].parameter.name in kind(library.entries[i].cause).essential
+    ]
+    return not made_of or any(made_of)
+
+
+def margin(gain: float) -> float:
+    """How much a name with more freedom must win by."""
+    return max(MARGIN_NATS, MARGIN_SHARE * gain)
+
+
+def choose(
+    library: Library,
+    theta: Float[np.ndarray, " p"],
+    fits: Mapping[Hypothesis, Fit],
+    threshold: float,
+    alpha: float,
+    accepted: Mapping[str, float] | None = None,
+    strict: bool = False,
+) -> Choice | None:
+    """The name that explains most, or None where nothing passes.
+
+    To pass, a name needs a held-out gain above `threshold` (calibrated for the number of names), a
+    robust p value that survives Bonferroni unless the gain is clear (`strict`: even then),
+    admissible estimates, and what makes it that name.
+    Echoes of names accepted before (with their gains) must win one per cent of those. Among the
+    rest the largest held-out gain leads; a simpler name replaces it unless clearly beaten. Ties are
+    names within two standard errors of the difference, clustered by run.
+    """
+    accepted = accepted or {}
+    passing: dict[Hypothesis, Fit] = {}
+    for hypothesis, fit in fits.items():
+        name = hypothesis[0]
+        needed = threshold
+        for other, gain in accepted.items():
+            if name in kind(other).echoes:
+                needed = max(needed, ECHO_SHARE * gain)
+        if (
+            fit.heldout_gain > needed
+            and (
+                fit.p_value * len(fits) < alpha
+                or (fit.heldout_gain > _clear(fit) * threshold and not strict)
+            )
+            and admissible(library, theta, fit)
+            and is_itself(library, theta, fit)
+        ):
+            passing[hypothesis] = fit
+    if not passing:
+        return None
+    order = sorted(passing, key=lambda h: (kind(h[0]).absorber, -passing[h].heldout_gain))
+    top = order[0]
+    best = passing[top].heldout_gain
+    simpler = [
+        h
+        for h in order
+        if h != top and _is_simpler(h, top) and passing[h].heldout_gain > best - margin(best)
+    ]
+    if simpler:
+        top = simpler[0]
+    ties = [h for h in order if h != top and _tied(passing[top], passing[h])]
+    rivals = [(h, passing[h].heldout_gain) for h in order if h != top][:5]
+    return Choice(top, passing[top], tuple(ties), tuple(rivals))
+
+
+def p_value(fit: Fit, tried: int, chance: Chance) -> float:
+    """Of the best of the names tried: the robust one, or that of a clear gain in noise alone."""
+    return min(1.0, fit.p_value * tried, chance.beyond(fit.heldout_gain / _clear(fit)))
+
+
+def _clear(fit: Fit) -> float:
+    return CLEAR_OF_FEW if len(fit.heldout) < _FEW else CLEAR
+
+
+def _is_simpler(a: Hypothesis, b: Hypothesis) -> bool:
+    return a[0] in kind(b[0]).simpler
+
+
+def _tied(a: Fit, b: Fit) -> bool:
+    difference = a.heldout - b.heldout
+    error = np.sqrt(len(difference)) * difference.std()
+    return bool(difference.sum() < 2 * error)
+
+
+def parameters_of(library: Library, hypotheses: Sequence[Hypothesis]) -> list[int]:
+    """Indices of all parameters of these causes."""
+    return [i for h in hypotheses for i in library.at(*h)]

@@ -1,0 +1,388 @@
+"""Which causes are there together: forward selection with exact refits, and checks backwards."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from ....models.effects.base import AXES
+from ....models.effects.library import kind
+from ..disturbance.found import SLOW, laws_of, won_by
+from ..disturbance.waves import beside_laws
+from ..filter.noise import Filter
+from ..filter.problem import Bench, Look
+from ..validation.validation import Contender, scores
+from .correlated_noise import Beside
+from .hypotheses import Chance, Fit
+from .model_selection import (
+    Choice,
+    Hypothesis,
+    admissible,
+    choose,
+    is_itself,
+    margin,
+    p_value,
+    parameters_of,
+)
+from .refit_all import coefficients
+
+BELIEFS = ("added_mass", "linear_drag", "quadratic_drag", "net_buoyancy")
+"""Coefficients that a user would expect fitted."""
+UNSCALED = ("axis_thrust", "linear_drag", "quadratic_drag", "net_buoyancy")
+"""Those that a command of unknown scale leaves, with the inertia as it is believed."""
+REFITS = {"none": (), "scales": ("thrust_scale",), "linear": BELIEFS, "command": UNSCALED}
+_HANGING = ("net_buoyancy", "centre_of_gravity")
+"""What a vehicle shows that is left alone."""
+_TIMES = ("thruster_lag", "actuation_delay", "clock_offset")
+_CLOSE = 0.7
+_TAKEN_BACK = 2
+_OF_A_LAW = 0.02
+"""Share of what the best law wins that a name must win where the law wins more."""
+_OF_A_DESCRIPTION = 0.02
+"""Share of what structure without a name wins that a name or law must win beside it: a few bumps or
+one frequency describe no more exactly."""
+_LEFT = 0.05
+"""Share of what the laws win that is hardly anything."""
+_OF_ESTIMATES = 0.05
+"""Nats a sample that a name must win where states were estimated: below that a name may as well
+explain what the estimator makes of its own errors."""
+_HALVED = math.log(2.0)
+"""Or nats a sample by which it makes one-step errors likelier: an axis' errors are halved. Records
+of a simulation without noise look like estimates too, until the name is found."""
+
+
+@dataclass
+class Found:
+    """Where a search has come to.
+
+    Attributes:
+        base, first, current: the belief, the belief refitted, and with the causes.
+        accepted: causes in the order found.
+        fits: every name alone, beside the belief refitted.
+        left: every further name beside those accepted.
+        dropped: causes that others made needless; they are not tried again.
+        chance: what noise alone wins of held-out nats in the last round.
+        threshold: what it exceeds with the rate of false alarms.
+    """
+
+    base: Look
+    first: Look
+    current: Look
+    accepted: list[Choice] = field(default_factory=list)
+    fits: dict[Hypothesis, Fit] = field(default_factory=dict)
+    left: dict[Hypothesis, Fit] = field(default_factory=dict)
+    dropped: set[Hypothesis] = field(default_factory=set)
+    chance: Chance = field(default_factory=lambda: Chance(0.0, 1.0))
+    threshold: float = 0.0
+
+    @property
+    def hypotheses(self) -> list[Hypothesis]:
+        """The causes named."""
+        return [choice.hypothesis for choice in self.accepted]
+
+    @property
+    def left_undescribed(self) -> float:
+        """Nats that descriptions of structure without a name may leave of it."""
+        described = (c.fit.heldout_gain for c in self.accepted if c.hypothesis[0] == "unknown")
+        return _OF_A_DESCRIPTION * sum(described)
+
+
+def refitted(bench: Bench, refit: str) -> list[int]:
+    """Parameters that are free beside every cause."""
+    if refit == "all":
+        return [c.row for c in coefficients(bench)]
+    entries = enumerate(bench.library.entries)
+    return [i for i, e in entries if e.cause in REFITS[refit] and e.where != "centre_of_buoyancy"]
+
+
+def _asks_for_commands(named: Hypothesis, quiet: Sequence[str]) -> bool:
+    """Whether a cause can't be told because axes were not driven: its own, or all of them."""
+    name, where = named
+    if len(quiet) == len(AXES):
+        return kind(name).family in ("actuation", "body") and name not in _HANGING
+    return where in quiet and kind(name).family == "body"
+
+
+class Search:
+    """Forward selection on a bench; `rng` draws what noise alone can win."""
+
+    def __init__(
+        self,
+        bench: Bench,
+        nuisance: list[int],
+        alpha: float,
+        most: int,
+        rng: np.random.Generator,
+        progress: Callable[[float, str], None],
+        quiet: Sequence[str] = (),
+        shortest: float = 0.0,
+    ):
+        """`quiet` axes are not identifiable; times below `shortest` (s) are no cause."""
+        self.bench, self.nuisance, self.alpha, self.most = bench, nuisance, alpha, most
+        self.rng, self.progress = rng, progress
+        free = {bench.library.entries[i].cause for i in nuisance}
+        self.names = [
+            h
+            for h in bench.library.hypotheses(single=False)
+            if h[0] not in free and not _asks_for_commands(h, quiet)
+        ]
+        self.shortest = shortest
+        self._asked: tuple[Look, tuple[Choice | None, dict[Hypothesis, Fit]]] | None = None
+
+    def run(self, found: Found, most: int | None = None) -> "Search":
+        """Add causes to `found` until none passes, or `most` are there; all are refitted together.
+
+        Where exact fits take back what was added `_TAKEN_BACK` times in a row, what names promise
+        is not to be had: the rest of them is not tried.
+        """
+        taken_back = 0
+        for number in range(len(found.accepted), min(most or self.most, self.most)):
+            self.progress(number / self.most, f"{number} causes so far")
+            choice, fits = self.next(found)
+            found.fits = found.fits or fits
+            found.left = fits
+            if choice is None:
+                break
+            choice, theta = self._refine(choice, fits, found)
+            p = p_value(choice.fit, len(fits), found.chance)
+            seen = self.bench.look(theta)
+            doubtful = choice.fit.p_value * len(fits) >= self.alpha
+            if doubtful and not self._holds(seen, choice.hypothesis, found):
+                found.dropped.add(choice.hypothesis)
+            else:
+                found.accepted.append(replace(choice, p_value=p))
+                found.current = seen
+                self._backward(found)
+            taken_back = taken_back + 1 if choice.hypothesis in found.dropped else 0
+            if taken_back == _TAKEN_BACK:
+                break
+        return self
+
+    def next(self, found: Found) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
+        """The name that explains most of what is left, and the fits of all names.
+
+        It is kept until another fit is current: causes are added and dropped with a new one.
+        """
+        if self._asked is None or self._asked[0] is not found.current:
+            answer = self._next(found)
+            self._asked = (found.current, answer)
+        return self._asked[1]
+
+    def _next(self, found: Found) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
+        """Where a law wins more than the best name, names must hold between runs by themselves.
+
+        Unless nothing is left of the law once the name is fitted: chance is not explained by a few
+        numbers. Where that law lasts, so that names imitate it, they are judged beside it: what it
+        wins on all axes counts.
+        """
+        if self.bench.beside is not None:
+            self._judge_beside(None, found)
+        choice, fits = self._chosen(found)
+        laws = laws_of(self.bench, found.current)
+        if choice is None or not laws:
+            return choice, fits
+        lasting = max(won_by(name, laws) for name in SLOW)
+        law = max(lasting, laws[0].heldout_gain)
+        if law < choice.fit.heldout_gain:
+            return choice, fits
+        explains = self._explaining(choice, fits, found, law)
+        if explains is not None:
+            return explains, {**fits, explains.hypothesis: explains.fit}
+        if law == lasting:
+            self._judge_beside(beside_laws(self.bench, found.current, laws), found)
+        return self._chosen(found, _OF_A_LAW * law, strict=True)
+
+    def _explaining(
+        self, choice: Choice, fits: dict[Hypothesis, Fit], found: Found, law: float
+    ) -> Choice | None:
+        """The first of the best names that leaves hardly anything of what the laws win.
+
+        Names whose numbers multiply each other (a pull and its lever) win little before they are
+        fitted.
+        """
+        names = [choice.hypothesis, *(h for h, _ in choice.rivals)]
+        for h in names:
+            theta, seen, _ = self._fitted(h, fits, found, None)
+            left = laws_of(self.bench, seen)
+            if left and max(won_by(w.name, left) for w in left) < _LEFT * law:
+                exact = self._exact(fits[h], theta, seen, found)
+                named = self.bench.library, found.current.theta, exact
+                if not (admissible(*named) and is_itself(*named)):
+                    continue
+                gains = [(other, fits[other].heldout_gain) for other in names if other != h]
+                return Choice(h, exact, (), tuple(gains))
+        return None
+
+    def _exact(self, fit: Fit, theta: Float[np.ndarray, " p"], seen: Look, found: Found) -> Fit:
+        """A fit with its exact values, and the nats that they win less one a number.
+
+        Each by a filter of its own: what a name explains is no noise any more.
+        """
+        current, rows = found.current, list(fit.parameters)
+        weight = self.bench.data.weight
+        won = seen.likelihood(weight) - current.likelihood(weight)
+        labels, index = np.unique(self.bench.data.cluster, return_inverse=True)
+        heldout = np.bincount(index, won, len(labels)) - len(rows) / len(labels)
+        change = theta - current.theta
+        return replace(
+            fit,
+            values=change[rows],
+            others={i: float(change[i]) for i in fit.others},
+            gain=float(won.sum()),
+            heldout=heldout,
+        )
+
+    def _judge_beside(self, structure: Beside | None, found: Found) -> None:
+        self.bench = replace(self.bench, beside=structure)
+        found.current = self.bench.look(found.current.theta, again=found.current)
+
+    def _chosen(
+        self, found: Found, least: float = 0.0, strict: bool = False
+    ) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
+        bench, current, taken = self.bench, found.current, found.hypotheses
+        beside = self.nuisance + parameters_of(bench.library, taken)
+        open_names = [h for h in self.names if h not in taken and h not in found.dropped]
+        sets = [bench.library.at(*h) for h in open_names]
+        found.chance = current.evidence.chance(sets, beside, self.rng)
+        found.threshold = found.chance.exceeded(self.alpha)
+        fits = {h: current.evidence.fit(s, beside) for h, s in zip(open_names, sets, strict=True)}
+        for h in [h for h in open_names if h[0] in _TIMES]:
+            times = current.theta[list(fits[h].parameters)] + fits[h].values
+            if np.all(np.abs(times) < self.shortest):
+                del fits[h]
+        gains = {c.hypothesis[0]: c.fit.heldout_gain for c in found.accepted}
+
+        def best(least: float) -> Choice | None:
+            needed = max(found.threshold, found.left_undescribed, least)
+            return choose(bench.library, current.theta, fits, needed, self.alpha, gains, strict)
+
+        def chosen() -> Choice | None:
+            found_ = best(least)
+            if found_ is None or not current.noise.estimated or self._halves(found_, current):
+                return found_
+            return best(max(least, _OF_ESTIMATES * bench.data.steps))
+
+        choice = chosen()
+        if choice is not None and self._about_thrust(choice):
+            fits |= self._single_thrusters(current, beside, [*taken, *found.dropped])
+            choice = chosen()
+        return choice, fits
+
+    def _halves(self, choice: Choice, current: Look) -> bool:
+        """Whether a name makes the one-step errors much smaller than they are."""
+        theta = self._start(choice.fit, current.theta)
+        won = self.bench.loss_of(current) - self.bench.loss(theta)
+        return bool(won >= _HALVED * self.bench.data.steps)
+
+    def _about_thrust(self, choice: Choice) -> bool:
+        """Whether the best names so far leave it open that a single thruster is at fault."""
+        names = [choice.hypothesis[0], *(h[0] for h, _ in choice.rivals[:2])]
+        level = self.bench.data.command != "F_Bo_B"
+        return level and any(kind(name).family == "actuation" for name in names)
+
+    def _single_thrusters(
+        self, current: Look, beside: list[int], taken: list[Hypothesis]
+    ) -> dict[Hypothesis, Fit]:
+        """Fits of causes in one thruster each, by the filter of the other names."""
+        library = self.bench.library
+        names = [h for h in library.hypotheses(single=True) if h not in taken]
+        chosen = sorted({*parameters_of(library, names), *beside})
+        seen = self.bench.look(current.theta, chosen, again=current)
+        return {h: seen.evidence.fit(library.at(*h), beside) for h in names}
+
+    def _holds(self, seen: Look, named: Hypothesis, found: Found) -> bool:
+        """Whether a name predicts data left out of its fit better, by exact predictions.
+
+        Where few runs show it, what their responses promise may not be had: they bend.
+        """
+        bench, names = self.bench, found.hypotheses
+        rows = self.nuisance + parameters_of(bench.library, names)
+        own = parameters_of(bench.library, [named])
+        before, after = (
+            scores(bench, Contender(bench.without_each(look, used)), found.first.noise.estimated)
+            for look, used in ((found.current, rows), (seen, [*rows, *own]))
+        )
+        return bool(after.density.sum() > before.density.sum())
+
+    def _start(self, fit: Fit, theta: np.ndarray) -> np.ndarray:
+        moved = theta.copy()
+        moved[list(fit.parameters)] += fit.values
+        for i, change in fit.others.items():
+            moved[i] += change
+        return moved
+
+    def _fitted(
+        self, h: Hypothesis, fits: dict[Hypothesis, Fit], found: Found, kalman: Filter | None
+    ) -> tuple[Float[np.ndarray, " p"], Look, Fit]:
+        """A name fitted with exact predictions, beside all that was found; the fit has its own
+        numbers alone, as they are.
+        """
+        beside = self.nuisance + parameters_of(self.bench.library, found.hypotheses)
+        chosen = [*self.bench.library.at(*h), *beside]
+        start = self._start(fits[h], found.current.theta)
+        theta, seen, joint = self.bench.polish(start, chosen, kalman, origin=found.current)
+        return theta, seen, _of_one(self.bench.library.at(*h), theta, joint)
+
+    def _refine(
+        self, choice: Choice, fits: dict[Hypothesis, Fit], found: Found
+    ) -> tuple[Choice, Float[np.ndarray, " p"]]:
+        """Fit the name with exact predictions; let close rivals try the same, and take the best."""
+        library, bench = self.bench.library, self.bench
+        beside = self.nuisance + parameters_of(library, found.hypotheses)
+        top = choice.hypothesis
+        theta, seen, _ = self._fitted(top, fits, found, None)
+        close = [h for h, g in choice.rivals[:2] if g > _CLOSE * choice.fit.heldout_gain]
+        if not close:
+            return choice, theta
+        best = bench.polish(theta, [*library.at(*top), *beside], seen.kalman, 2)[1]
+        start_loss = best.loss
+        for h in close:
+            if h[0] in kind(top[0]).simpler:
+                continue
+            other, rival, alone = self._fitted(h, fits, found, seen.kalman)
+            named = library, np.zeros_like(other), alone
+            within = admissible(*named) and is_itself(*named)
+            # what is nested in a name keeps it unless clearly beaten; more numbers must pay
+            least = 2.0 if best.loss == start_loss else 0.0
+            least += max(len(library.at(*h)) - len(library.at(*top)), 0)
+            if top[0] in kind(h[0]).simpler:
+                least = margin(choice.fit.heldout_gain)
+            if within and rival.loss < best.loss - least:
+                top, theta, best = h, other, rival
+        if top == choice.hypothesis:
+            return choice, theta
+        rivals = ((choice.hypothesis, choice.fit.heldout_gain), *choice.rivals)
+        others = tuple(rival for rival in rivals if rival[0] != top)
+        ties = tuple(h for h in choice.ties if h != top)
+        return Choice(top, fits[top], ties, others), theta
+
+    def _backward(self, found: Found) -> None:
+        """Drop causes that those found later have made needless, and refit the rest."""
+        library, current = self.bench.library, found.current
+        chosen = parameters_of(library, found.hypotheses)
+        kept, theta = [], current.theta.copy()
+        for choice in found.accepted:
+            own = library.at(*choice.hypothesis)
+            others = [i for i in chosen if i not in own]
+            weight = 0.0
+            if current.theta[own].any():  # else the joint fit itself has taken it back
+                errors = current.evidence.fit(own, others).errors
+                weight = float(np.sum((current.theta[own] / np.maximum(errors, 1e-300)) ** 2)) / 2
+            if weight > found.threshold:
+                kept.append(choice)
+            else:
+                found.dropped.add(choice.hypothesis)
+                theta[own] = 0.0
+        if len(kept) < len(found.accepted):
+            found.accepted = kept
+            rest = self.nuisance + parameters_of(library, found.hypotheses)
+            theta = self.bench.polish(theta, rest)[0] if rest else theta
+            found.current = self.bench.look(theta)
+
+
+def _of_one(rows: Sequence[int], theta: Float[np.ndarray, " p"], joint: Fit) -> Fit:
+    """Numbers of one name as they are (no changes), with their errors in a joint fit."""
+    errors = np.array([joint.errors[joint.parameters.index(i)] for i in rows])
+    return Fit(tuple(rows), theta[list(rows)], {}, errors, 0.0, np.zeros(1), 1.0)

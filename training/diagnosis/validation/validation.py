@@ -1,0 +1,361 @@
+"""What a model is worth on data that it was not fitted to: scores, simulations, bands.
+
+Every number of a model (parameters, diffusion, measurement noise) is fitted without the scenario
+that it is judged on; of one scenario runs are left out in turn, of one run blocks.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ....models import se3
+from ....models.effects.base import AXES, Effect
+from ....models.effects.deterministic_step import advance
+from ....models.effects.extended import FOR_EVER, Extended
+from ....models.effects.inertia import times
+from ....models.effects.recent import Recent
+from ...evaluation.metrics import BANDS, order_statistics
+from ..disturbance.laws import Law
+from ..filter.innovations import Arrays, as_arrays, at_first, difference, predict, settle, substeps
+from ..filter.noise import estimate, score_of
+from ..filter.problem import Bench
+from ..filter.transition import Transition
+from ..findings import result
+from .blackbox import BlackBox, arguments
+
+GROUPS = {"position": slice(0, 3), "rotation": slice(3, 6), "velocity": slice(6, 9)}
+_COARSER = 4
+"""Times longer than those of predictions the substeps of the many simulated samples are."""
+HORIZONS = (0.5, 1.0, 2.0, 4.0)
+SAMPLES = 39
+_PIECES = 60
+_DRAWS = 400
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A model to judge: θ of each piece, fitted without it (p, R), and perhaps a learned rest."""
+
+    theta: Float[np.ndarray, "p R"]
+    box: BlackBox | None = None
+    won: Float[np.ndarray, " R"] | float = 0.0
+    """Nats by piece that laws of the disturbance win besides, on pieces left out."""
+    stirring: tuple[Effect, ...] = ()
+    """Effects that have these laws; simulations start in their stationary state."""
+    white: Float[np.ndarray, "6"] = field(default_factory=lambda: np.ones(6))
+    """Share of the estimated diffusion that is none of theirs (`white_part`)."""
+
+
+class Simulated(NamedTuple):
+    """Recorded less simulated, window after window.
+
+    Attributes:
+        errors: pose seen from the simulated body, and twist; lane 0 is simulated without noise, the
+            others with that of the disturbance and of the records (N, 12, S, K).
+        pieces: which of the data (K,).
+        every: steps of a window, each simulated from the record at its start.
+    """
+
+    errors: Float[np.ndarray, "N 12 S K"]
+    pieces: Int[np.ndarray, " K"]
+    every: int
+
+
+class Judged(NamedTuple):
+    """Sums over pieces of one fold each; the bootstrap draws folds.
+
+    Attributes:
+        score: log density of the innovations by piece (nats) (R,).
+        square: squared errors by horizon, group and fold, with their number.
+        energy, inside: likewise energy scores, and shares in the bands.
+        simulated: the simulations that these were taken from.
+    """
+
+    score: Float[np.ndarray, " R"]
+    square: Float[np.ndarray, "h g F"]
+    energy: Float[np.ndarray, "h F"]
+    inside: Float[np.ndarray, "b h F"]
+    count: Float[np.ndarray, "h F"]
+    simulated: Simulated
+
+
+class Scores(NamedTuple):
+    """Of each piece, by noise estimated without it.
+
+    Attributes:
+        density: log density of the innovations (nats) (R,).
+        record, diffusion: noise of the records, and of the disturbance (12, R), (6, R).
+    """
+
+    density: Float[np.ndarray, " R"]
+    record: Float[np.ndarray, "12 R"]
+    diffusion: Float[np.ndarray, "6 R"]
+
+
+def scores(bench: Bench, contender: Contender, estimated: bool) -> Scores:
+    """How well a model predicts each piece, fitted without it, over one step."""
+    data, theta = bench.data, contender.theta
+    p = predict(bench.model, bench.library, theta, data)
+    error, jacobian = np.asarray(p.error), np.asarray(p.jacobian)
+    if contender.box is not None:
+        h = data.step[:, None]
+        a = np.asarray(contender.box.acceleration(*arguments(data))).swapaxes(0, 1) * h
+        error = error - np.concatenate([a * h / 2, a], axis=1) * data.told[:, None]
+    mass = bench.mass(theta.mean(axis=1))
+    density = np.zeros(len(data.fold))
+    record, diffusion = np.zeros((12, len(density))), np.zeros((6, len(density)))
+    for label in np.unique(data.fold):
+        own = data.fold == label
+        rest = data.weight * (~own if not own.all() else 1)
+        steps = Transition.along(jacobian, rest, p.late)
+        noise = estimate(error, rest, steps, mass, data.dt, estimated=estimated)
+        record[:, own], diffusion[:, own] = noise.record[:, None], noise.diffusion[:, None]
+        given = np.linalg.inv(mass), data.dt, data.step[:, own], data.weight[:, own]
+        density[own] = score_of(error[:, :, own], jacobian[..., own], noise, steps, *given)
+    return Scores(density, record, diffusion)
+
+
+def judge(
+    bench: Bench,
+    contender: Contender,
+    horizon: float,
+    seed: int,
+    in_use: Sequence[int],
+    estimated: bool,
+) -> Judged:
+    """Score a model's innovations, and simulate it over `horizon` s from recorded states.
+
+    Effects that own none of the parameters `in_use` are left out of the simulations; contenders
+    with the same ones share a compiled program. Whether the records are states that a filter has
+    `estimated` is one answer for all folds and contenders.
+    """
+    data, theta = bench.data, contender.theta
+    density, record, diffusion = scores(bench, contender, estimated)
+    kept = _spread(data.fold, _PIECES)
+    levels = record[:, kept], diffusion[:, kept] * contender.white[:, None]
+    kinds = {bench.library.entries[i][:2] for i in in_use}
+    kinds |= {bench.library.entries[i][:2] for i in np.flatnonzero(np.any(theta != 0, axis=1))}
+    return _simulated(bench, contender, levels, kept, horizon, seed, density + contender.won, kinds)
+
+
+def white_part(laws: Sequence[Law], bench: Bench) -> Float[np.ndarray, "6"]:
+    """Share of each axis' estimated diffusion that remains beside laws that are a part of it.
+
+    Blows come within single steps and count as diffusion; one that grows with the speed was
+    estimated as the mean over all speeds. Slow pushes are no part of the estimate.
+    """
+    share, data = np.ones(6), bench.data
+    speed2 = (data.V[:-1, :3] ** 2).sum(axis=1)
+    for law in laws:
+        p = law.parameters
+        if law.name == "disturbance_impacts":
+            square = (1 - p["share"]) * p["rest"] ** 2 + p["share"] * p["size"] ** 2
+            share[AXES.index(law.where)] = p["rest"] / np.sqrt(square)
+        elif law.name == "disturbance_state_dependence":
+            grown = ((1 + p["growth"] * speed2) * data.weight).sum() / data.weight.sum()
+            share[AXES.index(law.where)] = 1 / np.sqrt(grown)
+    return share
+
+
+def _spread(fold: np.ndarray, most: int) -> np.ndarray:
+    """At most so many pieces, as many of each fold as of any other."""
+    labels = np.unique(fold)
+    each = max(1, most // len(labels))
+    chosen = []
+    for label in labels:
+        own = np.flatnonzero(fold == label)
+        chosen += own[np.unique(np.linspace(0, len(own) - 1, each).round().astype(int))].tolist()
+    return np.array(sorted(chosen))
+
+
+def _simulated(
+    bench: Bench,
+    contender: Contender,
+    levels: tuple[np.ndarray, np.ndarray],
+    kept: np.ndarray,
+    horizon: float,
+    seed: int,
+    score: np.ndarray,
+    kinds: set[tuple[str, str]],
+) -> Judged:
+    data = bench.data
+    X, V, u, voltage, _, past, _ = as_arrays(data)
+    step, past_step = jnp.asarray(data.own_steps(kept)), jnp.asarray(data.past_steps(kept))
+    now = X[..., kept], V[..., kept], u[..., kept], voltage[..., kept], step
+    arrays = *now, past[..., kept], past_step
+    theta = contender.theta[:, kept]
+    every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))
+    effects = bench.library.filled(theta[:, None])
+    used = tuple(e for e in effects if any((e.name, where) in kinds for where in e.places))
+    box = contender.box
+    if box is not None:
+        box = eqx.tree_at(lambda b: b.weights, box, box.weights[..., kept])
+    e = np.asarray(
+        _errors(
+            bench.model, used, contender.stirring, arrays, box, jnp.asarray(levels[1]),
+            jnp.asarray(levels[0]), jax.random.key(seed), every,
+            max(1, substeps(data.longest) // _COARSER),
+        ),
+        np.float64,
+    )  # fmt: skip
+    simulated = Simulated(e.astype(np.float32), kept, every)
+    at = horizons(horizon, every, data.dt)
+    fold, labels = data.fold[kept], np.unique(data.fold)
+    weight = data.weight[:, kept]
+    square = np.zeros((len(at), len(GROUPS), len(labels)))
+    energy, count = np.zeros((len(at), len(labels))), np.zeros((len(at), len(labels)))
+    inside = np.zeros((len(BANDS), len(at), len(labels)))
+    for h, steps in enumerate(at):
+        rows = np.arange(steps - 1, len(e), every)
+        own, exists = e[rows], weight[rows] > 0  # (K, 12, 1 + S, R), (K, R)
+        drawn = own[:, :, 1:]
+        apart = np.abs(drawn[:, :, 1:] - drawn[:, :, :-1])
+        with np.errstate(invalid="ignore", over="ignore"):  # of forecasts that diverge
+            far = np.sqrt((drawn**2).sum(axis=1)).mean(axis=1)
+            far -= np.sqrt((apart**2).sum(axis=1)).mean(axis=1) / 2
+        ordered = np.sort(drawn, axis=2)
+        for f, label in enumerate(labels):
+            w = exists * (fold == label)
+            count[h, f] = w.sum()
+            energy[h, f] = (np.where(w, far, 0)).sum()
+            for g, group in enumerate(GROUPS.values()):
+                total = (own[:, group, 0] ** 2).sum(axis=1)
+                square[h, g, f] = np.where(w, total, 0).sum()
+            for b, band in enumerate(BANDS):
+                low, high = order_statistics(SAMPLES, band)
+                hit = (ordered[:, :, low] <= 0) & (ordered[:, :, high] >= 0)
+                inside[b, h, f] = (hit.mean(axis=1) * w).sum()
+    return Judged(score, square, energy, inside, count, simulated)
+
+
+def horizons(longest: float, every: int, dt: float) -> list[int]:
+    """Steps of the horizons that fit."""
+    found = [round(h / dt) for h in HORIZONS if h <= longest + 1e-9 and 1 <= round(h / dt) <= every]
+    return found or [every]
+
+
+@eqx.filter_jit
+def _errors(
+    model: Extended,
+    effects: tuple[Effect, ...],
+    stirring: tuple[Effect, ...],
+    arrays: Arrays,
+    box: BlackBox | None,
+    diffusion: Float[Array, "6 R"],
+    record: Float[Array, "12 R"],
+    key: Array,
+    every: int,
+    coarse: int,
+) -> Float[Array, "N 12 S R"]:
+    """Recorded less simulated: lane 0 without noise, the others with it and that of the records."""
+    X, V, u, voltage, step, past, past_step = arrays
+    model = model.with_effects(effects)
+    random = model.with_effects(stirring)
+    inertia = model.inertia()
+    R, S = V.shape[2], 1 + SAMPLES
+    more = random.noise_size - 6
+    noisy = (jnp.arange(S)[None, :, None] > 0).astype(V.dtype)
+    record = record[:, None] * noisy
+    b = diffusion[:, None] * noisy
+
+    stir = jax.vmap(random.stir, -1, -1)  # columns take steps of their own
+
+    def kicked(V: Array, w: Array) -> Array:
+        M = inertia.inverse
+        M = M.reshape(M.shape + (1,) * (4 - M.ndim))
+        own = random.scaled_diffusion(V, b) if stirring else b
+        return V + jnp.sum(M * (own * w)[None], axis=1)
+
+    def read(X: Array, V: Array, w: Array) -> tuple[Array, Array]:
+        n = record * w
+        X, n = jnp.broadcast_to(X, (7, *n.shape[1:])), n
+        return se3.retract(X, n[:6]), V + n[6:]
+
+    def body(carry: Any, given: Any) -> Any:
+        memory, pushes, x, v, recent = carry
+        n, X0, V0, X1, V1, command, before, volts, h = given
+        dt = h[None, None]
+        draw = jax.random.normal(jax.random.fold_in(key, n), (30 + 2 * more, S, R), V.dtype)
+        start = read(X0[:, None], V0[:, None], draw[:12])
+        fresh = model.infer(*start, recent)
+        starts = n % every == 0
+        x, v = (jnp.where(starts, a, b) for a, b in zip(fresh, (x, v), strict=True))
+        push = None
+        if box is not None:
+            wide = jnp.broadcast_to(command[:, None], (len(command), S, R))
+            late = jnp.broadcast_to(before[:, None], wide.shape)
+            push = times(inertia.matrix, box.acceleration(x, v, wide, late))
+        if stirring:
+            w = draw[24:] * noisy  # of which six are left for b dW
+            drawn, _ = random.stir(pushes, x, v, w[: 6 + more], FOR_EVER)
+            pushes = tuple(jnp.where(starts, a, b) for a, b in zip(drawn, pushes, strict=True))
+            pushes, stirred = stir(pushes, x, v, w[more:], jnp.broadcast_to(h, (R,)))
+            push = stirred if push is None else push + stirred
+        memory, x, Vp, a = advance(
+            model, inertia, memory, x, v, command[:, None], dt, coarse, volts[None, None], push
+        )
+        recent = recent.after(Recent.over(v, Vp, a, dt))
+        v = kicked(Vp, jnp.sqrt(dt) * draw[12:18])
+        seen = model.observe(x, v, recent)
+        e = difference(*read(*seen, draw[18:30]), X1[:, None], V1[:, None])
+        return (memory, pushes, x, v, recent), e.astype(jnp.float32)
+
+    zero = jnp.zeros((1, S, R), V.dtype)
+    memory = settle(model, past[:, :, None] + zero[None], past_step[:, None, None])
+    recent = at_first(
+        model, inertia, memory, X[0][:, None] + zero, V[0][:, None] + zero,
+        past[-1][:, None] + zero, voltage[:1, None], step[:1, None],
+    )  # fmt: skip
+    pushes = random.carried(u[0][:, None] + zero)[1]
+    start = (memory, pushes, X[0][:, None] + zero, V[0][:, None] + zero, recent)
+    before = jnp.concatenate([past[-1:], u[:-1]])
+    xs = (jnp.arange(len(u)), X[:-1], V[:-1], X[1:], V[1:], u, before, voltage, step)
+    return jax.lax.scan(body, start, xs)[1]
+
+
+# ----------------------------------------------------------------------------------- telling
+
+
+def told(
+    judged: Judged, base: Judged, bench: Bench, horizon: float, rng: np.random.Generator
+) -> result.ModelGain:
+    """Numbers with 95 % intervals, by bootstrap over what was left out in turn."""
+    data = bench.data
+    labels = np.unique(data.fold)
+    drawn = rng.integers(len(labels), size=(_DRAWS, len(labels)))
+    every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))
+    names = [f"{h * data.dt:g}" for h in horizons(horizon, every, data.dt)]
+
+    def ratio(top: np.ndarray, bottom: np.ndarray, root: bool = False) -> result.Interval:
+        value = top.sum() / max(bottom.sum(), 1e-300)
+        draws = top[drawn].sum(axis=1) / np.maximum(bottom[drawn].sum(axis=1), 1e-300)
+        return _interval(np.sqrt(value), np.sqrt(draws)) if root else _interval(value, draws)
+
+    def by_horizon(values: np.ndarray, root: bool = False) -> dict[str, result.Interval]:
+        rows = zip(names, values, judged.count, strict=True)
+        return {name: ratio(v, c, root) for name, v, c in rows}
+
+    steps = np.array([data.weight[:, data.fold == f].sum() for f in labels])
+    score = np.array([judged.score[data.fold == f].sum() for f in labels])
+    before = np.array([base.score[data.fold == f].sum() for f in labels])
+    rmse = {g: by_horizon(judged.square[:, k], True) for k, g in enumerate(GROUPS)}
+    return result.ModelGain(
+        log_score=ratio(score, steps),
+        log_score_gain=ratio(score - before, steps),
+        energy_score=by_horizon(judged.energy),
+        position_rmse=rmse["position"],
+        rotation_rmse=rmse["rotation"],
+        velocity_rmse=rmse["velocity"],
+        coverage={f"{100 * b:.0f} %": by_horizon(judged.inside[k]) for k, b in enumerate(BANDS)},
+    )
+
+
+def _interval(value: float, draws: np.ndarray) -> result.Interval:
+    low, high = np.percentile(draws, (2.5, 97.5))
+    return result.Interval(float(value), (float(low), float(high)))

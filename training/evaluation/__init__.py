@@ -1,0 +1,1 @@
+"""Models judged on data and laws that they have not seen."""

@@ -1,0 +1,1 @@
+"""Where training starts from, its steps, its guards and its folder."""

@@ -1,0 +1,218 @@
+"""The most likely drift and diffusion where states are known exactly: a fit to innovations.
+
+By the Markov property the likelihood of a trajectory is the product of its steps' (`innovations`).
+Least squares weighted by P⁻¹, with P and b brought up to date between passes, reaches the
+Cramér–Rao bound of the constants; squared errors of long noise-free motions do not by far, as
+noise that was seen long ago is counted again and again. With noise of measurement it is the other
+way round: single steps then tell little else. So the fit is judged by whether the innovations that
+it leaves are uncorrelated (`Fitted.white`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from ...models.spinn import Spinn
+from ..config import DriftConfig
+from ..data.windows import Windows
+from .constants import constants, without_networks
+from .one_step_errors import Steps, correlation, innovations, likely_diffusion, whitened, whitening
+
+Model = TypeVar("Model", bound=Spinn)
+
+_FEW = 4000  # steps that bring the constants near
+_CHUNK = 4096  # steps whose derivatives stay in a processor's cache
+_TRIES = 8
+_GAIN = 0.1
+"""Log-likelihood that an iteration must be worth: one standard error of a number is worth 0.5."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What the fit to innovations ends with.
+
+    Attributes:
+        values: the constants (`training.fitting.constants`), flat.
+        diffusion: b (N√s, N·m√s), most likely given them.
+        information: Fisher information of the values, the prior's included.
+        correlation: of neighbouring innovations by axis.
+    """
+
+    values: Float[np.ndarray, " p"]
+    diffusion: Float[np.ndarray, "6"]
+    information: Float[np.ndarray, "p p"]
+    correlation: Float[np.ndarray, "6"]
+
+    def white(self, bound: float) -> bool:
+        """Whether neighbours' correlation is known and within `bound` on every axis."""
+        return bool((np.abs(self.correlation) <= bound).all())
+
+    def apply(self, model: Model) -> Model:
+        """The model with these constants."""
+        flat, unravel = ravel_pytree(constants(model))
+        return eqx.tree_at(constants, model, unravel(jnp.asarray(self.values, flat.dtype)))
+
+
+def fit_innovations(
+    config: DriftConfig, model: Spinn, windows: Windows, substeps: int
+) -> Fitted | None:
+    """The most likely constants and b, from where `model` has them, as `config.innovations` says.
+
+    None where that is `never` or leaves no iterations, where it is `auto` and innovations stay
+    correlated, or where nothing finite is found.
+    """
+    if config.innovations == "never" or config.iterations == 0:
+        return None
+    few, every = (Steps.of(windows, n) for n in (min(_FEW, config.most_steps), config.most_steps))
+    if len(every) == 0:
+        return None
+    fit = _Fit.of(config, model, substeps)
+    # the first pass weighs by the preset's errors; the last is over once weights are nearly right
+    first = fit.from_here(fit.start, None, few)
+    found = None if first is None else fit.from_here(first.values, first.diffusion, few)
+    if found is not None and len(every) > len(few) and _may_stay(config, found):
+        found = fit.from_here(found.values, found.diffusion, every)
+    return found if found is not None and _may_stay(config, found) else None
+
+
+def _may_stay(config: DriftConfig, found: Fitted) -> bool:
+    return config.innovations == "always" or found.white(config.white)
+
+
+class _Fit(eqx.Module):
+    """What stays the same in all passes."""
+
+    small: Spinn
+    start: np.ndarray
+    unravel: Callable[[Array], Any]
+    precision: float
+    iterations: int
+    substeps: int
+
+    @classmethod
+    def of(cls, config: DriftConfig, model: Spinn, substeps: int) -> "_Fit":
+        flat, unravel = ravel_pytree(constants(model))
+        return cls(
+            without_networks(model),
+            np.asarray(flat, np.float64),
+            unravel,
+            config.prior_sd**-2 if config.prior_sd > 0 else 0.0,
+            config.iterations,
+            substeps,
+        )
+
+    def model(self, values: Float[np.ndarray, " p"]) -> Spinn:
+        dtype = self.small.matrix_heads.bias.dtype
+        return _with(self.small, self.unravel, jnp.asarray(values, dtype))
+
+    def from_here(
+        self, values: Float[np.ndarray, " p"], b: Float[np.ndarray, "6"] | None, steps: Steps
+    ) -> Fitted | None:
+        """One pass: weights from `values`, then the constants by least squares, then b."""
+        b = likely_diffusion(self.model(values), steps, self.substeps, b)
+        if not np.isfinite(b).all():
+            return None
+        whiten = self.whitening(values, steps, b)
+
+        def cost(values: Float[np.ndarray, " p"]) -> float:
+            errors, change = self.whitened(values, steps, whiten), values - self.start
+            return float(errors.ravel() @ errors.ravel() + self.precision * change @ change) / 2
+
+        def gram(values: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
+            flat = jnp.asarray(values, steps.V.dtype)
+            parts = _gram(self.small, self.unravel, flat, steps, whiten, self.substeps)
+            H, g = (np.asarray(a, np.float64) for a in parts)
+            g = g + self.precision * (values - self.start)
+            return H + self.precision * np.eye(len(g)), g
+
+        values, information = _descend(cost, gram, values, self.iterations)
+        b = likely_diffusion(self.model(values), steps, self.substeps, b)
+        errors = self.whitened(values, steps, self.whitening(values, steps, b))
+        if not (np.isfinite(values).all() and np.isfinite(b).all()):
+            return None
+        return Fitted(values, b, information, correlation(steps, errors))
+
+    def whitening(
+        self, values: Float[np.ndarray, " p"], steps: Steps, b: Float[np.ndarray, "6"]
+    ) -> Float[Array, "6 6 N"]:
+        b_array = jnp.asarray(b, steps.V.dtype)
+        return whitening(self.model(values), steps, b_array, self.substeps)[0]
+
+    def whitened(
+        self, values: Float[np.ndarray, " p"], steps: Steps, whiten: Float[Array, "6 6 N"]
+    ) -> Float[np.ndarray, "6 N"]:
+        errors = whitened(self.model(values), steps, whiten, self.substeps)
+        return np.asarray(errors, np.float64)
+
+
+def _with(small: Spinn, unravel: Callable[[Array], Any], values: Array) -> Spinn:
+    return eqx.tree_at(constants, small, unravel(values))
+
+
+@eqx.filter_jit
+def _gram(
+    small: Spinn,
+    unravel: Callable[[Array], Any],
+    values: Float[Array, " p"],
+    steps: Steps,
+    whiten: Float[Array, "6 6 N"],
+    substeps: int,
+) -> tuple[Float[Array, "p p"], Float[Array, " p"]]:
+    """JᵀJ and Jᵀr of the whitened innovations r, chunk by chunk."""
+    count = -(-len(steps) // _CHUNK)
+    short = -len(steps) % count
+
+    def chunks(a: Array, mode: str = "edge") -> Array:
+        a = jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, short)], mode=mode)
+        return jnp.moveaxis(a.reshape(*a.shape[:-1], count, -1), -2, 0)
+
+    def part(inputs: tuple[Steps, Array]) -> tuple[Array, Array]:
+        steps, whiten = inputs
+
+        def errors(v: Array) -> Array:
+            r = innovations(_with(small, unravel, v), steps, substeps)
+            return jnp.einsum("ijn,jn->in", whiten, r).ravel()
+
+        r, push = jax.linearize(errors, values)
+        J = jax.lax.map(push, jnp.eye(values.size, dtype=values.dtype))
+        return J @ J.T, J @ r
+
+    # what pads the last chunk is weighted by zero
+    H, g = jax.lax.map(part, (jax.tree.map(chunks, steps), chunks(whiten, "constant")))
+    return jnp.sum(H, axis=0), jnp.sum(g, axis=0)
+
+
+def _descend(
+    cost: Callable[[np.ndarray], float],
+    gram: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    values: Float[np.ndarray, " p"],
+    iterations: int,
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
+    """The least cost near `values` by Levenberg and Marquardt, and the Gauss–Newton matrix there.
+
+    Reference: Nocedal and Wright 2006, section 10.3.
+    """
+    now, damping = cost(values), 1e-3
+    H, g = gram(values)
+    for _ in range(iterations):
+        gain = 0.0
+        for _ in range(_TRIES):
+            move = -np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
+            then = cost(values + move)
+            if then < now:  # false too where the motion runs away
+                values, gain, now = values + move, now - then, then
+                break
+            damping *= 5
+        if gain > 0:
+            H, g = gram(values)
+        if gain < _GAIN:
+            break
+        damping /= 5
+    return values, H

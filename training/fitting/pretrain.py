@@ -1,0 +1,113 @@
+"""Pre-training: bring the coefficient networks to a preset before they see data.
+
+Coefficients of an underwater vehicle differ by orders of magnitude between axes; starting in the
+right chart is what makes training from little data possible (Palmer et al., experiments).
+"""
+
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from ...models import se3
+from ...models.dynamics import Dynamics
+from ...models.rigid_body import FossenDynamics
+from ..config import PretrainConfig
+from .step import QUICK_COMPILE, all_finite, partition
+
+Model = TypeVar("Model", bound=Dynamics)
+
+
+def pretrain(
+    model: Model, target: FossenDynamics, config: PretrainConfig, key: Array
+) -> tuple[Model, Float[Array, " _"]]:
+    """Fit M, D, D^f, b and F_V of `model` to those of `target`; returns the model and its losses.
+
+    Velocities are Gaussian with `speed` (m/s, rad/s), attitudes uniform in roll and pitch. Every
+    entry is compared in units of the target's diagonal, every wrench in units of its own size. All
+    steps run inside one compiled scan; none is taken if the model starts within `tolerance`.
+
+    Raises:
+        ValueError: the loss is not finite.
+    """
+    if config.steps == 0:
+        return model, jnp.zeros(0)
+    params, static = partition(model)
+    dtype = target.weight.dtype
+    adam = optax.scale_by_adam()
+
+    def loss(p: Any, k: Array) -> Array:
+        velocity_key, attitude_key = jax.random.split(k)
+        V = config.speed * jax.random.normal(velocity_key, (6, config.batch), dtype)
+        X = _attitudes(attitude_key, config.batch, dtype)
+        return coefficient_error(eqx.combine(p, static), target, V, X)
+
+    def step(carry: Any, inputs: Any) -> Any:
+        p, moments = carry
+        k, rate = inputs
+        value, gradient = jax.value_and_grad(loss)(p, k)
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes int32 and float
+            direction, moments = adam.update(gradient, moments, p)
+        p = jax.tree.map(lambda a, d: a - rate.astype(a.dtype) * d, p, direction)
+        return (p, moments), value
+
+    def run(p: Any, keys: Array, rates: Array) -> Any:
+        return jax.lax.scan(step, (p, adam.init(p)), (keys, rates))
+
+    rates = jnp.asarray(
+        config.learning_rate * np.cos(np.linspace(0, np.pi / 2, config.steps)) ** 2, dtype
+    )
+    start = jax.jit(loss)(params, key)
+    if float(start) <= config.tolerance:
+        return model, start[None]
+    (params, _), losses = jax.jit(run, compiler_options=QUICK_COMPILE)(
+        params, jax.random.split(key, config.steps), rates
+    )
+    if not bool(all_finite((params, losses))):
+        raise ValueError("pre-training ran away; give a smaller pretrain.learning_rate")
+    return eqx.combine(params, static), losses
+
+
+def coefficient_error(
+    model: Dynamics,
+    target: FossenDynamics,
+    V_WB_B: Float[Array, "6 W"],
+    X_WB: Float[Array, "7 W"],
+) -> Float[Array, ""]:
+    """Mean squared relative differences of M, D, D^f, b and F_V at these velocities and poses.
+
+    Diagonals of the target below 1 % of what stops the vehicle in a second are raised to that, as a
+    SPINN's scales are: a positive definite drag can't be zero, and networks that are driven there
+    are spoilt on the way. A diffusion of zero is left alone.
+    """
+    mine, theirs = model.coefficients(V_WB_B), target.coefficients(V_WB_B)
+    inertia = jnp.diagonal(theirs.mass.matrix())
+    total = jnp.zeros((), V_WB_B.dtype)
+    for name in ("mass", "linear_drag", "quadratic_drag"):
+        A, B = getattr(mine, name).matrix(), getattr(theirs, name).matrix()
+        A = A.reshape(6, 6, -1)
+        d = jnp.maximum(jnp.diagonal(B), 0.01 * inertia)
+        B = B + jnp.diag(d - jnp.diagonal(B))
+        total = total + jnp.mean(jnp.sum((A - B[:, :, None]) ** 2 / _outer(d), axis=(0, 1)))
+    b = theirs.diffusion[:, None]
+    known = b > 0
+    ratio = mine.diffusion.reshape(6, -1) / jnp.where(known, b, 1) - 1
+    total = total + jnp.mean(jnp.where(known, ratio * ratio, 0))
+    F, G = model.potential_wrench(X_WB), target.potential_wrench(X_WB)
+    size = jnp.mean(G * G, axis=1) + (0.01 * inertia) ** 2
+    return total + jnp.mean((F - G) ** 2 / size[:, None])
+
+
+def _outer(d: Float[Array, "6"]) -> Float[Array, "6 6 1"]:
+    return (d[:, None] * d[None, :])[:, :, None]
+
+
+def _attitudes(key: Array, count: int, dtype: Any) -> Float[Array, "7 W"]:
+    angles = jax.random.uniform(key, (3, count), dtype, -jnp.pi, jnp.pi)
+    position = jnp.zeros((3, count), dtype)
+    half = jnp.asarray([1.0, 0.5, 1.0], dtype)[:, None]
+    return se3.from_position_rpy(position, angles * half)

@@ -1,0 +1,170 @@
+"""The model that training starts from: a preset, drift and diffusion brought near the data."""
+
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...models.config.errors import UserError
+from ...models.dynamics import Dynamics
+from ...models.effects.extended import Extended, core
+from ...models.euclidean import create_spinn
+from ...models.integrate import cast
+from ...models.rigid_body import FossenDynamics
+from ...models.spinn import Spinn
+from ...models.vehicles.vehicle import Vehicle
+from ..config import TrainingConfig
+from ..data.windows import Windows
+from ..losses.base import Batch
+from ..losses.matching import SquaredError
+from ..predict import predict, predict_drift
+from .drift import fit_drift
+from .fit import Progress
+from .likelihood import fit_innovations
+from .one_step_errors import mass_at_rest
+from .pretrain import pretrain
+
+Model = TypeVar("Model", bound=Dynamics)
+
+_NORMAL_QUARTILE = 0.6744897501960817
+
+
+def estimate_diffusion(
+    dynamics: Dynamics, windows: Windows, horizon_s: float = 0.5, substeps: int = 1
+) -> Float[np.ndarray, "6"]:
+    """A first guess of b (N√s, N·m√s): how far M ξ misses its prediction after `horizon_s`.
+
+    b is such that motions drawn from `dynamics` with it miss the noise-free motion as far as the
+    data do, by the median of absolute values on each axis; drag, which pulls back what noise has
+    moved, is thereby accounted for. b contains what the model misses by bias and the sensors'
+    noise, so it is rather too large. At least 1e-3 of what accelerates by 1 in a second. A
+    distance-aware diffusion isn't drawn from: there b_i² h = Var[(M (ξ̂ - ξ))_i], too small by
+    what drag pulls back.
+    """
+    steps = int(np.clip(round(horizon_s / windows.dt), 1, windows.steps))
+    pieces = windows.thin(256).subdivide(steps).thin(1024)
+    batch = Batch.of(pieces)
+    start, commands = (batch.X[0], batch.V[0], batch.F, windows.dt), batch.commands
+    M = mass_at_rest(dynamics, batch.V.dtype)
+    floor = 1e-3 * np.diag(M)
+
+    def spread(difference: Float[Array, "6 W"]) -> Float[np.ndarray, "6"]:
+        miss = np.abs(M @ np.asarray(difference, np.float64))
+        miss = miss[:, np.isfinite(miss).all(axis=0)]
+        return np.median(miss, axis=1) / _NORMAL_QUARTILE if miss.size else np.zeros(6)
+
+    _, V = eqx.filter_jit(predict_drift)(dynamics, *start, substeps=substeps, commands=commands)
+    missed = spread(batch.V[-1] - V[-1])
+    b = np.maximum(missed / (steps * windows.dt) ** 0.5, floor)
+    own = core(dynamics)
+    if isinstance(own, Spinn) and own.config.diffusion != "network":
+        return b
+    for _ in range(2):
+        model = with_diffusion(dynamics, b)
+        _, Vs = eqx.filter_jit(predict)(
+            model, *start, jax.random.key(0), 1, substeps=substeps, commands=commands
+        )
+        drawn = spread(Vs[-1, :, 0] - V[-1])
+        b = np.maximum(b * np.clip(missed / np.maximum(drawn, 1e-12), 0.25, 4.0), floor)
+    return b
+
+
+def with_diffusion(model: Model, b: Float[np.ndarray, "6"]) -> Model:
+    """The model with another b (a SPINN: as the scale of its diffusion network)."""
+
+    def own(model: Dynamics) -> Any:
+        found = core(model)
+        return found.scales.diffusion if isinstance(found, Spinn) else found.diffusion  # pyright: ignore[reportAttributeAccessIssue]
+
+    return eqx.tree_at(own, model, jnp.asarray(b, own(model).dtype))
+
+
+def begun_with(config: TrainingConfig, model: Dynamics | None) -> TrainingConfig:
+    """The settings with the architecture of a learned model that training goes on from.
+
+    Raises:
+        UserError: it is another method's kind of model.
+    """
+    own = None if model is None else core(model)
+    if model is None or not isinstance(own, Spinn):
+        if isinstance(model, Extended) and config.model.coordinates != "group":
+            raise UserError(
+                "model: effects act on SE(3); choose a method on the group, not a Euclidean one"
+            )
+        return config
+    for name in ("stochastic", "coordinates", "diffusion"):
+        have, want = getattr(own.config, name), getattr(config.model, name)
+        if have != want:
+            raise UserError(
+                f"model: its {name} is {have!r}, the method wants {want!r}; choose the method "
+                "that it was trained with, or start from a preset"
+            )
+    return replace(config, model=own.config)
+
+
+def starting_model(
+    config: TrainingConfig,
+    vehicle: Vehicle,
+    windows: Windows,
+    progress: Progress | None = None,
+    given: Dynamics | None = None,
+    validation: Windows | None = None,
+) -> Dynamics:
+    """A SPINN at the vehicle's preset, its drift fitted to short pieces, b from what is then left.
+
+    A `given` Fossen model stands in the preset's place. Effects about it stay as they are and a
+    SPINN takes the place of what they are about; a learned model is the start as it is. The windows
+    have commands then (`make_windows`). A given model may be as good as the data can tell: its
+    drift is fitted only where the fit predicts `validation` windows better.
+
+    A function of its arguments alone, so that a resumed run starts from the same bits.
+    """
+    dtype = jnp.dtype(windows.X.dtype)
+    if isinstance(given, Extended):
+        given = given.for_steps_of(windows.dt)
+    given = None if given is None else cast(given, dtype)
+    reference = vehicle.dynamics(dtype=dtype) if given is None else core(given)
+    if given is not None and isinstance(reference, Spinn):
+        return given
+    if not isinstance(reference, FossenDynamics):
+        raise UserError(f"model: training starts from no {type(reference).__name__}")
+    model_key, pretrain_key = jax.random.split(jax.random.key(config.seed))
+    spinn = create_spinn(config.model, reference, model_key, dtype)
+    spinn = pretrain(spinn, reference, config.pretrain, pretrain_key)[0]
+    substeps = config.objective.substeps
+    effects = given if isinstance(given, Extended) else None
+    # steps of a model with effects may remember, which a fit from sample to sample can't know
+    fitted = None if effects else fit_innovations(config.drift, spinn, windows, substeps)
+    spinn = spinn if fitted is None else fitted.apply(spinn)
+    model = spinn if effects is None else effects.with_base(spinn)
+    if fitted is None:
+        found = fit_drift(config.drift, model, windows, substeps, progress)
+        if given is None or validation is None:
+            model = found
+        else:
+            model = _nearer(model, found, validation, substeps)
+    if not config.model.stochastic:
+        return model
+    if fitted is not None and config.model.diffusion == "network":
+        return with_diffusion(model, fitted.diffusion)
+    return with_diffusion(model, estimate_diffusion(model, windows, substeps=substeps))
+
+
+def _nearer(first: Model, second: Model, windows: Windows, substeps: int) -> Model:
+    """Which of two models' noise-free motion is nearer to the windows, in units of the first's."""
+    batch = Batch.of(windows.thin(256))
+    unit = SquaredError.build("typical", substeps, first, windows)
+
+    @eqx.filter_jit
+    def miss(model: Model) -> Array:
+        X, V = predict_drift(
+            model, batch.X[0], batch.V[0], batch.F, windows.dt, substeps=substeps,
+            commands=batch.commands,
+        )  # fmt: skip
+        return unit(X[:, :, None], V[:, :, None], batch)
+
+    return second if float(miss(second)) < float(miss(first)) else first

@@ -80,7 +80,7 @@ def windowing(model: Dynamics | None, normalise: Normalisation) -> dict[str, Any
     """What `make_windows` takes besides for a model; effects see the world and the thrusters."""
     if not isinstance(model, Extended):
         return {"normalise": normalise}
-    return {"normalise": "none", "remembered": min(model.lasts, _REMEMBERED)}
+    return {"normalise": "none", "remembered": min(model.memory_duration, _REMEMBERED)}
 
 
 def split_parts(

@@ -567,7 +567,7 @@ def test_followers_act_on_the_thrusters_that_are_such(tmp_path, where, kind, num
     model = load_model(tmp_path / "m.spinn")[0]
     assert isinstance(model, Extended)
     wanted = np.array([[2.0], [-4.0]])
-    memory, forces = model.carried(jnp.zeros((8, 1)))[0], []
+    memory, forces = model.simulation_state(jnp.zeros((8, 1)))[0], []
     for u in (*wanted, np.zeros(1)):
         memory, level = model.actuate(memory, jnp.broadcast_to(jnp.asarray(u), (8, 1)), 0.05, 2)
         forces.append(np.asarray(level)[:, 0, -1])

@@ -110,7 +110,7 @@ def test_a_few_steps_make_the_loss_smaller(name, windows):
 @pytest.mark.usefixtures("quick")
 def test_instability_ends_training_with_a_report(windows, monkeypatch):
     found = Diagnosis((), (), (), "motion runs away")  # what it looks for is tested with the guard
-    monkeypatch.setattr("spinndrift.training.fitting.fit.diagnose", lambda *_: found)
+    monkeypatch.setattr("spinndrift.training.fitting.fit.explain_non_finite", lambda *_: found)
     config = replace(small("euclidean-unconstrained"), max_recoveries=1)
     with pytest.raises(TrainingError, match="step 1: motion runs away; more than 1 bad steps"):
         fit(config, start(config), replace(windows, V=1e25 * windows.V))

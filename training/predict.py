@@ -6,7 +6,7 @@ from jaxtyping import Array, DTypeLike, Float, Int
 
 from ..models.dynamics import Dynamics
 from ..models.effects.extended import Extended
-from ..models.effects.recorded_rollout import Commands, gaussians, play
+from ..models.effects.recorded_rollout import Commands, gaussians, simulate_recorded
 from ..models.integrate import rollout
 
 
@@ -28,7 +28,8 @@ def predict(
 
     `with_path_of_drift` appends the noise-free motion as one more sample. Increments come from
     `key` and the windows' places (0, 1 … W - 1 unless given). A model with effects acts on the
-    thrusters' `commands`, where they are given, and shows what instruments would (`play`).
+    thrusters' `commands`, where they are given, and shows what instruments would show
+    (`simulate_recorded`).
     """
     T, _, W = F.shape
     count = samples + with_path_of_drift
@@ -47,7 +48,9 @@ def predict(
 
     if isinstance(model, Extended) and commands is not None:
         w = drawn(T, substeps, gaussians(model))
-        Xs, Vs = play(model, flat(X_0), flat(V_0), jax.tree.map(flat, commands), dt, w, substeps)
+        Xs, Vs = simulate_recorded(
+            model, flat(X_0), flat(V_0), jax.tree.map(flat, commands), dt, w, substeps
+        )
         return _by_sample(Xs, W), _by_sample(Vs, W)
     # substeps as steps of their own: the compiled step is one, however many there are
     dt = dt / substeps
@@ -83,6 +86,6 @@ def predict_drift(
 ) -> tuple[Float[Array, "T 7 W"], Float[Array, "T 6 W"]]:
     """The noise-free motion of each window at t_1 … t_T; `commands` as of `predict`."""
     if isinstance(model, Extended) and commands is not None:
-        return play(model, X_0, V_0, commands, dt, substeps=substeps)
+        return simulate_recorded(model, X_0, V_0, commands, dt, substeps=substeps)
     Xs, Vs = rollout(model, X_0, V_0, jnp.repeat(F, substeps, axis=0), dt / substeps)
     return Xs[substeps - 1 :: substeps], Vs[substeps - 1 :: substeps]

@@ -193,7 +193,7 @@ class Effect(eqx.Module):
         return 0
 
     @property
-    def lasts(self) -> float:
+    def memory_duration(self) -> float:
         """For how long (s) what came before a motion still shows in it, to a percent or so."""
         return 0.0
 

@@ -36,7 +36,7 @@ class ActuationDelay(Effect):
         return (self.thrusters + 1) * self.steps
 
     @property
-    def lasts(self) -> float:
+    def memory_duration(self) -> float:
         return self.longest(0)
 
     def initial(self, command: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
@@ -44,7 +44,9 @@ class ActuationDelay(Effect):
         return jnp.concatenate([command] * self.steps + [held])
 
     def for_steps_of(self, dt: float) -> "ActuationDelay":
-        return dataclasses.replace(self, steps=max(math.ceil(self.lasts / dt - 1e-9), 0) + 1)
+        return dataclasses.replace(
+            self, steps=max(math.ceil(self.memory_duration / dt - 1e-9), 0) + 1
+        )
 
     def actuate(
         self,

@@ -20,7 +20,7 @@ from .recent import Recent
 Random = tuple[Array, ...]
 """One array (s, *batch) for each effect with a random state, in the model's order."""
 FOR_EVER = 1e9
-"""A step (s) after which a random state is drawn from its stationary law (`Extended.stir`)."""
+"""A step (s) after which `step_random_state` draws from the stationary law."""
 
 
 def core(dynamics: Dynamics) -> Dynamics:
@@ -68,9 +68,9 @@ class Extended(Dynamics):
         return eqx.tree_at(lambda m: m.base, fixed, spec)
 
     @property
-    def lasts(self) -> float:
+    def memory_duration(self) -> float:
         """For how long (s) what came before a motion still shows in it."""
-        return max((effect.lasts for effect in self.effects), default=0.0)
+        return max((effect.memory_duration for effect in self.effects), default=0.0)
 
     @property
     def reads(self) -> bool:
@@ -358,7 +358,7 @@ class Extended(Dynamics):
         rest = (e for e in self.effects if not any(e.acts(hook) for hook in hooks))
         return self.with_effects(tuple(rest))
 
-    def carried(self, command: Float[Array, "n *batch"]) -> tuple[Memory, Random]:
+    def simulation_state(self, command: Float[Array, "n *batch"]) -> tuple[Memory, Random]:
         """What a simulation carries from step to step: at rest, under `command` (N) for ever."""
         batch = command.shape[1:]
         return self.remember(command), tuple(
@@ -423,14 +423,14 @@ class Extended(Dynamics):
         no batch axes, or ones that broadcast against the state's.
         """
         inertia = self.inertia()
-        memory, state = self.carried(command[0])
+        memory, state = self.simulation_state(command[0])
 
         def body(carry: Any, given: Any) -> Any:
             memory, state, X, V = carry
             u, noise, volts, since = given
             push = None
             if noise is not None:
-                state, push = self.stir(state, X, V, noise, since)
+                state, push = self.step_random_state(state, X, V, noise, since)
             memory, X, V, _ = advance(self, inertia, memory, X, V, u, dt, 1, volts, push)
             if noise is not None:
                 h = jnp.asarray(dt, V.dtype)
@@ -444,7 +444,7 @@ class Extended(Dynamics):
         start = (memory, state, X_WB, V_WB_B)
         return jax.lax.scan(body, start, (command, w, volts, since))[1]
 
-    def stir(
+    def step_random_state(
         self,
         state: Random,
         X_WB: Float[Array, "7 *#batch"],

@@ -31,7 +31,7 @@ class ThrusterLag(Effect):
         return self.thrusters
 
     @property
-    def lasts(self) -> float:
+    def memory_duration(self) -> float:
         return 5 * self.longest(0)
 
     def initial(self, command: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:

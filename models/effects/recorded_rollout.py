@@ -33,11 +33,11 @@ class Commands(NamedTuple):
 
 
 def gaussians(model: Extended) -> int:
-    """Unit Gaussians that a substep of `play` takes: of b dW, of effects, of pushes that last."""
+    """Unit Gaussians a substep of `simulate_recorded`: b dW, effects, coloured pushes."""
     return model.noise_size + model.base.brownian_size - 6
 
 
-def play(
+def simulate_recorded(
     model: Extended,
     X_0: Float[Array, "7 *batch"],
     V_0: Float[Array, "6 *batch"],
@@ -54,7 +54,7 @@ def play(
     """
     count = substeps if noise is None else noise.shape[1]
     commands = jax.tree.map(jnp.asarray, commands)
-    memory, random = model.carried(commands.before[0])
+    memory, random = model.simulation_state(commands.before[0])
     memory = _after(model, memory, commands, dt)
     X, V, recent = X_0, V_0, None
     if model.reads:

@@ -51,7 +51,7 @@ def advanced(
         dW = None
         if noise is not None:
             dt = jnp.where(started, h, FOR_EVER) if random and s == 0 else h
-            random, push = model.stir(random, X, V, noise[s], dt)
+            random, push = model.step_random_state(random, X, V, noise[s], dt)
             F, dW = F + push, h**0.5 * noise[s][:6]
         X, V = integrate.step(body, X, V, F, h, dW, flow)
     return (memory, random), X, V
@@ -68,7 +68,9 @@ class Stepper:
         """`period` in s; a period takes `substeps` steps."""
         self.model = model.for_steps_of(period)
         self.period, self.substeps = period, substeps
-        carried = self.model.carried(jnp.zeros(model.inverse.shape[0], model.inverse.dtype))
+        carried = self.model.simulation_state(
+            jnp.zeros(model.inverse.shape[0], model.inverse.dtype)
+        )
         parts, self._structure = jax.tree.flatten(carried)
         self._ends = list(accumulate(part.size for part in parts))
         # the last number tells whether it has started

@@ -189,7 +189,7 @@ class Unknown(Effect):
         return self.thrusters if self.kind in FOLLOWERS else 2 * (self.kind == "memory")
 
     @property
-    def lasts(self) -> float:
+    def memory_duration(self) -> float:
         if self.kind in FOLLOWERS:
             return _FOLLOWED
         return 5 * self.numbers[0] if self.kind == "memory" else 0.0

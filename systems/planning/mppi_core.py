@@ -13,7 +13,7 @@ from ...models import se3
 from ...models.dynamics import Dynamics
 from ...models.effects.extended import Extended
 from ...models.integrate import cast, step
-from ..plant.frozen_coefficients import HeldModel
+from ..plant.frozen_coefficients import FrozenCoefficients
 from ..plant.wrench_limits import WrenchLimits
 from .mppi_config import MppiConfig
 from .obstacles import Cylinders, SphereHull
@@ -430,7 +430,7 @@ class MppiPlanner(eqx.Module):
             if self.dynamics.remembers:
                 memory, late = self.dynamics.arriving(memory, wrench, V, c.dt, c.steps_of_model)
                 wrenches = [late[..., i] + later for i in range(c.steps_of_model)]
-            model = HeldModel(self.dynamics, V) if c.steps_of_model > 1 else self.dynamics
+            model = FrozenCoefficients(self.dynamics, V) if c.steps_of_model > 1 else self.dynamics
             for i in range(c.steps_of_model):
                 noise = None if dW is None else jnp.repeat(dW[i], n, 1)
                 X, V = step(model, X, V, wrenches[i], h, noise)

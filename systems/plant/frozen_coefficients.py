@@ -6,7 +6,7 @@ from ...models.dynamics import Coefficients, Dynamics, Flow
 from ...models.spd import Spd
 
 
-class HeldModel(Dynamics):
+class FrozenCoefficients(Dynamics):
     """The given dynamics with M, D, D^f and b held at what they are for one velocity.
 
     They change slowly with the velocity, while the drag and the potential that they enter are

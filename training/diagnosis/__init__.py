@@ -1,25 +1,27 @@
 """What a simulation gets wrong, by name: innovations, probes, held-out scores.
 
-The way of a diagnosis, one module a step:
+The steps of a diagnosis, a folder each:
 
-`data`        runs as arrays, with the thrusters' commands and who belongs to which scenario
-`innovations` one-step predictions from every sample, their errors r and Jacobians A
-`noise`       diffusion and measurement noise from the errors' covariances; the Kalman gain
-`responses`   how every effect would change the innovations: finite probes through the same filter
-`gram`        inner products of innovations and responses, run by run
-`hypotheses`  fits, held-out gains and bounds of a set of causes from these inner products
-`naming`      which of them to give: vetoes, nesting, echoes, ties
-`looking`     all that one set of parameters shows, and fits with exact predictions
-`search`      which causes are there together: forward and backward
-`structures`  what a wrench could depend on besides, group by group
-`unknowns`    when to say that no name explains it
-`laws`        what is left: heavy tails, memory, dependence on speed
-`checks`      data at fault: stuck sensors, jumps, axes never excited
-`gain`        what a model is worth on data left out: scores, simulations, bands
-`blackbox`    a rival that names nothing: ridge regression on random features
-`horizon`     fits to forecasts, for states that were smoothed, binned or resampled
-`telling`     causes with intervals, in words
-`diagnose`    all of it, to a `result.Diagnosis` (`result.schema()` is its JSON Schema)
+`data`        runs as arrays with the thrusters' commands and their scenarios (`arrays`); faults of
+              the data: stuck sensors, jumps, axes never excited (`checks`); runs that had the same
+              commands (`repeats`)
+`filter`      one-step predictions from every sample, their errors r and Jacobians A
+              (`innovations`); diffusion and measurement noise from their covariances, and the
+              Kalman gain (`noise`); how every effect would change the innovations
+              (`sensitivities`), inner products of these by run (`gram`); all of it for one set of
+              parameters (`problem`)
+`candidates`  structure without a name: what a wrench could depend on besides, group by group
+`disturbance` laws of what is left: level, memory, heavy tails, waves, varying currents
+`selection`   fits, held-out gains and bounds of sets of causes (`hypotheses`); which causes are
+              there together (`search`); which name to give (`model_selection`); fits to forecasts
+              for states that were smoothed or resampled (`multi_step_fit`); all coefficients anew
+              (`refit_all`)
+`validation`  what a model is worth on data left out: scores, simulations, bands, and a rival that
+              names nothing (`blackbox`)
+`findings`    causes with intervals, in words; `diagnosis.json` (`result`); the next experiment
+
+`pipeline` does all of it, from a recording and a belief to a `result.Diagnosis` (`result.schema()`
+is its JSON Schema).
 
 The filter. A record y_n = h(x_n) + e_n is predicted from the record before it,
 r_n = y_(n+1) ⊖ h(f(h⁻¹(y_n), u_n)), with f a fourth-order step under the held command. To first

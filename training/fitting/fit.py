@@ -23,7 +23,7 @@ from ..data.groups import group_labels, members, step_indices, whole_groups
 from ..data.provenance import fingerprint, provenance
 from ..data.windows import Windows
 from ..losses.base import Batch, Objective
-from .guard import Diagnosis, TrainingError, diagnose, not_finite
+from .guard import Diagnosis, TrainingError, explain_non_finite, not_finite
 from .run_folder import RunFolder, TrainState
 from .step import (
     Report,
@@ -226,7 +226,7 @@ class Run:
         state = self.state
         self.bad_in_a_row += 1
         key = jax.random.fold_in(jax.random.key(np.uint32(self.config.seed)), np.uint32(number))
-        found = diagnose(
+        found = explain_non_finite(
             self._model(state.params), state.objective, self.windows, indices, key, self.windows.dt
         )
         broken = bool(not_finite(state.params))

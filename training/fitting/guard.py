@@ -45,7 +45,7 @@ def not_finite(tree: Any) -> tuple[str, ...]:
     )
 
 
-def diagnose(
+def explain_non_finite(
     model: Dynamics,
     objective: Objective,
     windows: Windows,

@@ -264,7 +264,7 @@ def _errors(
     record = record[:, None] * noisy
     b = diffusion[:, None] * noisy
 
-    stir = jax.vmap(random.stir, -1, -1)  # columns take steps of their own
+    move = jax.vmap(random.step_random_state, -1, -1)  # columns take steps of their own
 
     def kicked(V: Array, w: Array) -> Array:
         M = inertia.inverse
@@ -293,9 +293,9 @@ def _errors(
             push = times(inertia.matrix, box.acceleration(x, v, wide, late))
         if stirring:
             w = draw[24:] * noisy  # of which six are left for b dW
-            drawn, _ = random.stir(pushes, x, v, w[: 6 + more], FOR_EVER)
+            drawn, _ = random.step_random_state(pushes, x, v, w[: 6 + more], FOR_EVER)
             pushes = tuple(jnp.where(starts, a, b) for a, b in zip(drawn, pushes, strict=True))
-            pushes, stirred = stir(pushes, x, v, w[more:], jnp.broadcast_to(h, (R,)))
+            pushes, stirred = move(pushes, x, v, w[more:], jnp.broadcast_to(h, (R,)))
             push = stirred if push is None else push + stirred
         memory, x, Vp, a = advance(
             model, inertia, memory, x, v, command[:, None], dt, coarse, volts[None, None], push
@@ -312,7 +312,7 @@ def _errors(
         model, inertia, memory, X[0][:, None] + zero, V[0][:, None] + zero,
         past[-1][:, None] + zero, voltage[:1, None], step[:1, None],
     )  # fmt: skip
-    pushes = random.carried(u[0][:, None] + zero)[1]
+    pushes = random.simulation_state(u[0][:, None] + zero)[1]
     start = (memory, pushes, X[0][:, None] + zero, V[0][:, None] + zero, recent)
     before = jnp.concatenate([past[-1:], u[:-1]])
     xs = (jnp.arange(len(u)), X[:-1], V[:-1], X[1:], V[1:], u, before, voltage, step)

@@ -10,7 +10,7 @@ from spinndrift.models import se3
 from spinndrift.models.effects.extended import Extended
 from spinndrift.models.effects.library import kind
 from spinndrift.models.effects.recent import Recent
-from spinndrift.models.effects.recorded_rollout import Commands, play
+from spinndrift.models.effects.recorded_rollout import Commands, simulate_recorded
 from spinndrift.models.rigid_body import FossenDynamics
 from spinndrift.training.predict import predict, predict_drift
 
@@ -71,7 +71,7 @@ def test_what_was_commanded_before_the_window_still_arrives(before):
     level = np.repeat(surge(push)[None, :, None], STEPS, axis=0)
     past = np.repeat(surge(before)[None, :, None], 3, axis=0)
     model = extended(kind("thruster_lag").of(time_constant=tau))
-    _, V = play(model, *at_rest(), commands(level, past), DT, substeps=2)
+    _, V = simulate_recorded(model, *at_rest(), commands(level, past), DT, substeps=2)
     t = DT * np.arange(1, STEPS + 1)
     impulse = push * t - (push - before) * tau * (1 - np.exp(-t / tau))
     np.testing.assert_allclose(V[:, 0, 0], impulse / MASS, rtol=1e-9)
@@ -82,7 +82,7 @@ def test_forces_that_cancel_show_a_dead_thruster():
     null = np.linalg.svd(np.asarray(THRUSTERS.allocation))[2][-1] * 20
     dead = extended(kind("thruster_gain").of("3", gain=-1.0))
     level = np.repeat(null[None, :, None], 2, axis=0)
-    _, V = play(dead, *at_rest(), commands(level), DT)
+    _, V = simulate_recorded(dead, *at_rest(), commands(level), DT)
     lost = np.asarray(THRUSTERS.wrench(jnp.asarray(np.where(np.arange(8) == 2, -null, 0))))
     np.testing.assert_allclose(V[0, :, 0], DT * lost / INERTIA, rtol=1e-9, atol=1e-15)
 
@@ -92,7 +92,8 @@ def test_voltage_reaches_the_thrusters():
     sag = extended(kind("voltage_sag").of(exponent=1.5))
     level = np.repeat(surge(10.0)[None, :, None], 2, axis=0)
     full, low = (
-        play(sag, *at_rest(), commands(level, None, v), DT)[1][-1, 0, 0] for v in (1.0, 0.9)
+        simulate_recorded(sag, *at_rest(), commands(level, None, v), DT)[1][-1, 0, 0]
+        for v in (1.0, 0.9)
     )
     np.testing.assert_allclose(low / full, 0.9**1.5, rtol=1e-9)
 
@@ -109,12 +110,12 @@ def test_records_lead_to_records(name):
     """From what an instrument showed to what it will show: the true motion, read by it."""
     X, V, given = moving()
     true, crooked = extended(body=BODY), extended(INSTRUMENTS[name], body=BODY)
-    Xs, Vs = play(true, X, V, given, DT)
+    Xs, Vs = simulate_recorded(true, X, V, given, DT)
     still = Recent.steady(jnp.zeros((6, WIDE)), DT)
     seen = [crooked.observe(x, v, still) for x, v in zip((X, *Xs), (V, *Vs), strict=True)]
     off = [jnp.abs(a - b).max() for a, b in zip(seen[1], (Xs[0], Vs[0]), strict=True)]
     assert max(off) > 1e-3
-    Xr, Vr = play(crooked, *seen[0], given, DT)
+    Xr, Vr = simulate_recorded(crooked, *seen[0], given, DT)
     # a heading's error is taken off in three steps, each of which leaves a hundredth
     np.testing.assert_allclose(Xr, [x for x, _ in seen[1:]], atol=1e-7)
     np.testing.assert_allclose(Vr, [v for _, v in seen[1:]], atol=1e-7)
@@ -129,11 +130,11 @@ def test_late_instruments_show_what_was():
     plain = extended(body=BODY)
     before = np.repeat(surge(0.0)[None, :, None], 1, axis=0)
     dense = commands(np.repeat(level, fine, axis=0), before)
-    _, Vf = play(plain, *at_rest(), dense, DT / fine)
+    _, Vf = simulate_recorded(plain, *at_rest(), dense, DT / fine)
     path = np.concatenate([np.zeros(1), np.asarray(Vf[:, 0, 0])])
     shown = np.interp(t - late, np.arange(len(path)) * DT / fine, path)
     model = extended(kind("clock_offset").of("twist", delay=late), body=BODY)
-    _, V = play(model, *at_rest(), commands(level, before), DT, substeps=fine)
+    _, V = simulate_recorded(model, *at_rest(), commands(level, before), DT, substeps=fine)
     ignored = np.abs(path[::fine][1:] - shown[1:]).max()
     assert np.abs(np.asarray(V[:, 0, 0]) - shown[1:]).max() < 0.05 * ignored
 

@@ -7,7 +7,7 @@ import numpy as np
 from spinndrift.models.integrate import step
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.systems.planning.mppi_config import MppiConfig
-from spinndrift.systems.plant.frozen_coefficients import HeldModel
+from spinndrift.systems.plant.frozen_coefficients import FrozenCoefficients
 
 RNG = np.random.default_rng(0)
 
@@ -16,7 +16,7 @@ def test_constant_coefficients_may_be_held_without_error():
     model = load_vehicle("bluerov2_heavy").dynamics(np.full(6, 0.5))
     X = jnp.concatenate([jnp.tile(jnp.array([[1.0], [0], [0], [0]]), (1, 5)), jnp.zeros((3, 5))])
     V, F, dW = (jnp.asarray(RNG.standard_normal((6, 5))) for _ in range(3))
-    held = HeldModel(model, jnp.zeros_like(V))
+    held = FrozenCoefficients(model, jnp.zeros_like(V))
     for noise in (None, 0.1 * dW):
         expected = jax.jit(step)(model, X, V, F, 0.02, noise)
         found = jax.jit(step)(held, X, V, F, 0.02, noise)

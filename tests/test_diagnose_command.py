@@ -12,7 +12,7 @@ from spinndrift.models.recordings.store import Recording, Trajectory
 
 PREPARE = """
 from types import SimpleNamespace
-import spinndrift.sims.reports.diagnosis_report, spinndrift.training.diagnosis.diagnose
+import spinndrift.sims.reports.diagnosis_report, spinndrift.training.diagnosis.pipeline
 from test_diagnose_command import Told
 spinndrift.training.diagnosis.pipeline.diagnose = lambda recording, vehicle, *_: SimpleNamespace(
     diagnosis=Told(), extended=vehicle.dynamics()

@@ -80,7 +80,7 @@ def average_bound(freedom: int, count: int = 1) -> tuple[float, float]:
 def nees_words(estimate: Mapping[str, Any]) -> str | None:
     """A run's NEES: `position 2.1, attitude 3.4, velocity 12 (outside), bounds 0.22 to 9.3`.
 
-    None where a block has none. `estimate` are the metrics of `sims.metrics`.
+    None where a block has none. `estimate` are the metrics of `sims.run.metrics`.
     """
     told = {name: estimate.get(f"{name}_nees") for name in BLOCKS}
     known = {name: x for name, x in told.items() if x is not None and math.isfinite(x)}

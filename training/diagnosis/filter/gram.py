@@ -32,9 +32,9 @@ def least_within(
     low: Float[np.ndarray, " k"],
     high: Float[np.ndarray, " k"],
 ) -> Float[np.ndarray, " k"]:
-    """The x in a box with the least ½ xᵀH x + gᵀx, of H by its eigenvalues (positive) and vectors.
+    """The minimiser of ½ xᵀH x + gᵀx in a box, with H by its eigenvalues (positive) and vectors.
 
-    Where a bound holds one number, the others answer to it.
+    Where a bound is active, the other components are optimal given it.
     """
     turned = vectors.T @ gradient
     free = -vectors @ (turned / values)

@@ -19,7 +19,7 @@ from ....models.effects.recent import Recent
 from ..data.arrays import Data
 
 SUBSTEPS, LONGEST = 2, 0.0125
-"""Substeps of a step at least, and their length (s) at most: drag is stiff in fast turns."""
+"""Fewest substeps of a step, and their greatest length (s): drag is stiff in fast turns."""
 
 
 def substeps(longest: float) -> int:
@@ -46,10 +46,10 @@ class Predictions(NamedTuple):
         X: predicted pose itself, before it is observed (N, 7, R).
         V: predicted twist (N, 6, R).
         jacobian: A_n, of errors (pose in B, twist) over a step (N, 12, 12, R).
-        latest: how the twist came there, of one step (N, 1, 3, 6, R).
-        start: pose and twist of the samples themselves, what instruments did to them taken off.
-        first: how the twist came to be that of the first sample.
-        late: by how much poses are recorded later than twists, by axis (s).
+        latest: history of the twist over the step, for delayed instruments (N, 1, 3, 6, R).
+        start: pose and twist at the samples, with the effects of instruments removed.
+        first: history of the twist before the first sample.
+        late: delay of recorded poses against twists, by axis (s).
     """
 
     error: Float[Array, "N 12 R"]
@@ -70,7 +70,7 @@ def difference(
 
 
 def settle(model: Extended, past: Float[Array, "P n *batch"], step: Array) -> Memory:
-    """Memories of commands, each held for a `step` (s), the first for ever before."""
+    """Actuator states after commands, each held for a `step` (s); steady under the first before."""
     memory = model.remember(past[0])
     if not memory:
         return ()
@@ -87,7 +87,7 @@ def at_first(
     model: Extended, inertia: Inertia, memory: Memory, X: Float[Array, "7 *#b"],
     V: Float[Array, "6 *#b"], before: Float[Array, "n *#b"], voltage: Array, step: Array,
 ) -> Recent:  # fmt: skip
-    """What the twist did before anything was predicted: under the command `before` the first."""
+    """History of the twist before the first sample: constant acceleration under `before`."""
     level = model.actuate(memory, before, step, 1)[1][..., 0]
     return Recent.steady(model.drift(inertia, X, V, level, voltage), step)
 
@@ -103,7 +103,7 @@ def _predict(model: Extended, effects: Any, arrays: Arrays, count: int) -> Predi
     def body(carry: tuple[Memory, Recent], given: Any) -> Any:
         memory, recent = carry
         X0, V0, X1, V1, command, volts, h = given
-        # what late instruments missed happened under the commands before
+        # what delayed instruments do not show yet happened under earlier commands
         x, v = model.infer(X0, V0, recent)
         memory, Xp, Vp, a = advance(
             model, inertia, memory, x, v, command, h[None], count, volts[None]
@@ -153,7 +153,7 @@ def _jacobian(
 
 
 def _late(library: Library, theta: np.ndarray) -> Float[np.ndarray, "6"]:
-    """By how much poses are recorded later than twists, by axis (s); the mean over pieces."""
+    """Delay of recorded poses against twists, by axis (s); the mean over pieces."""
     if not library.has("clock_offset"):
         return np.zeros(6)
 

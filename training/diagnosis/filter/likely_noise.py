@@ -1,14 +1,14 @@
-"""The noise of records and process that makes blocks of one-step errors most likely.
+"""Maximum likelihood noise of records and process, from blocks of one-step errors.
 
 r_n = e_(n+1) - A e_n + w_n is a moving average of first order. Its blocks of `_BLOCK` neighbours,
 each axis less its mean over the block (slow errors of the model are not noise), are normal with a
 covariance that is linear in the variances of records and process: Σ = Σ_i θ_i G_i. Fisher's scoring
 in log θ finds the most likely ones (Anderson 1973, "Asymptotically efficient estimation of
-covariance matrices with linear structure"). Moments of neighbours alone tell little of a process
-that is smaller than the records' noise: here the whole block tells.
+covariance matrices with linear structure"). Lag-one moments alone have little information on a
+process that is smaller than the records' noise; whole blocks have more.
 
-Pushes that last add Σ_j σ_j² φ_j^|n - m| g_j g_jᵀ, with g_j what a constant one makes of an error:
-linear in their variances too. So longer blocks tell a white level from what is not white.
+Slow disturbances add Σ_j σ_j² φ_j^|n - m| g_j g_jᵀ, with g_j the error that a constant one makes:
+linear in their variances too. Longer blocks thus separate a white level from coloured noise.
 """
 
 from typing import NamedTuple
@@ -22,21 +22,21 @@ from .transition import Transition
 _BLOCK, _LEAST = 12, 8
 """Samples of a block, and blocks at least."""
 _LONGER = 24
-"""Samples of a block where pushes that last are told from a level."""
+"""Samples of a block where slow disturbances are separated from a white level."""
 _TIMES = (0.3, 1.0, 4.0)
-"""Times (s) for which pushes last, as a mixture."""
+"""Time constants (s) of slow disturbances, as a mixture."""
 _ROUNDS, _TRIES, _ENOUGH = 60, 8, 1e-4
-"""Of scoring; halvings of a step; gain of log likelihood a block at which it ends."""
-_STEP = 1.5  # of log θ at most
+"""Rounds of scoring; trials of a step; gain of log likelihood a block at which scoring ends."""
+_STEP = 1.5  # largest step of log θ
 _DEEP = 14.0
-"""Of log θ below the start that pushes and levels may get."""
+"""How far below its start log θ may go where slow disturbances are fitted."""
 _CLEAR = 10.0
-"""Times what the process makes of a pose within a step its record's variance must be to be heard.
-Exact poses would tell of the process by how a simulation was stepped."""
+"""Ratio of a pose's measurement variance to its process variance over a step, above which the pose
+is used. Exact poses would show a simulation's integration scheme instead of the process."""
 
 
 class Likelihood(NamedTuple):
-    """Of blocks y: S, the mean of y yᵀ, is expected to be Σ_i exp(x_i) G_i; both scaled alike."""
+    """Likelihood of blocks y: S, the mean of y yᵀ, has the expectation Σ_i exp(x_i) G_i."""
 
     S: Float[np.ndarray, "d d"]
     G: Float[np.ndarray, "k d d"]
@@ -54,7 +54,7 @@ class Likelihood(NamedTuple):
     def fisher(
         self, x: Float[np.ndarray, " k"], inverse: Float[np.ndarray, "d d"]
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
-        """Slope of the loss by x, and its expected curvature."""
+        """Gradient of the loss in x, and the Fisher information."""
         IG = inverse @ self.G * np.exp(x)[:, None, None]
         slope = np.trace(IG, axis1=1, axis2=2) - np.einsum("iab,ba->i", IG, inverse @ self.S)
         return slope / 2, np.einsum("iab,jba->ij", IG, IG, optimize=True) / 2
@@ -65,7 +65,7 @@ class Likelihood(NamedTuple):
         low: Float[np.ndarray, " k"],
         moved: Bool[np.ndarray, " k"],
     ) -> Float[np.ndarray, " k"]:
-        """Scoring from x on those that may be `moved`, down to `low`."""
+        """Fisher scoring from x over the entries `moved`, bounded below by `low`."""
         x = np.where(moved, np.maximum(x, low), x)
         loss, inverse = self.loss(x)
         damping = 1e-3
@@ -102,10 +102,10 @@ def most_likely(
 ) -> tuple[Float[np.ndarray, "18"], Float[np.ndarray, "6"]]:
     """Variances of the twelve records and the six b², and standard errors of the six.
 
-    Where data are too few that is `start`, with errors of b² as large.
+    Where data are too few it returns `start`, with standard errors equal to b².
 
-    A process that is hidden by the records' noise counts with its standard error: a filter that
-    believes in none at all is deaf, and its innovations are correlated.
+    A b² below its standard error is replaced by that error: a filter without process noise has no
+    gain, and its innovations are correlated.
 
     Args:
         error: of one-step predictions.
@@ -129,7 +129,7 @@ def most_likely(
     if not np.isfinite(loss):  # predictions that nearly diverge
         return start, start[12:]
     curvature = model.fisher(x, inverse)[1][np.ix_(moved, moved)] * len(blocks) / 2
-    size = np.sqrt(np.diag(curvature))  # poses and forces are of unlike sizes
+    size = np.sqrt(np.diag(curvature))  # poses and forces differ in scale
     covariance = np.linalg.pinv(curvature / np.outer(size, size), hermitian=True)
     relative = np.zeros(len(found))
     relative[moved] = np.sqrt(np.maximum(np.diag(covariance), 0.0)) / size
@@ -149,15 +149,15 @@ def beside_pushes(
     believed: Float[np.ndarray, "6"],
     axes: list[int],
 ) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6"]]:
-    """White b beside pushes that last, and what a believed b loses there (nats), of some axes.
+    """White b fitted with slow disturbances, and the nats that a believed b loses, of some axes.
 
     Args:
         error, weight, transition, units: as in `most_likely`.
-        push: what a constant unit wrench makes of an error, by axis.
+        push: one-step error under a constant unit wrench, by axis.
         dt: step (s).
         start: variances to start from.
         believed: b.
-        axes: of which the loss is told; it is zero elsewhere, and where data are too few.
+        axes: whose loss is computed; it is zero elsewhere, and where data are too few.
     """
     blocks, lost = _blocks(error, weight, _LONGER), np.zeros(6)
     if len(blocks) < _LEAST:
@@ -178,7 +178,7 @@ def beside_pushes(
 
 
 def _blocks(error: np.ndarray, weight: np.ndarray, length: int) -> Float[np.ndarray, "K n 12"]:
-    """Blocks of neighbours without a gap, each half over the next."""
+    """Blocks of consecutive samples without a gap, overlapping by half."""
     found = []
     for n in range(0, len(error) - length + 1, length // 2):
         whole = np.all(weight[n : n + length] > 0, axis=0)
@@ -191,7 +191,7 @@ def _heard(
     units: Float[np.ndarray, "6 12 12"],
     start: Float[np.ndarray, "18"],
 ) -> Bool[np.ndarray, "12"]:
-    """Axes that tell of noise: twists, and poses whose records are clear of what a step makes."""
+    """Axes that are used: twists, and poses with clearly more measurement than process noise."""
     made = np.diagonal(units, axis1=1, axis2=2)[:, :6].T @ start[12:]
     heard = np.concatenate([start[:6] > _CLEAR * made, np.ones(6, bool)])
     return heard & np.any(blocks != blocks[:, :1], axis=(0, 1))
@@ -204,7 +204,7 @@ def _likelihood(
     heard: Bool[np.ndarray, "12"],
     pushes: tuple[np.ndarray, float] | None = None,
 ) -> Likelihood:
-    """Of the axes that are heard: twelve records, six white processes, perhaps pushes that last."""
+    """Likelihood of the `heard` axes: records, white processes, optionally slow disturbances."""
     n = blocks.shape[1]
     basis = scipy.linalg.null_space(np.ones((1, n)))
     y = np.einsum("kna,nm->kma", blocks[:, :, heard], basis).reshape(len(blocks), -1)

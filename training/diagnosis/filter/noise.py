@@ -1,13 +1,13 @@
-"""Diffusion and measurement noise, from what the errors of prediction have in common.
+"""Diffusion and measurement noise, from the autocovariances of one-step prediction errors.
 
 With y = x + e, r_n = e_(n+1) - A e_n + w_n has the covariances C_0 = Q + R + A R Aᵀ, C_1 = -A R and
-none further on. A slow model error adds about the same to C_1 and C_2, so C_1 - C_2 is the first
-guess, from which the most likely noise is sought (`likely_noise`).
+zero at longer lags. A slow model error adds about the same to C_1 and C_2, so C_1 - C_2 gives the
+first guess, from which the maximum of the likelihood is sought (`likely_noise`).
 
-States that an autopilot has estimated have no errors of their own at each sample, but slow ones:
-then R comes out as none on most axes of the twist, or of all. All that steps show is taken for
-process noise there, poses that slip against the twist included, and the errors' correlation in time
-is kept: so many samples tell less.
+States that an autopilot has estimated have slow errors, but none that is independent from sample to
+sample: R is then estimated as zero on most axes of the twist, or of all. All one-step errors are
+then taken as process noise, with slip of the pose against the twist, and their correlation in time
+is kept: it lowers the effective number of samples.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,19 +24,19 @@ from .transition import Transition
 FLOOR = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4] * 3 + [1e-5] * 3)
 """Least standard deviation of a record: m, rad, m/s, rad/s."""
 _SMOOTH, _SMOOTH_OF_ALL, _NEAR, _ALIKE = 4, 8, 3.0, 0.1
-"""States count as estimated from so many axes of the twist without errors of their own, or from so
-many of pose and twist whose errors are within so many times the least, if neighbouring errors of
-these axes are correlated that much. States that are known exactly have none of that correlation,
-nor has what noise hides."""
+"""States count as estimated where `_SMOOTH` axes of the twist have no independent error, or
+`_SMOOTH_OF_ALL` of pose and twist have errors within `_NEAR` times `FLOOR`, if neighbouring
+one-step errors of these axes correlate by more than `_ALIKE`. Those of exact states, and of states
+with dominant white noise, do not."""
 _LONGEST = 0.98
-"""Largest correlation of neighbouring errors that is believed."""
+"""Upper limit of the correlation of neighbouring errors."""
 _DEAF = 10.0
-"""Standard deviation (m, rad) of a pose that was not measured: it tells nothing."""
+"""Standard deviation (m, rad) given to a pose that was not measured, so that it has no weight."""
 _BELOW = 0.1
-"""Share of `FLOOR` that is the least when the most likely noise is sought: a floor of the order of
-what the process makes of a pose within a step would be taken from the process."""
+"""Share of `FLOOR` that bounds the most likely noise from below: a floor of the order of the
+process noise of a pose over one step would be subtracted from the process."""
 _MUCH = 0.03
-"""Share of what is seen of a twist that the spread of Jacobians may make before each piece has a
+"""Share of an innovation's variance due to the spread of Jacobians above which each piece has a
 filter of its own."""
 _NODES = 8
 """Nodes of interpolation between uneven steps."""
@@ -50,10 +50,10 @@ class Noise:
         record: m, rad, m/s, rad/s.
         diffusion: b.
         slip: of the pose against the integrated twist, in m/√s and rad/√s.
-        memory: how many samples tell as much as one independent one (12,).
+        memory: number of samples with the information of one independent sample (12,).
         error: standard error of b; half of b where data are too few, zero for estimated states.
         estimated: whether the records are states that a filter has estimated.
-        silent: poses that never err (12,), such as those that were not measured.
+        silent: poses without any one-step error (12,), such as those that were not measured.
     """
 
     record: Float[np.ndarray, "12"]
@@ -66,7 +66,7 @@ class Noise:
 
     @property
     def trusted(self) -> Float[np.ndarray, "12"]:
-        """Standard deviations of the records that a filter counts on."""
+        """Standard deviations of the records that the filter uses."""
         return np.where(self.silent, _DEAF, self.record)
 
     def with_diffusion(self, values: Mapping[int, float]) -> "Noise":
@@ -93,7 +93,7 @@ class Filter:
     memory: Float[np.ndarray, "12"] = field(default_factory=lambda: np.ones(12))
 
     def of(self, pieces: Int[np.ndarray, " K"]) -> "Filter":
-        """That of some pieces."""
+        """The filter of some pieces."""
         if self.keep.shape[-1] == 1:
             return self
         parts = (a[..., pieces] for a in (self.keep, self.whiten, self.log_det))
@@ -108,9 +108,9 @@ def process_covariance(
     slip: Float[np.ndarray, "6"] | None = None,
     late: Float[np.ndarray, "6"] | None = None,
 ) -> Float[np.ndarray, "12 12"]:
-    """Q = ∫ exp(J s) B Bᵀ exp(J s)ᵀ ds over a step, by three Gauss points, and the slip's.
+    """Q = ∫ exp(J s) B Bᵀ exp(J s)ᵀ ds over a step, by three Gauss points, plus that of the slip.
 
-    Of records whose poses are `late` against their twists (s): see `transition`.
+    Poses may be recorded `late` against twists (s): see `transition`.
     """
     J = np.real(scipy.linalg.logm(A)) / dt
     push = mass_inverse * diffusion
@@ -141,10 +141,10 @@ def estimate(
     held: Mapping[int, float] | None = None,
     estimated: bool | None = None,
 ) -> Noise:
-    """Noise of records and process: the most likely, from a first guess by moments.
+    """Maximum likelihood noise of records and process, from a first guess by moments.
 
     The diffusion b of some axes may be `held`. Whether the records are states that a filter has
-    `estimated` is told by the errors unless it is known.
+    `estimated` is decided from the errors unless it is given.
     """
     held = {} if held is None else held
     silent = np.zeros(12, bool)
@@ -190,7 +190,7 @@ def _of_estimates(
     unit: np.ndarray,
     dt: float,
 ) -> Noise:
-    """Noise of states that were estimated: all in the process, with its correlation."""
+    """Noise of states that were estimated: all of it process noise, with its correlation."""
     square = np.maximum(np.diag(C0)[6:] / unit, 1e-300)
     A = transition.mean
     own = process_covariance(A, inverse, np.sqrt(square), dt, None, transition.late)
@@ -215,8 +215,8 @@ def make_filter(
 ) -> Filter:
     """The Kalman filter that starts from the first record: gains of every step.
 
-    The transition is that of a step of `dt` s. Where all are equal, one filter serves all pieces,
-    unless what Jacobians differ by is much of what is seen: then each piece has one with its own.
+    The transition is that of a step of `dt` s. Where all steps are equal, all pieces share one
+    filter, unless the spread of Jacobians adds much to the innovations: then each has its own.
     """
     process = _process(noise, transition, mass_inverse, dt, step)
     if all_equal(step, dt):
@@ -235,7 +235,7 @@ def judging_filter(
     step: Float[np.ndarray, "N R"],
     jacobian: Float[np.ndarray, "N 12 12 R"],
 ) -> Filter:
-    """That filter, by which correlated innovations tell less than as many independent ones."""
+    """`make_filter` with correlated innovations weighted down by `Noise.memory`."""
     kalman = make_filter(noise, transition, mass_inverse, dt, step, jacobian)
     less = kalman.whiten / np.sqrt(noise.memory)[:, None, None]
     return replace(kalman, whiten=less, memory=noise.memory)
@@ -257,7 +257,7 @@ def _filter(
     R, eye = np.diag(noise.trusted**2), np.eye(12)
     count = step.shape[1]
     P = np.repeat(R[None], count, 0)
-    gap = np.zeros_like(P)  # I - K: the first record is believed as it is
+    gap = np.zeros_like(P)  # I - K: the filter starts at the first record
     keep, whiten = np.zeros((2, len(step), count, 12, 12))
     log_det = np.zeros(step.shape)
     for n in range(len(step)):

@@ -1,4 +1,4 @@
-"""What one set of parameters shows: innovations, noise, responses; fits by exact predictions."""
+"""The diagnosis problem: evaluation of θ (innovations, noise, responses), and exact fits of it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,26 +28,26 @@ from .sensitivities import respond
 from .transition import Transition
 
 _RANDOM = ("waves", "current_varying")
-"""Causes that are sought as laws: their motion differs from run to run."""
+"""Causes that are fitted as disturbance laws: they are random from run to run."""
 
 
 _DRAG = ("linear_drag", "quadratic_drag")
 _HALVINGS = 4
 """Steps that may fail before a fit ends."""
 WILD = 1e3
-"""m, rad, m/s, rad/s, and slopes, beyond which a prediction over one step has diverged."""
+"""Errors (m, rad, m/s, rad/s) and Jacobian entries beyond which a one-step prediction diverged."""
 _WORSE = 20.0
-"""Nats by which one-step errors may become less likely: the filter weighs them otherwise."""
+"""Nats of one-step likelihood that a step may lose: the filtered fit weighs errors differently."""
 _LATEST, _STEPS = 0.25, (6, 16)
-"""Delay (s) of commands that is told from a longer one, and least and most steps that hold it."""
+"""Longest command delay (s) that is resolved, and fewest and most steps of its buffer."""
 _LIGHTEST = 0.1
-"""Share of the believed mass along any direction below which a step is too long."""
+"""Least share of the believed mass matrix, along any direction, that a step may leave."""
 
 
 class Look(NamedTuple):
-    """All that one set of parameters shows; `z` are the whitened innovations as they are.
+    """Evaluation of one θ; `z` are the whitened innovations, not divided by `Filter.memory`.
 
-    `evidence` is beside the bench's random structure, `plain` without it.
+    `evidence` accounts for the problem's correlated noise, `plain` does not.
     """
 
     theta: Float[np.ndarray, " p"]
@@ -66,7 +66,7 @@ class Look(NamedTuple):
 
     @property
     def correlation(self) -> Float[np.ndarray, "12"]:
-        """Of neighbouring innovations; those of samples that do not exist are zero."""
+        """Lag-one autocorrelation of the innovations; padded samples count as zero."""
         z = self.z.astype(float)
         square = np.maximum((z**2).sum(axis=(0, 2)), 1e-300)
         return (z[1:] * z[:-1]).sum(axis=(0, 2)) / square
@@ -74,16 +74,16 @@ class Look(NamedTuple):
 
 @dataclass(frozen=True)
 class Bench:
-    """One recording beside one believed model.
+    """One recording and one believed model: the problem that a diagnosis solves.
 
     Attributes:
         data: the runs.
-        vehicle: whose thrusters they are.
+        vehicle: with the thrusters that were commanded.
         model: the believed model without effects.
         library: every effect that may explain a difference.
-        believed: θ of the belief: zero but for effects that it holds already (p,).
+        believed: θ of the believed model: zero except for effects that it already has (p,).
         bounds: ranges of parameters that are narrower than those of their effects.
-        beside: a random structure beside which parameters are fitted and causes judged.
+        beside: correlated noise that fits and tests of causes account for.
     """
 
     data: Data
@@ -102,7 +102,7 @@ class Bench:
         base: Dynamics | None = None,
         without: Sequence[int] = (),
     ) -> "Bench":
-        """`base` is believed in place of the vehicle's preset; runs `without` are faulty.
+        """The problem of `base` (default: the vehicle's preset), `without` the faulty runs.
 
         Raises:
             ValueError: if JAX runs in single precision.
@@ -116,7 +116,7 @@ class Bench:
         return cls(data, vehicle, Extended.create(core, (), vehicle.thrusters()), library, theta)
 
     def with_effect(self, effect: Effect) -> "Bench":
-        """The same with one more effect, absent so far, behind those of the library."""
+        """The problem with one more effect, zero in θ, appended to the library."""
         library = Library([*self.library.effects, effect])
         old = [library.index(*_key(e)) for e in self.library.entries]
         theta = np.zeros(library.size)
@@ -124,12 +124,12 @@ class Bench:
         return replace(self, library=library, believed=theta)
 
     def within(self, bounds: Mapping[int, tuple[float, float]]) -> "Bench":
-        """The same with narrower ranges of some parameters, by their place in θ."""
+        """The problem with narrower bounds of some parameters, by index in θ."""
         named = {_key(self.library.entries[i]): both for i, both in bounds.items()}
         return replace(self, bounds={**self.bounds, **named})
 
     def limits(self, rows: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Least and largest admissible values; drag stays passive, unless it is believed not to."""
+        """Lower and upper bounds; drag stays passive, unless the believed drag is not."""
         rows = list(rows)
         entries = [self.library.entries[i] for i in rows]
         both = [self.bounds.get(_key(e), (e.parameter.low, e.parameter.high)) for e in entries]
@@ -138,7 +138,7 @@ class Bench:
         return low, np.array([b[1] for b in both])
 
     def moved(self, theta: Float[np.ndarray, " q"], library: Library) -> Float[np.ndarray, " p"]:
-        """A θ of another library in this one's order."""
+        """θ of another library, reordered for this problem's library."""
         found = np.zeros(self.library.size)
         for value, entry in zip(theta, library.entries, strict=True):
             found[self.library.index(*_key(entry))] = value
@@ -166,12 +166,12 @@ class Bench:
         """The mass matrix under θ (kg, kg·m, kg·m²)."""
         return mass(self.model, self.library, theta)
 
-    # ------------------------------------------------------------------------------- looking
+    # ---------------------------------------------------------------------------- evaluation
 
     def predict(
         self, theta: Float[np.ndarray, " p"], kalman: Filter | None = None
     ) -> tuple[Predictions, Noise, Filter]:
-        """Predictions with the noise that they ask for, and its filter unless one is given."""
+        """Predictions, the noise estimated from their errors, and its filter or the one given."""
         p = predict(self.model, self.library, theta, self.data)
         error, weight = np.asarray(p.error), self.data.weight
         if not np.isfinite(error[:, :, weight.any(axis=0)]).all():
@@ -197,11 +197,11 @@ class Bench:
         kalman: Filter | None = None,
         again: Look | None = None,
     ) -> Look:
-        """Innovations at θ and the responses to the parameters chosen.
+        """Evaluate θ: innovations, and responses to the parameters chosen.
 
-        By default all but those in single thrusters of causes that may be in all of them, and all
-        coefficients that have a range of their own (`within`). A look at the same θ may be handed
-        over to look `again`: its predictions, noise and filter serve once more.
+        By default these are all causes (in single thrusters only if they can't be in all of them),
+        parameters in use, and those with bounds of their own (`within`). An evaluation at the same
+        θ may be passed as `again`: its predictions, noise and filter are reused.
         """
         if again is None:
             p, noise, kalman = self.predict(theta, kalman)
@@ -233,9 +233,9 @@ class Bench:
     ) -> tuple[np.ndarray, Look, Fit]:
         """Gauss–Newton on the parameters chosen, with exact predictions at every step.
 
-        A step that makes one-step errors clearly larger is halved; so is the way to the start from
-        `origin`, if one is given. The fit returned is at the θ returned: its
-        errors are joint, clustered by run.
+        A step that makes one-step errors clearly less likely is halved; so is the first one, from
+        `origin` to the start, if an origin is given. The fit returned is at the θ returned; its
+        standard errors are joint, clustered by run.
         """
         chosen = list(chosen)
         low, high = self.limits(chosen)
@@ -248,7 +248,7 @@ class Bench:
         while done < rounds and failed < _HALVINGS:
             seen = self._seen(theta, chosen, kalman)
             if seen is None or not self.loss_of(seen) <= bar + _WORSE:
-                # a step too far: back towards what was good
+                # the step is too long: go back halfway to the last good θ
                 theta = (theta + (back if best is None else best[0])) / 2
                 failed += 1
                 continue
@@ -265,33 +265,33 @@ class Bench:
         return best
 
     def _seen(self, theta: np.ndarray, chosen: list[int], kalman: Filter | None) -> Look | None:
-        """A look, or None where predictions diverge."""
+        """An evaluation, or None where predictions diverge."""
         try:
             return self.look(theta, chosen, kalman)
         except (FloatingPointError, np.linalg.LinAlgError):
             return None
 
     def loss_of(self, seen: Look) -> float:
-        """Minus the log likelihood of one-step errors under a covariance of their own.
+        """Negative log likelihood of one-step errors under their own sample covariance.
 
-        It asks for no filter, whose noise levels change with what is fitted.
+        It needs no filter, whose noise levels would change with the fit.
         """
         error = np.asarray(seen.predictions.error) * self.data.weight[:, None]
         return self.merit(self.covariance(error, seen.noise.estimated))
 
     def loss(self, theta: Float[np.ndarray, " p"]) -> float:
-        """That at θ, pose and twist apart: what poses lack is an instrument's."""
+        """Negative log likelihood at θ, pose and twist taken as uncorrelated (`covariance`)."""
         return self.merit(self.covariance(self.errors(theta), apart=True))
 
     def covariance(self, error: np.ndarray, apart: bool) -> Float[np.ndarray, "12 12"]:
-        """Of one-step errors; pose and twist `apart`: what estimated poses lack is no wrench's."""
+        """Of one-step errors; `apart`: pose and twist uncorrelated, as for estimated poses."""
         C = np.einsum("nir,njr->ij", error, error) / self.data.weight.sum()
         if apart:
             C[:6, 6:], C[6:, :6] = 0.0, 0.0
         return C + np.diag(self.data.told == 0)
 
     def merit(self, C: Float[np.ndarray, "12 12"]) -> float:
-        """Minus the log likelihood of errors of that covariance."""
+        """Negative log likelihood of errors with the sample covariance C."""
         if not np.isfinite(C).all():
             return np.inf
         return float(self.data.weight.sum() * np.linalg.slogdet(C)[1] / 2)
@@ -300,7 +300,7 @@ class Bench:
         self, theta: np.ndarray, chosen: list[int], step: np.ndarray, low: np.ndarray,
         high: np.ndarray,
     ) -> Float[np.ndarray, " k"]:  # fmt: skip
-        """θ after a step, halved until the mass matrix keeps a share of the believed one."""
+        """θ after a step, halved until the mass matrix is at least `_LIGHTEST` of the believed."""
         believed = self.mass(self.believed)
         moved, share = theta.copy(), 1.0
         while True:
@@ -311,11 +311,10 @@ class Bench:
             share /= 2
 
     def without_each(self, look: Look, chosen: Sequence[int]) -> Float[np.ndarray, "p R"]:
-        """θ of each piece, the parameters chosen refitted without the pieces it is left out with.
+        """θ of each piece, with the parameters chosen refitted without the piece's fold.
 
-        One Gauss–Newton step from the fit to all data, which is exact to first order in what a
-        fold weighs; values stay in their admissible range, and steps whose predictions diverge are
-        halved.
+        One Gauss–Newton step from the fit to all data, which is exact to first order in a fold's
+        weight; values stay within bounds, and steps whose predictions diverge are halved.
         """
         data, chosen = self.data, list(chosen)
         theta = np.repeat(look.theta[:, None], len(data.fold), axis=1)

@@ -1,4 +1,4 @@
-"""How the innovations would change if an effect were there: probes through the same filter."""
+"""Responses of the whitened innovations to effects: probes passed through the same filter."""
 
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,14 +21,14 @@ from .innovations import Arrays, Predictions, as_arrays, settle
 from .noise import Filter
 
 LANES, FEW, INSTRUMENTS = 28, 8, 18
-"""Probes that one call of the compiled program runs side by side, besides the base."""
+"""Probes that one call of the compiled program evaluates in parallel, besides the base."""
 AHEAD = 4
-"""Calls that wait or run while the results of one are taken: each holds its probes' innovations."""
+"""Calls queued or running while one is collected; each holds its probes' innovations in memory."""
 
 
 @cache
 def _threads() -> ThreadPoolExecutor:
-    """A program runs in the thread that calls it and leaves other cores idle."""
+    """Threads for compiled calls: one call uses one core."""
     return ThreadPoolExecutor(AHEAD, thread_name_prefix="responses")
 
 
@@ -56,7 +56,7 @@ def _respond(
         dt = h[None, None]
         kept = through(gap, nu)
         if instruments:
-            # states that instruments show otherwise go their way, and are read at its end
+            # propagate the state differences that instrument effects imply, then observe them
             away = _apart(model.infer(X0[:, None], V0[:, None], _wide(recent)))
             away = jnp.sum(p.jacobian[:, :, None] * away[None], axis=1)
             x, v = se3.retract(p.X[:, None], away[:6]), p.V[:, None] + away[6:]
@@ -74,7 +74,7 @@ def _respond(
             moved = kept - direct
         nu = jnp.sum(p.jacobian[:, :, None] * moved[None], axis=1) - direct
         nu = nu.at[:, 0].add(p.error)
-        # lane 0 carries the base's own innovation: nothing was changed there
+        # lane 0, the base, carries the innovation itself
         return (memory, nu, recent), through(white, nu) * exists[None, None]
 
     zero = jnp.zeros((12, lanes, V.shape[2]), V.dtype)
@@ -91,7 +91,7 @@ def _wide(recent: Recent) -> Recent:
 
 
 def _single(tree: Any) -> Any:
-    """Numbers of single precision: enough for changes of a wrench, in 0.7 of the time."""
+    """Arrays in single precision: enough for changes of a wrench, in 0.7 of the time."""
     return jax.tree.map(lambda a: a.astype(jnp.float32) if eqx.is_inexact_array(a) else a, tree)
 
 
@@ -113,9 +113,9 @@ def respond(
 ) -> Float[np.ndarray, "m N12 R"]:
     """Whitened innovations at `theta`, then the changes that each row of `probes` makes in them.
 
-    Rows of `probes` are differences from `theta`. Those of instruments go through one compiled
-    program in double precision, which poses take, all others through another one, `LANES` (or
-    `FEW`) at a time. Calls run side by side on as many cores as there are.
+    Rows of `probes` are differences from `theta`. Those of instruments use a compiled program in
+    double precision, which poses need, all others one in single precision, `LANES` (or `FEW`) at a
+    time. Up to `AHEAD` calls run in parallel.
     """
     arrays = as_arrays(data)
     filters = (jnp.asarray(kalman.keep), jnp.asarray(kalman.whiten), jnp.asarray(data.weight))
@@ -138,7 +138,7 @@ def respond(
     for instruments in (False, True):
         rows = np.flatnonzero(of_instruments == instruments)
         size = FEW if len(rows) <= FEW else INSTRUMENTS if instruments else LANES
-        alone = not len(probes) and not instruments  # the base is asked for in any case
+        alone = not len(probes) and not instruments  # the base is always evaluated
         for first in range(0, max(len(rows), alone), size):
             some = rows[first : first + size]
             chunk = np.zeros((size + 1, library.size))
@@ -158,7 +158,7 @@ def respond(
 def _of_family(
     lanes: tuple[Effect, ...], alike: tuple[Effect, ...], instruments: bool
 ) -> tuple[Effect, ...]:
-    """Effects whose values differ from lane to lane, those of the other family alike in all."""
+    """Effects with values by lane, those of the other family with the same value in all lanes."""
     return tuple(
         a if (a.family == "measurement") == instruments else b
         for a, b in zip(lanes, alike, strict=True)
@@ -166,7 +166,7 @@ def _of_family(
 
 
 def _apart(state: tuple[Array, Array]) -> Float[Array, "12 L R"]:
-    """How far the states of all lanes are from lane 0's, for angles well below a radian."""
+    """Differences of all lanes' states from lane 0's, for angles well below a radian."""
     X, V = state
     inverse = se3.inverse(X[:, :1])
     w, x, y, z = jnp.unstack(inverse[:4])

@@ -1,12 +1,12 @@
-"""What a step makes of errors: the mean of the Jacobians along the records, and their spread.
+"""Transition of errors over a step: mean and spread of the Jacobians along the records.
 
-Where instruments are noisy against the process, the noise enters the next error through Jacobians
+Where measurement noise is large against the process, it enters the next error through Jacobians
 that change from sample to sample (Munk's moment turns an error of the velocity into pitch, with the
-speed's sign): E[A P Aᵀ] is more than its mean makes of P.
+speed's sign): E[A P Aᵀ] is larger than Ā P Āᵀ.
 
-A push moves a late pose later than the twist beside it: of records X - δ V and V it makes
-T = [[1, -δ], [0, 1]] of what it makes of X and V. (Pushes within δ before a sample, of the order of
-δ^3/2, come in the next step; they are small against the pose's own noise.)
+A disturbance reaches a delayed pose later than the twist: its effect on records X - δ V and V is
+T = [[1, -δ], [0, 1]] times its effect on X and V. (Disturbances within δ before a sample, of the
+order of δ^3/2, enter the next step; they are small against the pose's own noise.)
 """
 
 from typing import NamedTuple
@@ -15,16 +15,16 @@ import numpy as np
 from jaxtyping import Float
 
 _SAMPLES = 4000
-"""Of so many samples the spread is taken, evenly."""
+"""Number of evenly spaced samples that the spread is computed from."""
 
 
 class Transition(NamedTuple):
-    """Of a step.
+    """Transition of errors over a step.
 
     Attributes:
         mean: Ā.
         spread: E[(A - Ā)_ij (A - Ā)_kl].
-        late: by how much poses are recorded later than twists, by axis (s).
+        late: delay of recorded poses against twists, by axis (s).
     """
 
     mean: Float[np.ndarray, "12 12"]
@@ -38,7 +38,7 @@ class Transition(NamedTuple):
         weight: Float[np.ndarray, "N R"],
         late: Float[np.ndarray, "6"],
     ) -> "Transition":
-        """That of all steps that exist.
+        """The transition over all steps that exist.
 
         Raises:
             FloatingPointError: a Jacobian is not finite.
@@ -55,11 +55,11 @@ class Transition(NamedTuple):
 
     @classmethod
     def constant(cls, A: Float[np.ndarray, "12 12"]) -> "Transition":
-        """The same A at all steps, of instruments that are in time."""
+        """The same A at all steps, without delays between instruments."""
         return cls(A, np.zeros([12] * 4))
 
     def added(self, P: Float[np.ndarray, "*b 12 12"]) -> Float[np.ndarray, "*b 12 12"]:
-        """What the spread adds to Ā P Āᵀ."""
+        """The term that the spread adds to Ā P Āᵀ."""
         return np.einsum("ijkl,...jl->...ik", self.spread, P, optimize=True)
 
     def of(self, P: Float[np.ndarray, "*b 12 12"]) -> Float[np.ndarray, "*b 12 12"]:

@@ -1,1 +1,1 @@
-"""Which causes are there together: hypotheses, search, model selection, refits."""
+"""Selection of a set of causes: hypotheses, search, model selection, refits."""

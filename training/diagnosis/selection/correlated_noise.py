@@ -1,10 +1,10 @@
-"""Causes beside a random structure: least squares where innovations depend on each other.
+"""Correlated noise: generalised least squares where innovations are not white.
 
-Pushes that last, a current that differs from run to run, and swell make innovations depend on each
-other. Names that only bend the mean then seem to explain them, for the state depends on past pushes
-too. Beside such a structure innovations and responses alike are made independent first: a slow push
-is predicted from the innovations before (an ARMA(1, 1), as `laws.colour` has it), and what is drawn
-anew for each piece is integrated out (Woodbury 1950), its size being known from its law.
+Slow disturbances, a current that differs from run to run, and swell make innovations correlated.
+Causes that only change the mean then seem to explain them, for the state depends on past
+disturbances too. Innovations and responses are therefore whitened first: a slow disturbance is
+predicted from past innovations (an ARMA(1, 1), as in `laws.colour`), and amplitudes drawn anew for
+each piece are integrated out (Woodbury 1950), with the variance of their law.
 """
 
 from dataclasses import dataclass, field
@@ -17,14 +17,14 @@ from ..filter.gram import gram
 
 @dataclass(frozen=True)
 class Beside:
-    """A random structure with known numbers.
+    """Correlated noise with known parameters.
 
     Attributes:
-        slow: of axes with slow pushes, by number: ρ, κ, and what each of the twelve innovations
-            has of the push that is predicted.
-        scale: standard deviations of the innovations without the pushes.
-        drawn: whitened responses to what is drawn for each piece (k, N·12, R).
-        precision: of each of these draws (k,).
+        slow: of axes with slow disturbances, by index: ρ, κ, and the regression coefficients of
+            the twelve innovations on the predicted disturbance.
+        scale: standard deviations of the innovations without the slow disturbances.
+        drawn: whitened responses to the amplitudes drawn for each piece (k, N·12, R).
+        precision: of each of these amplitudes (k,).
     """
 
     slow: dict[int, tuple[float, float, Float[np.ndarray, "12"]]] = field(default_factory=dict)
@@ -33,7 +33,7 @@ class Beside:
     precision: Float[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0))
 
     def products(self, z: Float[np.ndarray, "m N12 R"]) -> Float[np.ndarray, "R m m"]:
-        """Inner products of innovations and responses by piece, once they are independent."""
+        """Inner products of innovations and responses by piece, after whitening."""
         if self.drawn is not None:
             z = np.concatenate([z, self.drawn])
         G = gram(self._unslowed(z))
@@ -48,7 +48,7 @@ class Beside:
     def slowly(
         cls, z: Float[np.ndarray, "N 12 R"], numbers: dict[int, tuple[float, float]]
     ) -> "Beside":
-        """Slow pushes with ρ and κ by axis, the rest of their numbers from innovations `z`."""
+        """Slow disturbances with ρ and κ by axis; the rest is estimated from innovations `z`."""
         slow, left = {}, z.copy()
         for axis, (rho, kappa) in numbers.items():
             m = _predicted(z[None, :, 6 + axis], rho, kappa)[0]
@@ -76,7 +76,7 @@ class Beside:
 def _predicted(
     z: Float[np.ndarray, "m N R"], rho: float, kappa: float
 ) -> Float[np.ndarray, "m N R"]:
-    """What lasts of a slow part before each step."""
+    """Prediction of the slow disturbance before each step."""
     m = np.zeros_like(z)
     for n in range(z.shape[1] - 1):
         m[:, n + 1] = rho * (m[:, n] + kappa * (z[:, n] - m[:, n]))

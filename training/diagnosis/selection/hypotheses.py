@@ -62,7 +62,7 @@ def is_curved(library: Library, i: int) -> bool:
 
 @dataclass(frozen=True)
 class Fit:
-    """A hypothesis on all data, and on scenarios left out.
+    """Fit of a hypothesis to all data, and its gain on scenarios left out.
 
     Attributes:
         parameters: indices into θ.
@@ -89,13 +89,13 @@ class Fit:
 
 
 class Chance(NamedTuple):
-    """What noise alone wins at best: P(more than g nats) = exp((start - g) / scale) where small."""
+    """Largest gain in noise alone: P(more than g nats) = exp((start - g) / scale) where small."""
 
     start: float
     scale: float
 
     def exceeded(self, alpha: float) -> float:
-        """The gain that noise alone exceeds with this probability, of a tenth at most."""
+        """The gain that noise alone exceeds with probability `alpha` (0.1 at most)."""
         return float(max(self.start + self.scale * np.log(1 / min(alpha, 0.1)), 0.0))
 
     def beyond(self, gain: float) -> float:
@@ -104,7 +104,7 @@ class Chance(NamedTuple):
 
 
 def known_within(parameter: Parameter) -> float:
-    """Standard deviation of what is known of a parameter beforehand."""
+    """Prior standard deviation of a parameter."""
     return parameter.spread or PRIOR * parameter.probes[0]
 
 
@@ -129,13 +129,13 @@ class Evidence:
         del labels
 
     def scaled(self, products: Float[np.ndarray, "*R m m"]) -> Float[np.ndarray, "*R m m"]:
-        """Products of responses to parameters of one, from those to the probes as they are."""
+        """Products of responses per unit of each parameter, from those of responses to probes."""
         scale = np.concatenate([[1.0], 1 / self.design.size])
         return products * scale[:, None] * scale
 
     @cached_property
     def total(self) -> Float[np.ndarray, "m m"]:
-        """Sum over everything."""
+        """Sum over all folds."""
         return self.folds.sum(axis=0)
 
     def column(self, i: int) -> int:
@@ -143,12 +143,12 @@ class Evidence:
         return 1 + int(np.flatnonzero(self.design.owner == i)[0])
 
     def shows(self, i: int) -> bool:
-        """Whether a parameter changes anything here (an arm shows once there is a pull)."""
+        """Whether data are sensitive to a parameter (to a lever arm once there is a force)."""
         own = 1 + np.flatnonzero(self.design.owner == i)
         return bool(np.any(np.diag(self.total)[own] * self.design.size[own - 1] ** 2 > 1e-12))
 
     def prior(self, parameters: Sequence[int]) -> np.ndarray:
-        """Precision of the prior: weak, but where a parameter says how far it is known."""
+        """Precision of the prior: weak, except for parameters that declare a `spread`."""
         known = [known_within(self.library.entries[i].parameter) for i in parameters]
         return 1 / np.array(known) ** 2
 
@@ -200,7 +200,7 @@ class Evidence:
         return weights, float(t[best]), theta[best]
 
     def fit(self, parameters: Sequence[int], nuisance: Sequence[int] = ()) -> Fit:
-        """Fit a hypothesis, with nuisance parameters free in it and in what it is compared with."""
+        """Fit a hypothesis, with nuisance parameters free in it and in the null hypothesis."""
         named, parameters = list(parameters), [i for i in parameters if self.shows(i)]
         parameters = parameters or named
         extra = [i for i in nuisance if i not in named and self.shows(i)]
@@ -244,7 +244,7 @@ class Evidence:
         high: Float[np.ndarray, " k"],
         without: int | None = None,
     ) -> Float[np.ndarray, " k"]:
-        """The changes of θ that fit best between `low` and `high`, perhaps `without` a fold."""
+        """The changes of θ that fit best between `low` and `high`, optionally `without` a fold."""
         T = self.total if without is None else self.total - self.folds[without]
         place = {i: k for k, i in enumerate(parameters)}
         curved, linear = self._split([i for i in parameters if self.shows(i)])
@@ -265,7 +265,7 @@ class Evidence:
         return changes
 
     def least(self, T: Float[np.ndarray, "m m"], parameters: Sequence[int]) -> float:
-        """What is left of the loss ½ T_00 of some products at the best of these parameters."""
+        """Minimum over these parameters of the loss of some products T (½ T_00 without any)."""
         weights, _, _ = self._combine(T, *self._split([i for i in parameters if self.shows(i)]))
         return float(weights @ T @ weights) / 2
 
@@ -289,7 +289,7 @@ class Evidence:
         prior: np.ndarray,
         count: int,
     ) -> tuple[np.ndarray, float]:
-        """Robust standard errors, and the p value of the scores at the base being zero in mean.
+        """Robust standard errors, and the p value of a robust score test at the base.
 
         Errors are clustered by run, but no smaller than those of independent innovations: the
         spread between few runs is itself uncertain, and often small by chance.
@@ -313,7 +313,7 @@ class Evidence:
             wald = float(total @ np.linalg.solve(meat, total))
         except np.linalg.LinAlgError:
             wald = 0.0
-        # between few runs the statistic is bounded by their number: Hotelling's form
+        # with few runs the statistic is bounded by their number: Hotelling's form
         if n > count + 1:
             ratio = wald / n
             F = (n - count) / count * ratio / max(1 - ratio, 1e-300) if ratio < 1 else np.inf

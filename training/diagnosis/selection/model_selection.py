@@ -1,4 +1,4 @@
-"""Which name to give: vetoes, nesting, echoes, ties."""
+"""Model selection among causes: vetoes, nesting, echoes, ties."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,18 +15,18 @@ Hypothesis = tuple[str, str]
 MARGIN_NATS, MARGIN_SHARE = 10.0, 0.02
 ECHO_SHARE = 0.01
 CLEAR, CLEAR_OF_FEW = 5.0, 1.5
-"""Multiples of the threshold from which the robust p value is not asked: few clusters (runs, or
-pieces of a handful of runs) bound it, so few that only some of them show an effect bound it to
-nothing."""
+"""Multiples of the threshold above which the robust p value is not required: with few clusters
+(runs, or pieces of a few runs) it is bounded from below, and where only some of a few clusters show
+an effect it has no power."""
 _CLEARLY = 3.0
-"""Standard errors from which a parameter differs from zero."""
+"""Standard errors beyond which a parameter clearly differs from zero."""
 _FEW = 12
-"""Clusters that are few."""
+"""Number of clusters below which they count as few."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The name given, what it could as well be, who came next; a p value for all names tried."""
+    """The cause chosen, others not distinguishable from it, rivals; p value over all tried."""
 
     hypothesis: Hypothesis
     fit: Fit
@@ -36,7 +36,7 @@ class Choice:
 
 
 def admissible(library: Library, theta: Float[np.ndarray, " p"], fit: Fit) -> bool:
-    """Whether every estimate lies in its range; a sign that physics forbids vetoes a name."""
+    """Whether every estimate lies in its range; a sign that physics forbids vetoes a cause."""
     for i, change, error in zip(fit.parameters, fit.values, fit.errors, strict=True):
         p = library.entries[i].parameter
         value = theta[i] + change
@@ -48,7 +48,7 @@ def admissible(library: Library, theta: Float[np.ndarray, " p"], fit: Fit) -> bo
 
 
 def is_itself(library: Library, theta: Float[np.ndarray, " p"], fit: Fit) -> bool:
-    """Whether an essential parameter of the name clearly differs from zero, if it has any."""
+    """Whether an essential parameter of the cause clearly differs from zero, if it has any."""
     values = theta[list(fit.parameters)] + fit.values
     made_of = [
         abs(value) > _CLEARLY * error
@@ -59,7 +59,7 @@ def is_itself(library: Library, theta: Float[np.ndarray, " p"], fit: Fit) -> boo
 
 
 def margin(gain: float) -> float:
-    """How much a name with more freedom must win by."""
+    """Nats by which a cause with more parameters must win."""
     return max(MARGIN_NATS, MARGIN_SHARE * gain)
 
 
@@ -72,14 +72,14 @@ def choose(
     accepted: Mapping[str, float] | None = None,
     strict: bool = False,
 ) -> Choice | None:
-    """The name that explains most, or None where nothing passes.
+    """The cause that explains most, or None where nothing passes.
 
-    To pass, a name needs a held-out gain above `threshold` (calibrated for the number of names), a
-    robust p value that survives Bonferroni unless the gain is clear (`strict`: even then),
-    admissible estimates, and what makes it that name.
-    Echoes of names accepted before (with their gains) must win one per cent of those. Among the
-    rest the largest held-out gain leads; a simpler name replaces it unless clearly beaten. Ties are
-    names within two standard errors of the difference, clustered by run.
+    To pass, a cause needs a held-out gain above `threshold` (calibrated for the number of causes),
+    a robust p value that survives Bonferroni unless the gain is clear (`strict`: even then),
+    admissible estimates, and an essential parameter that differs from zero.
+    Echoes of causes accepted before must win one per cent of their gains (`accepted`). The largest
+    held-out gain is chosen; a simpler cause replaces it unless clearly beaten. Ties are
+    causes within two standard errors of the difference, clustered by run.
     """
     accepted = accepted or {}
     passing: dict[Hypothesis, Fit] = {}
@@ -117,7 +117,7 @@ def choose(
 
 
 def p_value(fit: Fit, tried: int, chance: Chance) -> float:
-    """Of the best of the names tried: the robust one, or that of a clear gain in noise alone."""
+    """Of the best of the causes tried: the robust one, or that of a clear gain in noise alone."""
     return min(1.0, fit.p_value * tried, chance.beyond(fit.heldout_gain / _clear(fit)))
 
 

@@ -1,16 +1,16 @@
-"""Fits to forecasts over a horizon, for records whose one-step errors tell more of the record.
+"""Multi-step fits, for records whose one-step errors come mostly from their preprocessing.
 
-Innovations (`looking`) are the better statistic where records are raw: noise white, steps as
-measured. States that were smoothed, averaged in bins or resampled have one-step errors that are
-correlated, and drag fitted to them answers for the smoothing. Here the model forecasts windows from
-the record at their start, without noise, and the errors all along the window are made small,
+Innovations (`problem`) are the better statistic where records are raw: white noise, original time
+steps. States that were smoothed, averaged in bins or resampled have correlated one-step errors, and
+drag fitted to them absorbs the smoothing. Here the model forecasts windows from the record at their
+start, without noise, and all errors along the window are minimised,
 
     min_θ Σ_windows Σ_k ρ(|e_k(θ)|² / s²),   e_k = (X̂_k, V̂_k) ⊖ (X_k, V_k),
 
-with s a robust size of each component under the belief and ρ(x) = 2 (√(1 + x) - 1) (Charbonnier et
-al. 1997), which a flicker of markers doesn't pull. Errors of θ are robust against dependence within
-blocks (sandwich). The price: process noise in the window biases drag by a little, and times below
-a few steps are told less sharply.
+with s a robust size of each component under the believed model and ρ(x) = 2 (√(1 + x) - 1)
+(Charbonnier et al. 1997), which limits the weight of outliers of motion capture. Standard errors of
+θ are robust against dependence within blocks (sandwich). The price: process noise in the window
+biases drag slightly, and lags and delays below a few steps are less well resolved.
 """
 
 from collections.abc import Sequence
@@ -43,11 +43,11 @@ class Windows:
     Attributes:
         X, V: records 0 … M (M + 1, 7, K), (M + 1, 6, K).
         u: thruster forces (M, n, K).
-        past: commands of the steps before, oldest first (P, n, K), for what remembers.
+        past: commands of the steps before, oldest first (P, n, K); they set actuator states.
         past_step: how long each was held (s) (P, K).
         voltage: relative (M, K).
         step: from record k to k + 1 (s) (M, K).
-        block: which windows depend on each other (K,): those of one stretch of time.
+        block: index of the stretch of time (K,), within which windows depend on each other.
         scenario: index of the scenario (K,).
     """
 
@@ -78,7 +78,7 @@ class HorizonFit:
 
 
 def windows(data: Data, horizon: float, every: float, block: float = 10.0) -> Windows:
-    """Windows of `horizon` s that start `every` s; those within `block` s hang together."""
+    """Windows of `horizon` s that start `every` s, in blocks of `block` s."""
     M, step = max(1, round(horizon / data.dt)), max(1, round(every / data.dt))
     parts: dict[str, list[np.ndarray]] = {
         k: [] for k in ("X", "V", "u", "past", "past_step", "voltage", "step")
@@ -146,7 +146,7 @@ def _arrays(w: Windows) -> tuple:
 
 
 def small(bench: Bench, rows: Sequence[int], theta: np.ndarray) -> tuple[Library, list[int]]:
-    """The library of the effects in use alone, and where its numbers stand in the bench's."""
+    """The library of the effects in use, and its parameters' indices in the problem's library."""
     used = {bench.library.entries[i].cause for i in rows}
     used |= {bench.library.entries[i].cause for i in np.flatnonzero(theta)}
     library = Library([e for e in bench.library.effects if e.name in used])
@@ -157,7 +157,7 @@ def small(bench: Bench, rows: Sequence[int], theta: np.ndarray) -> tuple[Library
 def forecast_errors(
     bench: Bench, theta: Float[np.ndarray, " p"], w: Windows
 ) -> Float[np.ndarray, "M 12 K"]:
-    """Forecast less record, pose seen from the recorded body (m, rad), then twist."""
+    """Forecast minus record: pose in the recorded body frame (m, rad), then twist."""
     library, at = small(bench, (), theta)
     effects = library.filled(theta[at])
     return np.asarray(_apart(bench.model, effects, _arrays(w), w.count))
@@ -188,7 +188,7 @@ def fit_forecasts(
     probe = np.array([abs(p.probes[0]) for p in entries])
     arrays = _arrays(w)
     best = theta[at]
-    # where a response has no slope at zero (lag, delay), start a probe away
+    # where a response has no slope at zero (lag, delay), start at the first probe
     start = best[own]
     flat = np.array([len(p.probes) > 2 and min(p.probes) > 0 for p in entries]) & (start == 0)
     best[own] = np.clip(np.where(flat, probe, start), low, high)
@@ -228,7 +228,7 @@ def _is_body(bench: Bench, library: Library, values: np.ndarray) -> bool:
 
 
 def _loss(e: np.ndarray, size: np.ndarray) -> float:
-    with np.errstate(over="ignore", invalid="ignore"):  # a step too far diverges
+    with np.errstate(over="ignore", invalid="ignore"):  # too long a step diverges
         x = np.sum((e / size[:, None]) ** 2, axis=1) / e.shape[1]
     return float(np.mean(2 * (np.sqrt(1 + x) - 1))) if np.isfinite(x).all() else np.inf
 
@@ -278,7 +278,7 @@ def rmse(
 ) -> dict[str, tuple[float, float, float]]:
     """RMSE at the windows' end, or its ratio to that of `than`, with 95 % intervals.
 
-    Intervals come from drawing whole blocks again (Künsch 1989), the same ones for both.
+    Intervals are from a block bootstrap (Künsch 1989), with the same blocks for both.
     """
     labels, index = np.unique(block, return_inverse=True)
     drawn = rng.integers(len(labels), size=(draws, len(labels)))

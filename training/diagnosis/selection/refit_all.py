@@ -1,11 +1,11 @@
-"""A belief that is wrong in most of its numbers, brought near the data before anything is named.
+"""Joint fit of all coefficients of a grey-box model, before any cause is selected.
 
-Where every coefficient is off, names that are tried one by one explain each other's errors. With
-`--refit all` the coefficients of a grey box are fitted together first: added mass, drag, buoyancy
-and restoring moment, the thrusters' curve, what they push along each axis and their levers. Motion
-alone tells all of these in proportion to each other. The scale is that of the rigid body's mass and
-inertia, which one can weigh and compute; added mass and drag are not negative, and thrust lies as
-near to the belief as that allows.
+Where most coefficients are wrong, causes that are tried one by one fit each other's errors. With
+`--refit all` the coefficients are fitted together first: added mass, drag, buoyancy and restoring
+moment, the thrust curve, thrust along each axis and its lever arms. Motion alone determines all of
+these only relative to each other. The scale is that of the rigid body's mass and inertia, which can
+be weighed and computed; added mass and drag are not negative, and thrust is as near to the believed
+one as that allows.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,22 +29,22 @@ OF_ALL = {
     "thrust_asymmetry": ("reverse_gain", 0.5),
     "thruster_dead_zone": ("width", 3.0),
 }
-"""Parameters of effects in all thrusters alike, and how far they are known beforehand."""
+"""Parameters of effects common to all thrusters, and their prior standard deviations."""
 _ROUNDS, _TRIES = 40, 8
 _ENOUGH = 1.0
-"""Nats a round from which a fit goes on."""
+"""Gain of a round (nats) below which the fit ends."""
 _START = 0.3
-"""Dead zone and offset (N) to start from: at none their responses are one-sided."""
+"""Dead zone and offset (N) to start from: at zero their responses are one-sided."""
 _COMMON = 13
-"""Samples by which a piece's covariance is drawn to that of all: as many as give it an inverse."""
+"""Prior weight (samples) of the pooled covariance in a piece's own: enough for an inverse."""
 _DRAG, _BUOYANCY, _DELAY = 3.0, 20.0, 0.01
-"""How far drag (in multiples of itself), net buoyancy (N) and the commands' delay (s) are known
-beforehand."""
+"""Prior standard deviations of drag (in multiples of itself), net buoyancy (N) and the commands'
+delay (s)."""
 
 
 @dataclass(frozen=True)
 class Coefficient:
-    """A number of θ with what is known of it: standard deviation about the belief, and range."""
+    """An entry of θ with its prior standard deviation about the believed value, and its range."""
 
     row: int
     spread: float
@@ -53,7 +53,7 @@ class Coefficient:
 
 
 def with_coefficients(bench: Bench) -> Bench:
-    """The bench with the effects that only such a fit has, and bounds that physics sets."""
+    """The problem with the effects that only this fit has, and physical bounds."""
     level, of_pulses = bench.data.command != "F_Bo_B", bench.data.command == "pwm"
     for name, kind in COEFFICIENTS.items():
         if (name in CURVE and not level) or (name in PULSES and not of_pulses):
@@ -65,7 +65,7 @@ def with_coefficients(bench: Bench) -> Bench:
 
 
 def coefficients(bench: Bench) -> list[Coefficient]:
-    """All that is fitted."""
+    """All coefficients that are fitted."""
     library, found = bench.library, []
     level, of_pulses = bench.data.command != "F_Bo_B", bench.data.command == "pwm"
     rigid = np.diag(np.asarray(bench.model.rigid_inertia))
@@ -83,7 +83,7 @@ def coefficients(bench: Bench) -> list[Coefficient]:
             spread = _DELAY
         elif cause in OF_ALL and level and where == "all" and p.name == OF_ALL[cause][0]:
             if cause == "thruster_dead_zone" and of_pulses:
-                continue  # an offset says more
+                continue  # the offset of pulses replaces it
             spread = OF_ALL[cause][1]
         elif cause not in (*WRENCH, *CURVE, *PULSES):
             continue
@@ -97,14 +97,14 @@ def identify(
     start: Float[np.ndarray, " p"] | None = None,
     also: Sequence[int] = (),
 ) -> Float[np.ndarray, " p"]:
-    """θ with all coefficients where data and prior have them (Levenberg 1944).
+    """Maximum a posteriori θ of all coefficients, by damped Gauss–Newton (Levenberg 1944).
 
-    Steps are damped in units of what is known beforehand, so that they are short along valleys that
-    data leave flat, which are curved, and whole across them.
+    Steps are damped in units of the prior standard deviations, so that they are short along the
+    flat, curved valleys that data leave undetermined, and full across them.
 
-    From the belief, or from `start`; with the parameters `also` of causes free beside them. Every
-    step is weighed by the covariances that the one-step errors of pose and of twist have at it, in
-    each piece its own: that asks for no noise levels that a wrong model makes too large, and an
+    It starts at the believed θ, or at `start`; the parameters `also` of causes are free too. Each
+    step weights one-step errors by their covariances (of pose and of twist) at the current θ, piece
+    by piece. That needs no noise levels, which a wrong model makes too large, and an
     estimator's slow errors do less harm where the vehicle rests than where drag multiplies them.
     """
     chosen = [*coefficients(bench), *_beside(bench, also)]
@@ -136,7 +136,7 @@ def identify(
         seen = bench.look(theta, rows, one_step(bench, theta))
         gradient, H = _quadratic(seen, rows)
         gradient = (gradient + (theta[rows] - centre) / spread**2) * spread
-        # products of responses are rounded; with the prior no eigenvalue is below 1
+        # but for rounding, no eigenvalue is below 1 with the prior
         values, vectors = np.linalg.eigh(H * np.outer(spread, spread) + np.eye(len(rows)))
         values = np.maximum(values, 1.0)
         for _ in range(_TRIES):
@@ -158,7 +158,7 @@ def identify(
 
 
 def _beside(bench: Bench, rows: Sequence[int]) -> list[Coefficient]:
-    """Parameters of causes as coefficients: known no better than a name's prior has them."""
+    """Parameters of causes as coefficients, with the priors and bounds that they have as causes."""
     low, high = bench.limits(rows)
     return [
         Coefficient(i, known_within(bench.library.entries[i].parameter), a, b)
@@ -167,7 +167,7 @@ def _beside(bench: Bench, rows: Sequence[int]) -> list[Coefficient]:
 
 
 def one_step(bench: Bench, theta: Float[np.ndarray, " p"]) -> Filter:
-    """The filter that believes every record: innovations are one-step errors, whitened."""
+    """The filter with the gain K = I: its innovations are one-step errors, whitened."""
     error = bench.errors(theta)
     C, _ = _by_piece(bench, error, bench.covariance(error, apart=True))
     whiten = np.moveaxis(np.linalg.inv(np.linalg.cholesky(C)), 0, -1)
@@ -179,9 +179,9 @@ def one_step(bench: Bench, theta: Float[np.ndarray, " p"]) -> Filter:
 def _by_piece(
     bench: Bench, error: Float[np.ndarray, "N 12 R"], common: Float[np.ndarray, "12 12"]
 ) -> tuple[Float[np.ndarray, "R 12 12"], Float[np.ndarray, " R"]]:
-    """Covariance of each piece's one-step errors, and of how many samples it is one.
+    """Covariance of each piece's one-step errors, and its number of samples with the prior's.
 
-    It is the most likely under an inverse Wishart prior with the mean that all have in `common`.
+    It is the estimate under an inverse Wishart prior centred on `common`.
     """
     C = np.einsum("nir,njr->rij", error, error)
     C[:, :6, 6:], C[:, 6:, :6] = 0.0, 0.0

@@ -1,4 +1,4 @@
-"""Which causes are there together: forward selection with exact refits, and checks backwards."""
+"""Forward selection of causes with exact refits, and backward elimination."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -31,40 +31,40 @@ from .refit_all import coefficients
 BELIEFS = ("added_mass", "linear_drag", "quadratic_drag", "net_buoyancy")
 """Coefficients that a user would expect fitted."""
 UNSCALED = ("axis_thrust", "linear_drag", "quadratic_drag", "net_buoyancy")
-"""Those that a command of unknown scale leaves, with the inertia as it is believed."""
+"""Coefficients to fit where commands have an unknown scale; the inertia stays as believed."""
 REFITS = {"none": (), "scales": ("thrust_scale",), "linear": BELIEFS, "command": UNSCALED}
 _HANGING = ("net_buoyancy", "centre_of_gravity")
-"""What a vehicle shows that is left alone."""
+"""Causes that are identifiable without commands."""
 _TIMES = ("thruster_lag", "actuation_delay", "clock_offset")
 _CLOSE = 0.7
 _TAKEN_BACK = 2
 _OF_A_LAW = 0.02
-"""Share of what the best law wins that a name must win where the law wins more."""
+"""Share of the best law's gain that a cause must win where the law wins more."""
 _OF_A_DESCRIPTION = 0.02
-"""Share of what structure without a name wins that a name or law must win beside it: a few bumps or
-one frequency describe no more exactly."""
+"""Share of the gain of unmodelled structure that a further cause or law must win: a nonparametric
+fit (a few bumps, one frequency) may leave a residual of that size."""
 _LEFT = 0.05
-"""Share of what the laws win that is hardly anything."""
+"""Share of the laws' gain below which they count as explained."""
 _OF_ESTIMATES = 0.05
-"""Nats a sample that a name must win where states were estimated: below that a name may as well
-explain what the estimator makes of its own errors."""
+"""Nats a sample that a cause must win where states were estimated: below that it may fit the
+estimator's own errors."""
 _HALVED = math.log(2.0)
-"""Or nats a sample by which it makes one-step errors likelier: an axis' errors are halved. Records
-of a simulation without noise look like estimates too, until the name is found."""
+"""Or nats a sample by which it makes one-step errors likelier: as if an axis' errors were halved.
+Records of a noise-free simulation look like estimates too, until the cause is found."""
 
 
 @dataclass
 class Found:
-    """Where a search has come to.
+    """State of a search.
 
     Attributes:
-        base, first, current: the belief, the belief refitted, and with the causes.
+        base, first, current: evaluations of the believed model, refitted, and with the causes.
         accepted: causes in the order found.
-        fits: every name alone, beside the belief refitted.
-        left: every further name beside those accepted.
-        dropped: causes that others made needless; they are not tried again.
-        chance: what noise alone wins of held-out nats in the last round.
-        threshold: what it exceeds with the rate of false alarms.
+        fits: of every cause alone, with the nuisance parameters free.
+        left: fits of every further cause, with those accepted free.
+        dropped: causes rejected or made redundant by others; they are not tried again.
+        chance: distribution of the held-out gain (nats) of noise alone in the last round.
+        threshold: what noise alone exceeds with the false-alarm rate (nats).
     """
 
     base: Look
@@ -79,18 +79,18 @@ class Found:
 
     @property
     def hypotheses(self) -> list[Hypothesis]:
-        """The causes named."""
+        """The causes accepted."""
         return [choice.hypothesis for choice in self.accepted]
 
     @property
     def left_undescribed(self) -> float:
-        """Nats that descriptions of structure without a name may leave of it."""
+        """Nats that accepted unmodelled structure may leave unexplained."""
         described = (c.fit.heldout_gain for c in self.accepted if c.hypothesis[0] == "unknown")
         return _OF_A_DESCRIPTION * sum(described)
 
 
 def refitted(bench: Bench, refit: str) -> list[int]:
-    """Parameters that are free beside every cause."""
+    """Nuisance parameters: free in the fit of every cause."""
     if refit == "all":
         return [c.row for c in coefficients(bench)]
     entries = enumerate(bench.library.entries)
@@ -98,7 +98,7 @@ def refitted(bench: Bench, refit: str) -> list[int]:
 
 
 def _asks_for_commands(named: Hypothesis, quiet: Sequence[str]) -> bool:
-    """Whether a cause can't be told because axes were not driven: its own, or all of them."""
+    """Whether a cause is not identifiable because its axis, or no axis at all, was driven."""
     name, where = named
     if len(quiet) == len(AXES):
         return kind(name).family in ("actuation", "body") and name not in _HANGING
@@ -106,7 +106,7 @@ def _asks_for_commands(named: Hypothesis, quiet: Sequence[str]) -> bool:
 
 
 class Search:
-    """Forward selection on a bench; `rng` draws what noise alone can win."""
+    """Forward selection of causes; `rng` draws the gains of noise alone."""
 
     def __init__(
         self,
@@ -119,7 +119,7 @@ class Search:
         quiet: Sequence[str] = (),
         shortest: float = 0.0,
     ):
-        """`quiet` axes are not identifiable; times below `shortest` (s) are no cause."""
+        """`quiet` axes are not identifiable; lags and delays below `shortest` (s) are rejected."""
         self.bench, self.nuisance, self.alpha, self.most = bench, nuisance, alpha, most
         self.rng, self.progress = rng, progress
         free = {bench.library.entries[i].cause for i in nuisance}
@@ -132,10 +132,10 @@ class Search:
         self._asked: tuple[Look, tuple[Choice | None, dict[Hypothesis, Fit]]] | None = None
 
     def run(self, found: Found, most: int | None = None) -> "Search":
-        """Add causes to `found` until none passes, or `most` are there; all are refitted together.
+        """Add causes to `found` until none passes, or `most` are found; all are refitted together.
 
-        Where exact fits take back what was added `_TAKEN_BACK` times in a row, what names promise
-        is not to be had: the rest of them is not tried.
+        It ends where exact fits reject `_TAKEN_BACK` causes in a row: linearised gains then do not
+        hold for the rest either.
         """
         taken_back = 0
         for number in range(len(found.accepted), min(most or self.most, self.most)):
@@ -161,9 +161,9 @@ class Search:
         return self
 
     def next(self, found: Found) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
-        """The name that explains most of what is left, and the fits of all names.
+        """The cause that explains most of the residual, and the fits of all causes.
 
-        It is kept until another fit is current: causes are added and dropped with a new one.
+        The answer is cached as long as `found.current` is the same evaluation.
         """
         if self._asked is None or self._asked[0] is not found.current:
             answer = self._next(found)
@@ -171,11 +171,11 @@ class Search:
         return self._asked[1]
 
     def _next(self, found: Found) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
-        """Where a law wins more than the best name, names must hold between runs by themselves.
+        """Where a law wins more than the best cause, causes must pass the robust test between runs.
 
-        Unless nothing is left of the law once the name is fitted: chance is not explained by a few
-        numbers. Where that law lasts, so that names imitate it, they are judged beside it: what it
-        wins on all axes counts.
+        The exception is a cause whose fit leaves hardly any gain to the law: a few constants can't
+        fit a random disturbance. Where the law is a slow one (its gain summed over axes), which
+        causes can imitate, they are tested with it as correlated noise.
         """
         if self.bench.beside is not None:
             self._judge_beside(None, found)
@@ -197,10 +197,10 @@ class Search:
     def _explaining(
         self, choice: Choice, fits: dict[Hypothesis, Fit], found: Found, law: float
     ) -> Choice | None:
-        """The first of the best names that leaves hardly anything of what the laws win.
+        """The first of the best causes that leaves hardly any gain to the laws.
 
-        Names whose numbers multiply each other (a pull and its lever) win little before they are
-        fitted.
+        Each is fitted exactly first: causes whose parameters multiply each other (a force and its
+        lever arm) win little in a linear fit.
         """
         names = [choice.hypothesis, *(h for h, _ in choice.rivals)]
         for h in names:
@@ -216,9 +216,9 @@ class Search:
         return None
 
     def _exact(self, fit: Fit, theta: Float[np.ndarray, " p"], seen: Look, found: Found) -> Fit:
-        """A fit with its exact values, and the nats that they win less one a number.
+        """A fit with its exact values, and their gain in nats less one a parameter (AIC).
 
-        Each by a filter of its own: what a name explains is no noise any more.
+        Each side has its own filter: what a cause explains no longer counts as noise.
         """
         current, rows = found.current, list(fit.parameters)
         weight = self.bench.data.weight
@@ -271,13 +271,13 @@ class Search:
         return choice, fits
 
     def _halves(self, choice: Choice, current: Look) -> bool:
-        """Whether a name makes the one-step errors much smaller than they are."""
+        """Whether a cause makes the one-step errors much smaller."""
         theta = self._start(choice.fit, current.theta)
         won = self.bench.loss_of(current) - self.bench.loss(theta)
         return bool(won >= _HALVED * self.bench.data.steps)
 
     def _about_thrust(self, choice: Choice) -> bool:
-        """Whether the best names so far leave it open that a single thruster is at fault."""
+        """Whether the best causes so far leave it possible that a single thruster is at fault."""
         names = [choice.hypothesis[0], *(h[0] for h, _ in choice.rivals[:2])]
         level = self.bench.data.command != "F_Bo_B"
         return level and any(kind(name).family == "actuation" for name in names)
@@ -285,7 +285,7 @@ class Search:
     def _single_thrusters(
         self, current: Look, beside: list[int], taken: list[Hypothesis]
     ) -> dict[Hypothesis, Fit]:
-        """Fits of causes in one thruster each, by the filter of the other names."""
+        """Fits of causes in one thruster each, with the filter of the other causes."""
         library = self.bench.library
         names = [h for h in library.hypotheses(single=True) if h not in taken]
         chosen = sorted({*parameters_of(library, names), *beside})
@@ -293,9 +293,9 @@ class Search:
         return {h: seen.evidence.fit(library.at(*h), beside) for h in names}
 
     def _holds(self, seen: Look, named: Hypothesis, found: Found) -> bool:
-        """Whether a name predicts data left out of its fit better, by exact predictions.
+        """Whether a cause improves exact predictions of data left out of its fit.
 
-        Where few runs show it, what their responses promise may not be had: they bend.
+        Where few runs show it, the linearised gain may not hold: responses are nonlinear.
         """
         bench, names = self.bench, found.hypotheses
         rows = self.nuisance + parameters_of(bench.library, names)
@@ -316,8 +316,8 @@ class Search:
     def _fitted(
         self, h: Hypothesis, fits: dict[Hypothesis, Fit], found: Found, kalman: Filter | None
     ) -> tuple[Float[np.ndarray, " p"], Look, Fit]:
-        """A name fitted with exact predictions, beside all that was found; the fit has its own
-        numbers alone, as they are.
+        """A cause fitted with exact predictions, jointly with all accepted ones; the fit returned
+        has its own parameters alone, as values and not as changes.
         """
         beside = self.nuisance + parameters_of(self.bench.library, found.hypotheses)
         chosen = [*self.bench.library.at(*h), *beside]
@@ -328,7 +328,7 @@ class Search:
     def _refine(
         self, choice: Choice, fits: dict[Hypothesis, Fit], found: Found
     ) -> tuple[Choice, Float[np.ndarray, " p"]]:
-        """Fit the name with exact predictions; let close rivals try the same, and take the best."""
+        """Fit the cause and its close rivals with exact predictions, and take the best."""
         library, bench = self.bench.library, self.bench
         beside = self.nuisance + parameters_of(library, found.hypotheses)
         top = choice.hypothesis
@@ -344,7 +344,7 @@ class Search:
             other, rival, alone = self._fitted(h, fits, found, seen.kalman)
             named = library, np.zeros_like(other), alone
             within = admissible(*named) and is_itself(*named)
-            # what is nested in a name keeps it unless clearly beaten; more numbers must pay
+            # a cause nested in the rival stays unless clearly beaten; parameters cost a nat each
             least = 2.0 if best.loss == start_loss else 0.0
             least += max(len(library.at(*h)) - len(library.at(*top)), 0)
             if top[0] in kind(h[0]).simpler:
@@ -359,7 +359,7 @@ class Search:
         return Choice(top, fits[top], ties, others), theta
 
     def _backward(self, found: Found) -> None:
-        """Drop causes that those found later have made needless, and refit the rest."""
+        """Drop causes that later ones have made redundant, and refit the rest."""
         library, current = self.bench.library, found.current
         chosen = parameters_of(library, found.hypotheses)
         kept, theta = [], current.theta.copy()
@@ -367,7 +367,7 @@ class Search:
             own = library.at(*choice.hypothesis)
             others = [i for i in chosen if i not in own]
             weight = 0.0
-            if current.theta[own].any():  # else the joint fit itself has taken it back
+            if current.theta[own].any():  # else the joint fit itself has set it to zero
                 errors = current.evidence.fit(own, others).errors
                 weight = float(np.sum((current.theta[own] / np.maximum(errors, 1e-300)) ** 2)) / 2
             if weight > found.threshold:
@@ -383,6 +383,6 @@ class Search:
 
 
 def _of_one(rows: Sequence[int], theta: Float[np.ndarray, " p"], joint: Fit) -> Fit:
-    """Numbers of one name as they are (no changes), with their errors in a joint fit."""
+    """Parameters of one cause as values (no changes), with their errors in a joint fit."""
     errors = np.array([joint.errors[joint.parameters.index(i)] for i in rows])
     return Fit(tuple(rows), theta[list(rows)], {}, errors, 0.0, np.zeros(1), 1.0)

@@ -1,1 +1,1 @@
-"""Laws of the disturbance: level, memory, tails, waves, varying currents."""
+"""Laws of the disturbance: level, colour, heavy tails, waves, varying currents."""

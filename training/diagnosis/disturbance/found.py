@@ -1,4 +1,4 @@
-"""Laws of the disturbance in what is left: which there are, and which are told."""
+"""Disturbance laws of the residual: which are found, and which are reported."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,20 +18,20 @@ from .levels import LEVEL, beside_slow, find_levels, process_share
 from .waves import are_waves, find_current, find_waves
 
 _BLOW = 4.0
-"""Standard deviations beyond which an error is a blow's."""
+"""Standard deviations beyond which an error counts as an impact."""
 _SHORTEST, _SMALLEST = 3.0, 0.1
-"""Steps that a colour must last, share by which a level must differ."""
+"""Least time constant of a colour (steps), and least relative change of a level."""
 _MOST_AXES = 3
-"""Axes on which errors repeat from which it is no water that moves at random."""
+"""Number of axes with repeating errors from which randomly moving water is ruled out."""
 SLOW = ("waves", "disturbance_colour", "current_varying")
 _AS_WELL = 1.0
-"""Nats by which growth with the speed may explain less than a level to explain it as well."""
+"""Nats that growth with the speed may win less than a level and still explain it."""
 OF_OTHERS = 1e-3
-"""Share of what others win that a law must win besides: they leave some of their own."""
+"""Share of other findings' gain that a law must win: they leave a residual of that order."""
 
 
 def laws_of(bench: Bench, look: Look) -> list[Law]:
-    """Laws of the disturbance in what is left, largest gain first.
+    """Disturbance laws of the residual, largest gain first.
 
     None where states were estimated: errors of an estimator are no disturbance.
     """
@@ -53,17 +53,17 @@ def laws_of(bench: Bench, look: Look) -> list[Law]:
 
 
 def won_by(name: str, laws: Sequence[Law]) -> float:
-    """What a law wins on all axes together (nats)."""
+    """Gain of a law on all axes together (nats)."""
     return sum((max(law.heldout_gain, 0.0) for law in laws if law.name == name), 0.0)
 
 
 def best_law(bench: Bench, look: Look) -> float:
-    """What the best law of the disturbance wins on data left out (nats)."""
+    """Held-out gain of the best disturbance law (nats)."""
     return max((law.heldout_gain for law in laws_of(bench, look)), default=0.0)
 
 
 def all_laws(bench: Bench, look: Look, least: float) -> list[Law]:
-    """Laws of what is left, waves and level included, largest gain first."""
+    """Disturbance laws of the residual, waves and level included, largest gain first."""
     found = laws_of(bench, look)
     alike = repeating(look.z, bench.data)
     slow = [law for law in found if law.name == "disturbance_colour"]
@@ -71,12 +71,12 @@ def all_laws(bench: Bench, look: Look, least: float) -> list[Law]:
         waves, current = find_waves(bench, look), find_current(bench, look)
         if are_waves(waves, slow):
             found.append(waves)
-        # one motion of the water against pushes on every axis, or against one that stays
+        # one motion of the water against disturbances by axis, or against a constant current
         stays = won_by("current_varying", found)
         if current.heldout_gain > max(won_by("disturbance_colour", slow), stays + margin(stays)):
             found = [law for law in found if law.name != "current_varying"]
             found.append(current)
-    # what repeats with the commands is no chance
+    # errors that repeat with the commands are not random
     water = {"W"} if len(alike) >= _MOST_AXES else set()
     found = [law for law in found if law.name not in SLOW or law.where not in {*alike, *water}]
     found += find_levels(bench, look, least)
@@ -84,19 +84,19 @@ def all_laws(bench: Bench, look: Look, least: float) -> list[Law]:
 
 
 def passing(laws: Sequence[Law], bench: Bench, least: float) -> list[Law]:
-    """Laws that win more than `least` nats by more than the noise levels alone can be in error."""
+    """Laws that win more than `least` nats and that errors of the noise levels can't imitate."""
     return [law for law in laws if law.heldout_gain > least and _is_apart(law, bench)]
 
 
 def told(laws: Sequence[Law], bench: Bench, look: Look, least: float) -> list[list[Law]]:
-    """Which of the laws that pass are told, in groups of one name each, largest first.
+    """Which of the laws that pass are reported, in groups of one name each, largest first.
 
-    Of laws with a structure one name is told. Levels differ with any of them: a slow one disturbs
-    the estimate of b, one that comes and goes is a part of it. A level stands beside a slow one
-    if the believed one loses more than `least` nats beside pushes that last; beside growth with
-    the speed if that alone explains less than the level alone, beside blows if it holds between
-    them, and then if it is the larger part of the change. A structure must win more than what the
-    level leaves of its own.
+    Of laws with a structure one name is reported. Each of them changes levels: a slow one biases
+    the estimate of b, an intermittent one is part of it. A level is reported with a slow law if the
+    believed level loses more than `least` nats in a fit with slow disturbances; with growth with
+    the speed if growth alone explains less than the level alone, with impacts if it holds between
+    them, and with either only if it is the larger part of the change. A structure must win more
+    than the residual that the level leaves.
     """
     passed = passing(laws, bench, least)
     levels = [law for law in passed if law.name == LEVEL]
@@ -122,7 +122,7 @@ def told(laws: Sequence[Law], bench: Bench, look: Look, least: float) -> list[li
 
 
 def _level_beside(law: Law, shaped: Sequence[Law], bench: Bench, look: Look) -> Law | None:
-    """A level with what is left of its change beside laws of one name, if it stands."""
+    """A level with the change that laws of one name leave to it, or None if they explain it."""
     i, name = AXES.index(law.where), shaped[0].name
     if name in SLOW:
         return law
@@ -142,10 +142,10 @@ def _level_beside(law: Law, shaped: Sequence[Law], bench: Bench, look: Look) -> 
 def _grown(
     laws: Sequence[Law], shaped: Sequence[Law], levels: Sequence[Law], bench: Bench, look: Look
 ) -> tuple[list[Law], list[Law]]:
-    """Axes that grow with the speed, and levels beside them.
+    """Laws of growth with the speed, and the levels that remain.
 
     Where growth from the believed levels wins more than levels without it, levels of these axes are
-    a part of it, and so are those of others that the speed explains as well. Growth is told of
+    part of it, and so are those of other axes that growth explains as well. Growth is reported on
     those others where it wins on data left out.
     """
     data = bench.data
@@ -165,7 +165,7 @@ def _grown(
 
 
 def _without_blows(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
-    """Diffusion estimated from the steps without a blow at their begin, at their end or before."""
+    """Diffusion estimated from steps without an impact in them or in a neighbouring step."""
     data = bench.data
     error, jacobian = np.asarray(look.predictions.error), np.asarray(look.predictions.jacobian)
     exists = data.weight > 0
@@ -181,7 +181,7 @@ def _without_blows(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
 
 
 def _is_apart(law: Law, bench: Bench) -> bool:
-    """Whether a law differs from what the noise levels alone can be in error."""
+    """Whether errors of the noise levels alone can't imitate a law."""
     if law.name == "disturbance_colour" and law.loss is not None:
         return float(np.exp(estimated(law, bench.data.cluster)[0][0])) > _SHORTEST * bench.data.dt
     if law.name == LEVEL:

@@ -1,8 +1,8 @@
-"""Laws of what is left: heavy tails, dependence on speed, memory, level.
+"""Disturbance laws of whitened innovations: heavy tails, growth with speed, colour, run constants.
 
 Whitened innovations are unit Gaussians if the disturbance is white, Gaussian and of constant
-intensity. Each law below is one or two numbers that change their density; gains are in nats, with
-the numbers fitted on the other scenarios.
+intensity. Each law below changes their density by a few parameters; gains are in nats, with the
+parameters fitted to the other scenarios.
 """
 
 import itertools
@@ -18,7 +18,7 @@ from ....models.effects.base import AXES
 
 @dataclass(frozen=True)
 class Law:
-    """A finding about the disturbance on one axis, with parameters as the effect of that name."""
+    """A law of the disturbance on one axis, with the parameters of the effect of that name."""
 
     name: str
     where: str
@@ -36,10 +36,10 @@ class Law:
 
 
 Told = tuple[np.ndarray, dict[str, float], Callable[[np.ndarray], np.ndarray]]
-"""Held-out gain by piece, the best numbers, and the loss as a function of their logarithms."""
+"""Held-out gain by piece, the best parameters, and the loss as a function of their logarithms."""
 _GROWTHS = np.geomspace(0.05, 1000.0, 48)
 _EVENNESS, _ALIKE = (0.3, 0.1, 0.03), 4.0
-"""Shares of their spread in the squared sizes of blows that are alike; nats this must win."""
+"""Evenness (w² / size²) of impacts of about one size; nats that this must win."""
 _KAPPAS = (0.004, 0.01, 0.02, 0.04, 0.08, 0.15, 0.3)
 
 
@@ -51,7 +51,7 @@ def _folds(fold: np.ndarray) -> list[np.ndarray]:
 
 
 def _held_out(losses: np.ndarray, fold: np.ndarray) -> tuple[np.ndarray, int]:
-    """Losses (choices, R) with each fold judged at the best choice of the others; best of all."""
+    """Losses of pieces, each fold at the best choice of the others; index of the best of all."""
     found = np.zeros(losses.shape[1])
     for here in _folds(fold):
         rest = losses[:, ~here] if not here.all() else losses
@@ -62,10 +62,10 @@ def _held_out(losses: np.ndarray, fold: np.ndarray) -> tuple[np.ndarray, int]:
 def impacts(
     z: Float[np.ndarray, "N R"], weight: Float[np.ndarray, "N R"], fold: Int[np.ndarray, " R"]
 ) -> Told:
-    """Gain of a mixture of N(0, s²) with share 1 - p and blows with share p over N(0, σ²).
+    """Gain of a mixture of N(0, s²) with share 1 - p and impacts with share p over N(0, σ²).
 
-    Blows have Gaussian sizes, w = `size`, or where that clearly wins more about one size, ±μ with a
-    spread w: μ² + w² = size², w² / size² the `evenness`.
+    Impacts have Gaussian sizes, w = `size`, or where that clearly wins more, about one size, ±μ
+    with a spread w: μ² + w² = size², w² / size² the `evenness`.
     """
     sigma = np.sqrt((z**2 * weight).sum() / weight.sum())
     # a histogram for each run: the density is smooth on its bins
@@ -113,7 +113,7 @@ def speed_dependence(
 ) -> Told:
     """Gain of a process with the variance q (1 + k |v|²) over a constant one.
 
-    `share` of the variance of z is the process's, the rest the instruments'.
+    `share` of the variance of z is process noise, the rest measurement noise.
     """
     growth = np.concatenate([[0.0], _GROWTHS])
 
@@ -135,7 +135,7 @@ def growth_alone(
     rest: float,
     share: float = 1.0,
 ) -> float:
-    """Nats by which a process that grows from rest² times its variance is better than any constant.
+    """Nats by which a variance that grows with the speed, from rest² times, beats any constant one.
 
     As 1 + k |v|² or as (1 + k |v|)², whichever is better; `share` as in `speed_dependence`.
     """
@@ -152,7 +152,7 @@ def colour(
     z: Float[np.ndarray, "N R"], weight: Float[np.ndarray, "N R"], fold: Int[np.ndarray, " R"],
     dt: float,
 ) -> Told:  # fmt: skip
-    """Gain of predicting z from a slow part m' = ρ m + κ (z - m) (an ARMA(1, 1) of slow waves)."""
+    """Gain of predicting z by a slow part m' = ρ (m + κ (z - m)) (an ARMA(1, 1) process)."""
     plain = (z**2 * weight / 2).sum(axis=0)
 
     def at(rho: np.ndarray, kappa: np.ndarray) -> np.ndarray:
@@ -263,7 +263,7 @@ def estimated(
         ]
     ) / (4 * h * h)  # fmt: skip
     if not np.isfinite(H).all() or np.any(np.diag(H) <= 0):
-        return found, np.full((k, k), np.nan)  # at the edge of what is possible
+        return found, np.full((k, k), np.nan)  # at the boundary of the range
     inverse = np.linalg.pinv(H + 1e-9 * np.eye(k))
     n = len(labels)
     return found, inverse @ (g.T @ g) @ inverse * n / max(n - 1, 1)

@@ -1,4 +1,4 @@
-"""Whether the white disturbance is stronger or weaker than the belief says."""
+"""Disturbance level: whether the white disturbance is stronger or weaker than believed."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,16 +19,16 @@ LEVEL = "disturbance_level"
 
 
 def believed_levels(bench: Bench) -> Float[np.ndarray, "6"]:
-    """Diffusion b that the belief states; zero where it states none."""
+    """Diffusion b of the believed model; zero where it has none."""
     return np.asarray(bench.model.base.mass_and_diffusion(jnp.zeros(6))[1])
 
 
 def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
-    """Levels axis by axis, none where the belief states none.
+    """Levels axis by axis, none where the believed model has none.
 
     The gain is that of the level estimated on the other folds over the believed one, all other
     levels being estimated. Where it is above `least`, the others are estimated again with the
-    believed one held, for noise of the instruments may stand in for it. The error of a level is
+    believed one held, for measurement noise may compensate for it. The error of a level is
     that of its likelihood or, if larger, that by the jackknife over folds.
     """
     believed = believed_levels(bench)
@@ -73,9 +73,9 @@ def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
 
 
 def beside_slow(levels: Sequence[Law], bench: Bench, look: Look, least: float) -> list[Law]:
-    """Those that stand beside pushes that last, with the level that is left there.
+    """Levels that hold in a fit with slow disturbances, with the level estimated there.
 
-    They lose more than `least` nats where the believed one is held, and differ to the same side.
+    Holding the believed one loses more than `least` nats, and the change keeps its sign.
     """
     data, believed = bench.data, believed_levels(bench)
     p = look.predictions
@@ -103,13 +103,13 @@ def beside_slow(levels: Sequence[Law], bench: Bench, look: Look, least: float) -
 
 
 def process_share(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
-    """Share of the variance of each twist's innovation that the process on its axis makes."""
+    """Share of the variance of each twist's innovation due to process noise on its axis."""
     p = look.predictions
     steps = Transition.along(np.asarray(p.jacobian), bench.data.weight, p.late)
     inverse = np.linalg.inv(bench.mass(look.theta))
     own = unit_processes(steps, inverse, bench.data.dt)
     own *= look.noise.diffusion[:, None, None] ** 2
-    # whitened squares are divided by `memory`: one as many would be
+    # whitened squares are divided by `memory`: undo that
     whiten = look.kalman.whiten.mean(axis=-1) * np.sqrt(look.kalman.memory)[:, None]
     P = np.zeros_like(own)
     for keep in look.kalman.keep.mean(axis=-1):
@@ -122,7 +122,7 @@ def process_share(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
 def _pushed(
     transition: Transition, mass_inverse: Float[np.ndarray, "6 6"], dt: float
 ) -> Float[np.ndarray, "6 12"]:
-    """What a constant unit wrench makes of an error within a step: ∫ exp(J s) ds [0; M⁻¹]."""
+    """One-step error under a constant unit wrench: ∫ exp(J s) ds [0; M⁻¹]."""
     J = np.real(scipy.linalg.logm(transition.mean)) / dt
     both = np.zeros((18, 18))
     both[:12, :12] = J

@@ -1,4 +1,4 @@
-"""Swell, currents that wander, and judging causes beside either or slow pushes."""
+"""Fits of waves and of varying currents; correlated noise of these or of slow disturbances."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -14,33 +14,33 @@ from ..selection.correlated_noise import Beside
 from .laws import Law, Told, estimated, run_constants
 
 _OMEGAS = np.arange(0.6, 5.3, 0.2)
-"""Frequencies that are tried (rad/s); runs of ten seconds tell 0.6 rad/s apart."""
+"""Frequencies that are tried (rad/s); runs of ten seconds resolve 0.6 rad/s."""
 _WAYS = 12
 """Directions that are tried; a quarter of them with every frequency."""
 _FIRST = 0.05
-"""Speeds that are tried: 1/8 to 64 times as much (m/s)."""
+"""Reference speed (m/s): 1/8 to 64 times as much is tried."""
 _PARTS = np.array([0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 1.9])
-"""Frequencies of a sea, as shares of the one with most energy."""
+"""Frequencies of a sea, as multiples of the peak frequency."""
 _ABOUT = (0.85, 0.95, 1.0, 1.05)
-"""Shares of the frequency of the best single one that a sea is tried with."""
+"""Peak frequencies of a sea that are tried, as multiples of the best single frequency."""
 _FINER = (-0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15)
 _GRAVITY = 9.80665
 _LEAST = 5.0
-"""Nats that a slow push on an axis must win to be taken into account."""
+"""Nats that a slow disturbance on an axis must win to be taken into account."""
 _TIMES = 2.0
-"""How many times what slow forces win waves must win."""
+"""Multiple of the gain of slow forces that waves must win."""
 _BENDS = 4
-"""Cosines that bend a current over a piece, besides a constant."""
+"""Cosine terms of a current over a piece, besides a constant."""
 _WANDER = np.array([0.3, 0.6, 1.0, 2.0, 4.0, 10.0, 100.0])
 """Time constants of a current that are tried, in lengths of a piece."""
 _ROUNDS = 4
-"""Times that the most likely current of a piece is sought."""
+"""Iterations for the most likely current of a piece."""
 _LONG = 10.0
-"""Of those, from which a current stays as it is."""
+"""Lengths of a piece: a longer time constant is only known to exceed a piece."""
 
 
 def beside_laws(bench: Bench, look: Look, laws: Sequence[Law]) -> Beside:
-    """The random structure that wins most: slow pushes by axis, a current, or swell."""
+    """The correlated noise that wins most: slow disturbances by axis, a current, or swell."""
     slow = [law for law in laws if law.name == "disturbance_colour" and law.heldout_gain > _LEAST]
     pushes = sum(law.heldout_gain for law in slow)
     stays = max((law.heldout_gain for law in laws if law.name == "current_varying"), default=0.0)
@@ -66,9 +66,9 @@ def beside_laws(bench: Bench, look: Look, laws: Sequence[Law]) -> Beside:
 
 
 def are_waves(waves: Law, slow: Sequence[Law]) -> bool:
-    """Whether waves explain more than slow pushes by axis do.
+    """Whether waves explain more than slow disturbances by axis do.
 
-    They move all axes at once by four numbers; pushes that only revert are half explained at most.
+    They act on all axes with four parameters, and explain half of a Gauss–Markov force at most.
     """
     forces, all_axes = (
         sum(max(law.heldout_gain, 0.0) for law in slow if law.where in axes)
@@ -78,7 +78,7 @@ def are_waves(waves: Law, slow: Sequence[Law]) -> bool:
 
 
 def _drawn(screen: Screen, v: np.ndarray, a: np.ndarray, spread: np.ndarray) -> Beside:
-    """Motion of the water drawn for each piece, its terms' standard deviations in proportion."""
+    """Water motion drawn anew for each piece; `spread` has its terms' relative deviations."""
     J = _responses(screen, v, a)
     G = _products(screen.z[0], J)
     std = run_constants(G, list(range(1, len(J) + 1)), spread, screen.fold)[1]["std"] / spread[0]
@@ -96,7 +96,7 @@ def _responses(screen: Screen, v: np.ndarray, a: np.ndarray) -> Float[np.ndarray
 def _about(
     screen: Screen, v: np.ndarray, a: np.ndarray, likely: Float[np.ndarray, "R k"]
 ) -> tuple[Float[np.ndarray, "N12 R"], Float[np.ndarray, "k N12 R"]]:
-    """Innovations of still water and responses, both of the tangent at a likely motion of it."""
+    """Innovations in still water and responses, both linearised at a likely motion of the water."""
     push, slope = screen.in_current(np.einsum("nikr,rk->nir", v, likely))
     by_a = np.einsum("nijr,njkr->nikr", screen.water[1], a)
     J = screen.passed(np.einsum("nijr,njkr->nikr", slope, v) + by_a)
@@ -111,9 +111,9 @@ def _refined(
     a: np.ndarray,
     fit: Callable[[np.ndarray], tuple[Told, Float[np.ndarray, " k"]]],
 ) -> tuple[Float[np.ndarray, "R m m"], Told]:
-    """Products and fit about the most likely motion of each piece, sought a few times (Laplace).
+    """Products and fit, relinearised at the most likely motion of each piece (Laplace's method).
 
-    `fit` gives what is told by products, and the standard deviations that it finds.
+    `fit` maps products to its result and to the standard deviations that it finds.
     """
     still = _squares(screen.z[0])
 
@@ -135,7 +135,7 @@ def _squares(z: np.ndarray) -> Float[np.ndarray, " R"]:
 
 
 def _most_likely(G: Float[np.ndarray, "R m m"], spread: np.ndarray) -> Float[np.ndarray, "R k"]:
-    """Coefficients of each piece with standard deviations `spread` beforehand."""
+    """Most likely coefficients of each piece with prior standard deviations `spread`."""
     prior = np.diag(1 / np.maximum(spread, 1e-6) ** 2)
     return -np.linalg.solve(G[:, 1:, 1:] + prior, G[:, 1:, :1])[..., 0]
 
@@ -145,7 +145,7 @@ def _products(z: np.ndarray, J: np.ndarray) -> Float[np.ndarray, "R m m"]:
 
 
 def _times(bench: Bench, kept: np.ndarray) -> Float[np.ndarray, "N R"]:
-    """Middles of the steps since the begin of each piece (s)."""
+    """Mid-step times since the start of each piece (s)."""
     return (bench.data.times[:-1] + bench.data.step / 2)[:, kept]
 
 
@@ -160,11 +160,11 @@ def _flow(bench: Bench, kept: np.ndarray) -> Float[np.ndarray, "N 3 k R"]:
 
 
 def find_current(bench: Bench, look: Look) -> Law:
-    """A horizontal current that wanders within runs: Gauss–Markov in W, anew for each piece.
+    """A horizontal current that varies within runs: Gauss–Markov in W, drawn anew for each piece.
 
-    Its Karhunen–Loève series is cut after `_BENDS` cosines. Drag is not linear in it, so responses
-    are taken about the most likely current of each piece (Laplace's method), a few times. Of the
-    time constants the one that wins most; of one of ten pieces and more is only known that it is
+    Its Karhunen–Loève series is truncated after `_BENDS` cosines. Drag is nonlinear in the current,
+    so responses are relinearised at the most likely current of each piece (Laplace's method). The
+    time constant with the largest gain is taken; one of ten pieces and more is only known to be
     longer than a piece.
     """
     screen = Screen(bench, look, None)
@@ -202,7 +202,7 @@ def find_current(bench: Bench, look: Look) -> Law:
 
 
 def _bends(tau: float) -> np.ndarray:
-    """Standard deviations of the flow's terms, mean-reverting within `tau` lengths of a piece."""
+    """Standard deviations of the flow's terms, for a time constant of `tau` lengths of a piece."""
     t = (np.arange(64) + 0.5) / 64
     C = np.exp(-np.abs(t[:, None] - t) / tau)
     phi = np.stack([np.cos(np.pi * k * t) * (np.sqrt(2) if k else 1) for k in range(_BENDS + 1)])
@@ -217,11 +217,11 @@ class Swell:
     of a period later, fading with exp(k z), ω² = g k (Airy; Faltinsen 1990, table 2.1, deep water).
 
     Attributes:
-        frequency: ω where there is most energy (rad/s).
+        frequency: peak frequency ω (rad/s).
         direction: ψ.
-        sea: whether there are the frequencies of a wind sea, and not one alone.
-        flat: whether it moves along and up with amplitudes and phases of their own, as in shallow
-            water or under waves from several directions; ψ may be that of the other way then.
+        sea: whether it has the spectrum of a wind sea, and not a single frequency.
+        flat: whether horizontal and vertical motion have independent amplitudes and phases, as in
+            shallow water or under waves from several directions; ψ may then be opposite.
     """
 
     frequency: float
@@ -231,14 +231,14 @@ class Swell:
 
     @property
     def spread(self) -> Float[np.ndarray, " k"]:
-        """Standard deviations of the amplitudes that are tried first, all together `_FIRST`."""
+        """Reference standard deviations of the amplitudes, together `_FIRST`."""
         share = np.sqrt(_sea() / _sea().sum()) if self.sea else np.ones(1)
         return _FIRST * np.repeat(share, 4 if self.flat else 2)
 
     def water(
         self, bench: Bench, kept: np.ndarray
     ) -> tuple[Float[np.ndarray, "N 3 k R"], Float[np.ndarray, "N 3 k R"]]:
-        """Velocities of 1 m/s at the surface and accelerations, in W."""
+        """Velocities for amplitudes of 1 m/s at the surface, and accelerations, in W."""
         X, t = bench.data.X[:-1][..., kept], _times(bench, kept)
         way = np.array([np.cos(self.direction), np.sin(self.direction), 0.0])
         ahead = way[0] * X[:, 4] + way[1] * X[:, 5]
@@ -259,9 +259,9 @@ class Swell:
 
 
 def _sea() -> Float[np.ndarray, " k"]:
-    """Energy of the motion at the surface in `_PARTS` of a wind sea's peak frequency.
+    """Energy of the motion at the surface at `_PARTS` times a wind sea's peak frequency.
 
-    ω² times the spectrum of Hasselmann et al. (1973) with γ = 3.3, over the ranges between.
+    ω² times the spectrum of Hasselmann et al. (1973) with γ = 3.3, times the spacing.
     """
     x = _PARTS
     peak = 3.3 ** np.exp(-(((x - 1) / np.where(x <= 1, 0.07, 0.09)) ** 2) / 2)
@@ -269,19 +269,19 @@ def _sea() -> Float[np.ndarray, " k"]:
 
 
 def find_waves(bench: Bench, look: Look) -> Law:
-    """Waves from one direction, of one frequency or of a sea, amplitudes anew for each piece."""
+    """Waves from one direction, of one frequency or a sea, amplitudes drawn anew for each piece."""
     return _found(bench, look)[1]
 
 
 def _found(bench: Bench, look: Look) -> tuple[Swell, Law]:
-    """The waves that win most, z ~ N(0, I + σ² J Jᵀ).
+    """The waves with the largest gain, z ~ N(0, I + σ² J Jᵀ).
 
     Frequency and direction from a grid, then from finer ones; then a sea of about that frequency.
     """
     screen = Screen(bench, look, None)
 
     def tried(swells: list[Swell]) -> list[Told]:
-        """What is told by each; all are alike in their number of frequencies."""
+        """The result of each; all have the same number of frequencies."""
         water = [swell.water(bench, screen.kept) for swell in swells]
         J = _responses(screen, *(np.concatenate(w, axis=2) for w in zip(*water, strict=True)))
         found, spread = [], swells[0].spread
@@ -330,9 +330,9 @@ def _found(bench: Bench, look: Look) -> tuple[Swell, Law]:
 
 
 def _others(omega: float, direction: float) -> list[list[Swell]]:
-    """What else is tried about the best single frequency: flat waves, seas and flat seas.
+    """Further models near the best single frequency: flat waves, seas and flat seas.
 
-    Flat slow swell looks nearly alike from ahead and from astern.
+    Flat slow swell has nearly the same effect from ahead and from astern.
     """
     both = (direction, direction + np.pi)
     return [
@@ -343,7 +343,7 @@ def _others(omega: float, direction: float) -> list[list[Swell]]:
 
 
 def _size(std: float, loss: Callable[[np.ndarray], np.ndarray], part: float) -> tuple[float, float]:
-    """Most likely speed of which `part` has the standard deviation `std`, and its error."""
+    """Most likely speed, of which the share `part` deviates by `std`, and its standard error."""
     logs = np.log(max(std, 1e-9)) + np.linspace(-0.4, 0.4, 9)
     top, error = _peak(logs, -np.array([loss(np.array([at])).sum() for at in logs]))
     speed = float(np.exp(top)) / part
@@ -351,7 +351,7 @@ def _size(std: float, loss: Callable[[np.ndarray], np.ndarray], part: float) -> 
 
 
 def _peak(at: np.ndarray, gains: np.ndarray) -> tuple[float, float]:
-    """The top of a parabola through the gains, and its width where half a nat is lost."""
+    """The maximum of a parabola through the gains, and its half-width half a nat below."""
     a, b, _ = np.polyfit(at - at.mean(), gains, 2)
     if a >= 0:
         return float(at[int(np.argmax(gains))]), float(np.ptp(at))

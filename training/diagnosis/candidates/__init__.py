@@ -1,1 +1,1 @@
-"""Structure without a name: what a wrench could depend on besides."""
+"""Unmodelled structure: groups of further regressors for the wrench."""

@@ -1,4 +1,4 @@
-"""Which structure without a name is tried, group by group, and what is said of what was found."""
+"""Groups of regressors for unmodelled structure, and the description of a match."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -23,17 +23,17 @@ NODES = {
     1.2: (0.0, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0),
     4.0: (0.0, 0.2, 0.35, *_TENTHS, 1.7, 2.0, 2.5, 3.0),
 }
-"""Times (s) that a memory fades in, and frequencies (Hz) for each, closest where vehicles and what
-hangs on them ring."""
+"""Time constants (s) of a memory, and frequencies (Hz) for each, densest where vehicles and loads
+that hang on them resonate."""
 FOLLOWED = {"play": (0.3, 0.6, 1.2, 2.4, 4.8), "slew": (8.0, 16.0, 32.0, 64.0, 128.0)}
-"""Backlash (N), ±, and largest rates (N/s) of thrusters that are tried."""
+"""Backlash (±N) and rate limits (N/s) of thrusters that are tried."""
 _CORRELATED, _MOST_CORRELATED = 0.1, 2
-"""Correlation of neighbouring innovations from which an axis may remember other velocities, and so
-many axes at most."""
+"""Correlation of neighbouring innovations from which memories of other velocities are tried on an
+axis, and number of such axes at most."""
 
 
 def groups(bench: Bench, look: Look, quiet: Sequence[str] = ()) -> Iterator[Group]:
-    """Everything that is tried; what axes that are `quiet` do with their motion can't be told."""
+    """All groups that are tried; dependence on motion of `quiet` axes is not identifiable."""
     d = bench.data
     nodes = [(time, f) for time, frequencies in NODES.items() for f in frequencies]
     moving = [i for i, axis in enumerate(AXES) if axis not in quiet]
@@ -104,7 +104,7 @@ def _of_thruster(bench: Bench, k: int) -> Group:
 
 
 def _of_exchange(bench: Bench) -> Group:
-    """Two thrusters that take each other's command, one pair a node."""
+    """Two thrusters with exchanged commands, one pair a node."""
     model, d = bench.model, bench.data
     count = d.u.shape[1]
     pairs = tuple(itertools.combinations(range(count), 2))
@@ -124,7 +124,7 @@ def _of_exchange(bench: Bench) -> Group:
 
 
 def _of_follower(bench: Bench, kind: str, where: str, numbers: Sequence[float]) -> Group:
-    """One thruster or all that follow commands by one number, one of them a node."""
+    """Backlash or rate limit of one thruster or of all, one value a node."""
     model, d = bench.model, bench.data
     count, single = d.u.shape[1], where != "thrusters"
     effect = Unknown.neutral(kind=kind, acts_on=where, numbers=(numbers[0],), thrusters=count)
@@ -152,7 +152,7 @@ def followed_by(
     step: Float[np.ndarray, "N _"],
     numbers: Sequence[float],
 ) -> Float[np.ndarray, "k N n R"]:
-    """How much what follows commands u differs from them, those before them followed too."""
+    """Followed commands minus commands u; the past commands set the follower's initial state."""
     commands, held = np.concatenate([past, u]), np.concatenate([past_step, step])
     found = _followed(kind, jnp.asarray(commands), jnp.asarray(held), jnp.asarray(numbers))
     return np.asarray(found)[:, len(past) :]
@@ -160,7 +160,7 @@ def followed_by(
 
 @eqx.filter_jit
 def _followed(kind: str, commands: Array, held: Array, numbers: Array) -> Array:
-    """Differences (k, N, n, R) of means over each step; the first command has been followed."""
+    """Differences (k, N, n, R) of means over each step, from steady state at the first command."""
     numbers = numbers[:, None, None]
 
     def follow(before: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -173,14 +173,14 @@ def _followed(kind: str, commands: Array, held: Array, numbers: Array) -> Array:
 
 
 def _correlated(look: Look) -> list[int]:
-    """Axes whose neighbouring innovations are correlated most, if they are."""
+    """Axes with the most correlated neighbouring innovations, above `_CORRELATED`."""
     correlation = look.correlation[6:]
     first = np.argsort(-correlation)[:_MOST_CORRELATED]
     return [int(i) for i in first if correlation[i] > _CORRELATED]
 
 
 def _memory(bench: Bench, axis: int, of: int, nodes: Sequence[tuple[float, float]]) -> Group:
-    """A wrench on an axis that remembers a component of the twist."""
+    """A wrench on an axis with memory of a component of the twist."""
     effect = Unknown.neutral(kind="memory", acts_on=AXES[axis], numbers=(*nodes[0], float(of)))
 
     def columns(kept: np.ndarray) -> np.ndarray:
@@ -218,17 +218,17 @@ def _bumps(x: np.ndarray, y: np.ndarray, most: int = 16) -> tuple[float, ...]:
 
 
 _FINER = (1.4, 1.18, 1.08)
-"""Factors by which numbers between nodes are sought."""
+"""Factors of successive refinements between nodes."""
 
 
 def refined(screen: Screen, found: Matched, rng: np.random.Generator) -> Unknown:
-    """The effect of a match: a memory's numbers between the nodes, the few terms of a motion."""
+    """The effect of a match, with parameters refined between nodes, or few terms of the motion."""
     effect = found.group.effect
     if effect.kind == "memory":
         axis, of = AXES.index(effect.acts_on), effect.remembered
         T, f = found.group.labels[found.node]
         for spread in _FINER:
-            # a ring that decays within the runs tells its frequency to a fraction of 1 / T
+            # a decaying oscillation determines its frequency to a fraction of 1 / T
             step = (spread - 1) * max(f, 0.2)
             frequencies = [g for g in (f - step, f, f + step) if g >= 0.03] if f else [0.0]
             times = (T / spread, T, T * spread)

@@ -1,13 +1,13 @@
-"""Structure that no name explains: what a wrench could depend on, tried group by group.
+"""Unmodelled structure: regressors that a wrench could depend on, tried group by group.
 
 A group is a few columns φ_k of one kind of action (a wrench on an axis, along a thruster, in the
 directions of W, or moving water) on one set of inputs. Each column passes the innovations' filter,
 
     J_(n+1) = A_n ((I - K_n) J_n - d/2) - d/2,   d = dt φ_n (∂V'/∂wrench or ∂V'/∂flow),
 
-so that its gain is in the same held-out nats as that of a name. Ridge regression, the prior's size
-chosen with the fit; groups with nodes (time constants, frequencies) take the best node of the other
-folds. Groups are added one at a time, each beside those before (orthogonal matching by groups).
+so that its gain is in the same held-out nats as that of a cause. The fit is a ridge regression, its
+prior that of most evidence; groups with nodes (time constants, frequencies) take the best node of
+the other folds. Groups are added one by one to those before (group orthogonal matching pursuit).
 """
 
 from collections.abc import Callable
@@ -33,25 +33,25 @@ from ..selection.model_selection import CLEAR
 
 LANES = 24
 PIECES = 60
-"""Columns that one call of the compiled program takes, and pieces that are looked at."""
+"""Columns that one call of the compiled program takes, and most pieces that are used."""
 _PRIORS = (0.3, 3.0, 30.0)
 _LEAST, _ROBUST = 8.0, 2.5
-"""Nats below which a gain is not looked at further, and standard errors between runs below which it
-must be as clear as a name's (`naming.CLEAR`)."""
+"""Nats below which a gain is not tested further, and standard errors between runs below which it
+must be as clear as a cause's (`model_selection.CLEAR`)."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """Columns that stand or fall together.
+    """Columns that are accepted or rejected together.
 
     Attributes:
-        effect: that has these columns as its terms (of a memory: with the first node's numbers).
+        effect: that has these columns as its terms (of a memory: with the first node's parameters).
         action: `wrench`, `thruster`, `thrusters` (a wrench on all axes), `force` or `flow` (in W).
-        variables: inputs, in the words of recordings.
+        variables: inputs, by their names in recordings.
         columns: of the wrench (N, component of the action, k, R) for a range of pieces.
         nodes: columns of each alternative.
-        labels: the effect's first numbers at each node: time constant (s) and frequency (Hz) of a
-            memory, the play (N) or rate (N/s) of thrusters, two that are exchanged.
+        labels: the effect's first parameters at each node: time constant (s) and frequency (Hz) of
+            a memory, backlash (N) or rate limit (N/s) of thrusters, two exchanged thrusters.
     """
 
     effect: Unknown
@@ -64,9 +64,9 @@ class Group:
 
 @dataclass(frozen=True)
 class Matched:
-    """A group's gain: nats by run while its fold is left out, and the node that is best.
+    """A group's gain: nats by run while its fold is left out, and the best node.
 
-    Noise alone wins `threshold` with the probability asked for, and as much as this with `p_value`.
+    Noise alone wins more than `threshold` with probability α, and as much as this with `p_value`.
     """
 
     group: Group
@@ -105,7 +105,7 @@ def _through(
 
 
 class Screen:
-    """Responses of groups beside the columns of what is accepted, on some of the pieces."""
+    """Tests of groups, jointly with the columns already accepted, on some of the pieces."""
 
     def __init__(
         self,
@@ -203,7 +203,7 @@ class Screen:
     def match(
         self, group: Group, alpha: float, rng: np.random.Generator, draws: int = 24
     ) -> Matched:
-        """Held-out gain of a group, and what noise alone wins at most with probability α.
+        """Held-out gain of a group, and the gain that noise alone exceeds with probability α.
 
         That threshold is infinite where the gain is small, and larger where runs disagree.
         """
@@ -233,7 +233,7 @@ class Screen:
         if gain <= _LEAST:
             return Matched(group, heldout, node, np.inf)
         chance = self._null(folds, free, group, size, rng, draws)
-        # self-normalised: runs that excite much win much, whatever is there
+        # self-normalised: runs with much excitation win much, whatever the structure
         robust = min(_ROBUST, 0.8 * np.sqrt(len(heldout))) * np.sqrt(np.sum(heldout**2))
         above = 1.0 if gain > robust else CLEAR
         return Matched(
@@ -262,7 +262,7 @@ class Screen:
     def _fit(
         self, T: np.ndarray, free: int, node: tuple[int, ...], size: np.ndarray
     ) -> tuple[np.ndarray, float]:
-        """Weights of all columns (1 for z), and the gain on T, at the prior of most evidence."""
+        """Weights of all columns (1 for z), and the log evidence on T, for the best prior."""
         c = np.array([*range(1, free), *(free + k for k in node)], int)
         if not len(c):
             w = np.zeros(len(T))
@@ -275,7 +275,7 @@ class Screen:
         q = vectors.T @ g
         best: tuple[float, np.ndarray] | None = None
         for prior in _PRIORS:
-            # weights ~ N(0, prior²) in units of a column that alone wins half a nat a unit
+            # the weight of a column of unit norm has the variance 100 prior²
             precision = 1 / (prior**2 * 100)
             x = -q / (values + precision)
             evidence = float(
@@ -305,7 +305,7 @@ class Screen:
         self, folds: np.ndarray, free: int, group: Group, size: np.ndarray,
         rng: np.random.Generator, draws: int,
     ) -> Chance:  # fmt: skip
-        """What white innovations win: mean and spread over draws, and a Gumbel tail."""
+        """The gain in white innovations: mean and spread over draws, as an exponential tail."""
         gains = []
         roots = []
         for T in folds:

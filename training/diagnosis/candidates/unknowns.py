@@ -1,4 +1,4 @@
-"""When to say `unknown`: structure that no name, nor all names together, explain as well."""
+"""Acceptance of `unknown`: structure that no cause, nor all causes together, explain as well."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,14 +17,14 @@ from .groups import described, groups, refined
 from .structures import Matched, Screen
 
 BEATS = 1.5
-"""Times the best name's gain that structure without a name must win."""
+"""Multiple of the best cause's gain that unmodelled structure must win."""
 _TOGETHER, _OF_A_LAW = 1.1, 0.7
-"""Times what all names win together; share of what the best law wins."""
+"""Multiple of the joint gain of all causes, and share of the best law's gain, that it must win."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """The best structure under one set of parameters, in nats of all data, and what names win."""
+    """The best structure at one θ, its gain in nats of all data, and the best cause's gain."""
 
     screen: Screen
     matched: Matched
@@ -53,7 +53,7 @@ def screened(
     rng: np.random.Generator,
     quiet: Sequence[str] = (),
 ) -> tuple[Screen, Matched, float] | None:
-    """The structure that wins most beside `rows`, of those that noise alone can't make."""
+    """The structure that wins most with `rows` free, of those significant against noise alone."""
     screen = Screen(bench, look, responses_of(bench, look, rows))
     share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
     tried = list(groups(bench, look, quiet))
@@ -64,7 +64,7 @@ def screened(
             best = m
     if best is None:
         return None
-    # of as many as were tried
+    # Bonferroni over the groups tried
     best = replace(best, p_value=min(1.0, best.p_value * len(tried)))
     return screen, best, best.gain * share
 
@@ -82,10 +82,10 @@ def seek(
     rng: np.random.Generator,
     quiet: Sequence[str] = (),
 ) -> Seen | None:
-    """Structure in what the names leave; where it wins more than they do, in place of them.
+    """Structure in the residual of the causes; where it wins more than they do, in place of them.
 
-    In the second case `found` is set back to the belief without names. Of estimated states none is
-    sought: what their estimator does has structure of its own; nor in how `quiet` axes move.
+    In the second case `found` is reset to the model without causes. None is sought in estimated
+    states, as their estimator adds structure of its own, nor in how `quiet` axes move.
     """
     if found.current.noise.estimated:
         return None
@@ -115,7 +115,7 @@ def seek(
 def accept(
     bench: Bench, nuisance: list[int], found: Found, seen: Seen, rng: np.random.Generator
 ) -> Bench:
-    """Add the structure to the model, refit it with all that was accepted; the new bench."""
+    """Add the structure to the model, refit it with all that was accepted; the new problem."""
     effect = refined(seen.screen, seen.matched, rng)
     rivals = sorted(found.left.items(), key=lambda item: -item[1].heldout_gain)[:5]
     wider = bench.with_effect(effect)
@@ -135,7 +135,7 @@ def accept(
 
 
 def structure(bench: Bench, where: str, theta: np.ndarray, seen: Seen) -> result.Structure:
-    """What was found, in words."""
+    """The structure that was found, in words."""
     effect = next(e for e in bench.library.effects if e.name == "unknown" and e.places == (where,))
     told = described(effect, theta[bench.library.at("unknown", where)], bench)  # pyright: ignore[reportArgumentType]
     return result.Structure(**told, heldout_gain=seen.gain, best_name_gain=seen.name_gain)

@@ -1,1 +1,1 @@
-"""What a model is worth on data left out: scores, forecasts, a black-box rival."""
+"""Validation on held-out data: scores, forecasts, a black-box model to compare with."""

@@ -1,9 +1,9 @@
-"""A rival that names nothing: ridge regression on random features of what a model gets wrong.
+"""Black-box model to compare with: ridge regression of a model's errors on random features.
 
 The error of the twist after one step, divided by the step, is regressed on
 φ(s) = [1, s, cos(Ω s + c)] with s the standardised state, command and command before, and Gaussian
 Ω of two length scales: an approximate Gaussian process (Rahimi and Recht 2007, algorithm 1). The
-ridge is chosen by leaving folds out once more.
+ridge is chosen by cross-validation among the folds of the fit.
 """
 
 import equinox as eqx
@@ -20,7 +20,7 @@ _RIDGES = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 
 
 class BlackBox(eqx.Module):
-    """Acceleration that a model lacks: weights on D features by piece, or one set for all."""
+    """Acceleration error of a model: weights on D features by piece, or one set for all."""
 
     centre: Float[Array, " s"]
     scale: Float[Array, " s"]
@@ -41,7 +41,7 @@ class BlackBox(eqx.Module):
     def acceleration(
         self, X: Float[Array, "7 S R"], V: Float[Array, "6 S R"], u: Array, before: Array
     ) -> Float[Array, "6 S R"]:
-        """What is added to dV/dt (m/s², rad/s²)."""
+        """Correction to dV/dt (m/s², rad/s²)."""
         phi = self.features(X, V, u, before)
         weights = jnp.broadcast_to(self.weights, (*self.weights.shape[:2], phi.shape[-1]))
         return jnp.einsum("dsr,dir->isr", phi, weights)
@@ -74,7 +74,7 @@ def train(
     count: int = 240,
     whole: bool = False,
 ) -> BlackBox:
-    """Fit to the errors of one-step predictions, for every piece without those it is left out with.
+    """Fit to the errors of one-step predictions, for every piece without its fold.
 
     With a single fold, or `whole`, it is fitted to all.
     """
@@ -111,7 +111,7 @@ def train(
 
 
 def _ridge(H: list[np.ndarray], g: list[np.ndarray], kept: list[int]) -> np.ndarray:
-    """Weights (D, 6) from the folds kept, each axis with the ridge that halves predict best."""
+    """Weights (D, 6) from the folds kept, the ridge of each axis by two-fold cross-validation."""
     size = np.diag(sum(H[i] for i in kept)).mean()
     eye = np.eye(len(H[0]))
     halves = [kept[0::2], kept[1::2]] if len(kept) > 1 else [kept, kept]
@@ -127,7 +127,7 @@ def _ridge(H: list[np.ndarray], g: list[np.ndarray], kept: list[int]) -> np.ndar
     found = np.zeros_like(b)
     for k in np.unique(best):
         w = np.linalg.solve(A + _RIDGES[k] * 1e-2 * size * eye, b)
-        # where no ridge predicts the other half better than nothing, nothing is said
+        # where no ridge predicts the other half better than zero, weights stay zero
         use = (best == k) & (losses[k] < 0)
         found[:, use] = w[:, use]
     return found

@@ -1,4 +1,4 @@
-"""What a model forecasts of recorded runs, window by window, without noise."""
+"""Noise-free forecasts of recorded runs, window by window."""
 
 from typing import Any, Protocol, runtime_checkable
 
@@ -18,12 +18,12 @@ from ..filter.innovations import Arrays, as_arrays, at_first, settle, substeps
 
 @runtime_checkable
 class Learned(Protocol):
-    """Acceleration that a model lacks, learned by whatever method; a pytree of arrays."""
+    """Learned acceleration error of a model, by any method; a pytree of arrays."""
 
     def acceleration(
         self, X: Float[Array, "7 S R"], V: Float[Array, "6 S R"], u: Array, before: Array
     ) -> Float[Array, "6 S R"]:
-        """What is added to dV/dt (m/s², rad/s²), by commands and those a step before."""
+        """Correction to dV/dt (m/s², rad/s²), given commands and those a step before."""
         ...
 
 
@@ -63,8 +63,8 @@ def forecast(
 ) -> tuple[Float[np.ndarray, "N 7 R"], Float[np.ndarray, "N 6 R"]]:
     """Poses and twists as they would be recorded at steps 1 … N.
 
-    Windows start at steps 0, `every`, 2 `every`, … from the record there; what the actuators
-    remember goes on from window to window. `rest` is added to what the model says.
+    Windows start at steps 0, `every`, 2 `every`, … from the record there; actuator states continue
+    from window to window. `rest` is added to the model's acceleration.
     """
     X, V = _forecast(model, as_arrays(data), every, substeps(data.longest), rest)
     return np.asarray(X), np.asarray(V)

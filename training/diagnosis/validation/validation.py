@@ -1,7 +1,7 @@
-"""What a model is worth on data that it was not fitted to: scores, simulations, bands.
+"""Validation of models on held-out data: scores, simulations, coverage of bands.
 
-Every number of a model (parameters, diffusion, measurement noise) is fitted without the scenario
-that it is judged on; of one scenario runs are left out in turn, of one run blocks.
+All of a model (parameters, diffusion, measurement noise) is fitted without the scenario that it is
+judged on; of a single scenario runs are left out in turn, of a single run blocks.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ from .blackbox import BlackBox, arguments
 
 GROUPS = {"position": slice(0, 3), "rotation": slice(3, 6), "velocity": slice(6, 9)}
 _COARSER = 4
-"""Times longer than those of predictions the substeps of the many simulated samples are."""
+"""Ratio of the substeps of simulated samples to those of predictions."""
 HORIZONS = (0.5, 1.0, 2.0, 4.0)
 SAMPLES = 39
 _PIECES = 60
@@ -40,16 +40,16 @@ _DRAWS = 400
 
 @dataclass(frozen=True)
 class Contender:
-    """A model to judge: θ of each piece, fitted without it (p, R), and perhaps a learned rest."""
+    """A model to judge: θ of each piece (p, R), fitted without it; perhaps a learned correction."""
 
     theta: Float[np.ndarray, "p R"]
     box: BlackBox | None = None
     won: Float[np.ndarray, " R"] | float = 0.0
-    """Nats by piece that laws of the disturbance win besides, on pieces left out."""
+    """Held-out nats by piece that disturbance laws win in addition."""
     stirring: tuple[Effect, ...] = ()
-    """Effects that have these laws; simulations start in their stationary state."""
+    """Effects of these laws; simulations start in their stationary state."""
     white: Float[np.ndarray, "6"] = field(default_factory=lambda: np.ones(6))
-    """Share of the estimated diffusion that is none of theirs (`white_part`)."""
+    """Share of the estimated diffusion that is not due to them (`white_part`)."""
 
 
 class Simulated(NamedTuple):
@@ -58,7 +58,7 @@ class Simulated(NamedTuple):
     Attributes:
         errors: pose seen from the simulated body, and twist; lane 0 is simulated without noise, the
             others with that of the disturbance and of the records (N, 12, S, K).
-        pieces: which of the data (K,).
+        pieces: indices of the pieces that are simulated (K,).
         every: steps of a window, each simulated from the record at its start.
     """
 
@@ -86,7 +86,7 @@ class Judged(NamedTuple):
 
 
 class Scores(NamedTuple):
-    """Of each piece, by noise estimated without it.
+    """Scores of each piece, with noise estimated without it.
 
     Attributes:
         density: log density of the innovations (nats) (R,).
@@ -99,7 +99,7 @@ class Scores(NamedTuple):
 
 
 def scores(bench: Bench, contender: Contender, estimated: bool) -> Scores:
-    """How well a model predicts each piece, fitted without it, over one step."""
+    """One-step log scores of a model on each piece, fitted without it."""
     data, theta = bench.data, contender.theta
     p = predict(bench.model, bench.library, theta, data)
     error, jacobian = np.asarray(p.error), np.asarray(p.jacobian)
@@ -132,8 +132,8 @@ def judge(
     """Score a model's innovations, and simulate it over `horizon` s from recorded states.
 
     Effects that own none of the parameters `in_use` are left out of the simulations; contenders
-    with the same ones share a compiled program. Whether the records are states that a filter has
-    `estimated` is one answer for all folds and contenders.
+    with the same ones share a compiled program. `estimated` (the records are states of a filter) is
+    the same for all folds and contenders.
     """
     data, theta = bench.data, contender.theta
     density, record, diffusion = scores(bench, contender, estimated)
@@ -145,10 +145,10 @@ def judge(
 
 
 def white_part(laws: Sequence[Law], bench: Bench) -> Float[np.ndarray, "6"]:
-    """Share of each axis' estimated diffusion that remains beside laws that are a part of it.
+    """Share of each axis' estimated diffusion that is not due to these laws.
 
-    Blows come within single steps and count as diffusion; one that grows with the speed was
-    estimated as the mean over all speeds. Slow pushes are no part of the estimate.
+    Impacts occur within single steps and count as diffusion; one that grows with the speed was
+    estimated as the mean over all speeds. Slow disturbances are no part of the estimate.
     """
     share, data = np.ones(6), bench.data
     speed2 = (data.V[:-1, :3] ** 2).sum(axis=1)
@@ -164,7 +164,7 @@ def white_part(laws: Sequence[Law], bench: Bench) -> Float[np.ndarray, "6"]:
 
 
 def _spread(fold: np.ndarray, most: int) -> np.ndarray:
-    """At most so many pieces, as many of each fold as of any other."""
+    """At most `most` pieces, equally many of each fold."""
     labels = np.unique(fold)
     each = max(1, most // len(labels))
     chosen = []
@@ -235,7 +235,7 @@ def _simulated(
 
 
 def horizons(longest: float, every: int, dt: float) -> list[int]:
-    """Steps of the horizons that fit."""
+    """Steps of the horizons that fit into a window."""
     found = [round(h / dt) for h in HORIZONS if h <= longest + 1e-9 and 1 <= round(h / dt) <= every]
     return found or [every]
 
@@ -264,7 +264,7 @@ def _errors(
     record = record[:, None] * noisy
     b = diffusion[:, None] * noisy
 
-    move = jax.vmap(random.step_random_state, -1, -1)  # columns take steps of their own
+    move = jax.vmap(random.step_random_state, -1, -1)  # each column has its own step
 
     def kicked(V: Array, w: Array) -> Array:
         M = inertia.inverse
@@ -319,13 +319,13 @@ def _errors(
     return jax.lax.scan(body, start, xs)[1]
 
 
-# ----------------------------------------------------------------------------------- telling
+# ----------------------------------------------------------------------------------- summary
 
 
 def told(
     judged: Judged, base: Judged, bench: Bench, horizon: float, rng: np.random.Generator
 ) -> result.ModelGain:
-    """Numbers with 95 % intervals, by bootstrap over what was left out in turn."""
+    """Scores with 95 % intervals, by bootstrap over folds."""
     data = bench.data
     labels = np.unique(data.fold)
     drawn = rng.integers(len(labels), size=(_DRAWS, len(labels)))

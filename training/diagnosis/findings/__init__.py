@@ -1,1 +1,1 @@
-"""What a diagnosis says: causes, ratios, text, next experiments."""
+"""Results of a diagnosis: causes, ratios, text, next experiments."""

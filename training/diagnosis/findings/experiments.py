@@ -1,14 +1,14 @@
-"""What to do next: the maneuver of a set that would tell names apart, or tell a name best.
+"""Experiment design: the maneuver that separates a cause from its rivals, or measures it, best.
 
-Every maneuver of `trials` is simulated by the model that the diagnosis ends with, without noise,
-and looked at through the filter of the data. Were a cause A with parameters θ_A not there, the
-innovations would be -J_A θ_A; another name B, and all that is free beside it, explain what they can
-of that. What they can't, in the data that there are and in a maneuver together,
+Every maneuver of `maneuver_library` is simulated by the final model of the diagnosis, without
+noise, and passed through the filter of the data. Without a cause A with parameters θ_A the
+innovations would be -J_A θ_A; another cause B and all free parameters explain a part of that. The
+part that they can't, in the recorded data and a maneuver together,
 
     D = min_b ½ |J_A θ_A - J_B b|²,
 
 is the expected log likelihood ratio of A against B (Hunter and Reiner 1965, with the filter's
-innovations as responses). A maneuver is worth what it adds to D in a minute.
+innovations as responses). The value of a maneuver is what it adds to D in a minute.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,9 +30,9 @@ from ..selection.model_selection import Choice, Hypothesis, parameters_of
 from .maneuver_library import TRIALS, simulated
 
 _NOTHING = 1.0
-"""Nats a minute below which a maneuver tells nothing."""
+"""Nats a minute below which a maneuver counts as uninformative."""
 _MOST = 4
-"""Names that a cause is to be told from."""
+"""Most rivals that a cause is to be distinguished from."""
 _BY_ITSELF = {
     "actuation": "measure the thrust at the bollard with a scale",
     "body": "weigh the vehicle in air and in water and measure where its weights are",
@@ -40,19 +40,19 @@ _BY_ITSELF = {
     "disturbance": "record ten minutes without commands",
     "measurement": "hold the instrument against another one",
 }
-"""What tells where no maneuver does, by the family of a cause."""
+"""Measurements for causes that no maneuver informs on, by the family of a cause."""
 _SLOW = ("current_varying", "waves", "disturbance_colour")
 _DEPTHS = "repeat at two depths and several headings"
-"""What tells water that moves from slow pushes."""
+"""Experiment that distinguishes moving water from slow disturbances."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What to do next for one cause.
+    """The next experiment for one cause.
 
     Attributes:
         text: in words.
-        nats: expected nats a minute by maneuver, against the names it is to be told from; empty for
+        nats: expected nats a minute by maneuver, against the rivals of the cause; empty for
             laws of the disturbance, which depend on no maneuver.
     """
 
@@ -63,9 +63,9 @@ class Experiment:
 def experiments(
     bench: Bench, final: Look, accepted: Sequence[Choice], nuisance: Sequence[int]
 ) -> dict[Hypothesis, Experiment]:
-    """The next experiment for every cause that was accepted; `final` is the look with all of them.
+    """The next experiment for every accepted cause; `final` is the evaluation with all of them.
 
-    A cause is to be told from its ties, or else from its closest rival, or else from nothing.
+    It distinguishes a cause from its ties, else from its closest rival, else from its absence.
     """
     if not accepted:
         return {}
@@ -101,9 +101,9 @@ def _rows(bench: Bench, b: Hypothesis | None, taken: Sequence[int]) -> list[int]
 
 
 def _opponents(choice: Choice, named: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Ties that are no causes themselves, or else the closest rival that is none.
+    """Ties that were not accepted themselves, or else the closest rival that was not.
 
-    What has the cause as a part of itself explains it whatever is driven.
+    Rivals in which the cause is nested are left out: they explain it in any maneuver.
     """
     own = choice.hypothesis[0]
 
@@ -117,7 +117,7 @@ def _opponents(choice: Choice, named: Sequence[Hypothesis]) -> list[Hypothesis]:
 def _looked_at(
     bench: Bench, final: Look, there: Evidence
 ) -> dict[str, tuple[Float[np.ndarray, "m m"], float]]:
-    """Products of responses in each maneuver, as those that are `there`, and its minutes."""
+    """Products of responses in each maneuver, with the design of `there`, and its minutes."""
     inverse, design = np.linalg.inv(bench.mass(final.theta)), there.design
     products: dict[str, np.ndarray] = {}
     minutes: dict[str, float] = {}
@@ -146,9 +146,9 @@ def _added(
     free: Sequence[int],
     change: Float[np.ndarray, " p"],
 ) -> float:
-    """Nats that a maneuver adds to those by which the cause `own` beats all that is `free`.
+    """Nats that a maneuver adds to those by which the cause `own` beats all `free` parameters.
 
-    `change` is by how much the parameters differ from those without the cause.
+    `change` is the difference of the parameters from those without the cause.
     """
     rows = [i for i in own if there.shows(i)]
     absent = np.eye(len(flown))
@@ -171,9 +171,9 @@ def _told(a: Hypothesis, opponents: Sequence[Hypothesis], value: Mapping[str, fl
 def of_law(law: Law, rivals: Sequence[Law], bench: Bench, final: Look) -> Experiment:
     """The next experiment for a law of the disturbance.
 
-    Noise is the same whatever is driven, but for growth with the speed: there the maneuver is
+    Noise does not depend on the maneuver, except for growth with the speed: there the maneuver is
     taken whose speeds vary most, by the expected likelihood ratio ½ E[ρ - 1 - log ρ] of a variance
-    that follows the speed against one that doesn't.
+    that grows with the speed against a constant one.
     """
     slow = [r.name for r in rivals if r.name in _SLOW]
     if law.name in _SLOW and slow:

@@ -1,4 +1,4 @@
-"""A set of maneuvers that anyone can drive, simulated as data that a diagnosis could be given.
+"""A library of maneuvers that a pilot can drive, simulated as data for a diagnosis.
 
 Each has `VARIANTS` pieces as long as those recorded, at the recorded steps: axis after axis,
 thruster after thruster, heading after heading, from rest in the middle of the recorded places.
@@ -24,9 +24,9 @@ VARIANTS = 8
 _GENTLE = np.array([1, 1, 1, 0.1, 0.1, 0.4])
 """Share of the largest wrench about each axis that keeps a vehicle upright."""
 _FASTEST = 0.4
-"""Of the sampling rate, the highest frequency of a chirp."""
+"""Highest frequency of a chirp, as a share of the sampling rate."""
 _APART = 4.0
-"""Distance (m) between the places of maneuvers that ask for several."""
+"""Distance (m) between the places of maneuvers that need several."""
 _HEADINGS = 4
 _SURFACE, _WILD = -0.2, 20.0
 """Height (m) above which a piece ends, and speed (m/s, rad/s) at which it does."""
@@ -36,7 +36,7 @@ Effort = Callable[[Float[np.ndarray, " N"], int], Float[np.ndarray, "N k"]]
 
 
 def _axis(k: int, s: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 6"]:
-    """A signal on one axis after the other; the second time round to the other side."""
+    """A signal on one axis after the other; the second cycle has the opposite sign."""
     sign = -1.0 if (k // len(AXES)) % 2 else 1.0
     return sign * np.asarray(s)[:, None] * np.eye(len(AXES))[k % len(AXES)]
 
@@ -90,13 +90,13 @@ def _nothing(t: np.ndarray, k: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Trial:
-    """One maneuver of the set.
+    """One maneuver of the library.
 
     Attributes:
-        text: what to do, as one says it to a pilot.
-        effort: of full effort, by axis, or of one thruster (N, 1).
+        text: instruction to the pilot.
+        effort: share of full effort, by axis, or of one thruster (N, 1).
         voltage: relative to the nominal one, variant after variant.
-        apart: whether variants start at places and depths of their own.
+        apart: whether variants start at different places and depths.
     """
 
     text: str
@@ -142,9 +142,9 @@ TRIALS: dict[str, Trial] = {
 
 
 def simulated(bench: Bench, theta: Float[np.ndarray, " p"]) -> Iterator[tuple[list[str], Data]]:
-    """Data of all trials under θ without noise, with the trial of each piece; '' fills up.
+    """Noise-free data of all maneuvers under θ, with the maneuver of each piece ('' for padding).
 
-    Each is of the shape of the bench's own data, so that programs compiled for these serve again.
+    Shapes are those of the problem's own data, so that programs compiled for these are reused.
     """
     own = bench.data
     R, n = own.u.shape[2], own.u.shape[1]
@@ -187,14 +187,14 @@ def simulated(bench: Bench, theta: Float[np.ndarray, " p"]) -> Iterator[tuple[li
 
 
 def _flown(model: Extended, data: Data) -> Data:
-    """The same with the motion that follows; what leaves the water or runs away weighs nothing."""
+    """The data with the simulated motion; samples out of the water or diverged have no weight."""
     X1, V1 = forecast(model, data, len(data.u))
     X, V = np.concatenate([data.X[:1], X1]), np.concatenate([data.V[:1], V1])
     with np.errstate(invalid="ignore"):
         there = np.isfinite(X).all(axis=1) & (np.abs(V).max(axis=1) < _WILD)
         there &= X[:, 6] <= np.maximum(_SURFACE, data.X[0, 6])
     there = np.logical_and.accumulate(there, axis=0)
-    last = np.maximum(there.sum(axis=0) - 1, 0)  # its repetitions weigh nothing
+    last = np.maximum(there.sum(axis=0) - 1, 0)  # its repetitions have no weight
     at = np.minimum(np.arange(len(X))[:, None], last)[:, None]
     X, V = (np.take_along_axis(states, at, axis=0) for states in (X, V))
     return replace(data, X=X, V=V, weight=data.weight * there[1:])

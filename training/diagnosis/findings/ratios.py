@@ -1,10 +1,10 @@
-"""What motion tells of a vehicle whatever its mass: coefficients over inertia.
+"""Coefficients over inertia, which motion determines without knowledge of the mass.
 
-Forces and masses that are all larger by one factor move alike, so data tell coefficients in
-proportion to inertia only. Intervals are those of the likelihood (inverse of its curvature, the
-correlation of errors in time taken off) by the delta method or, where they are wider, of scores
-that differ from piece to piece (Huber 1967); a coefficient at its physical limit is taken for
-known.
+Scaling all forces and masses by one factor leaves the motion unchanged, so data determine
+coefficients only relative to inertia. Intervals are those of the likelihood (inverse of its
+curvature, corrected for the correlation of errors in time) by the delta method or, where wider,
+those from the variation of scores between clusters (Huber 1967); a coefficient at its physical
+limit counts as known.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,13 +37,13 @@ _UNITS = {
     "restoring": ("", "rad/s²"),
     "net_buoyancy": ("m/s²", ""),
 }
-"""Of translations and of rotations."""
+"""Units of translations and of rotations."""
 
 
 def ratios(bench: Bench, look: Look, rows: Sequence[int]) -> list[result.Ratio]:
     """Believed and found ratios by axis; `rows` are the parameters that were fitted.
 
-    `inertia` is in proportion to surge's (of rotations to roll's), everything else over the
+    `inertia` is relative to surge's (of rotations to roll's), everything else over the
     axis' inertia; `half_thrust` is the acceleration when all thrusters push along the axis at
     half command, for commands by PWM, `thrust` that at the commands' RMS where they are forces or
     wrenches. Empty for a base without constant coefficients.

@@ -1,4 +1,4 @@
-"""A finding in words and numbers: causes with intervals, what is left, what was refitted."""
+"""A diagnosis in words and numbers: causes with intervals, residuals, refitted coefficients."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -22,18 +22,18 @@ from .experiments import Experiment, of_law
 CHANNELS = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
 _NAN = float("nan")
 _SCALE = 0.01
-"""Spread of thrust between runs that is tried first."""
+"""Reference spread of thrust between runs (1/8 to 64 times as much is tried)."""
 _FOLLOWING, _SEVERAL = 0.5, 3
-"""Correlation of neighbouring errors that is no chance, and velocities that have it."""
+"""Correlation of neighbouring errors that counts as clear, and least number of such velocities."""
 
 
 def quantile(fit: Fit) -> float:
-    """Of Student's t for 95 % intervals: clusters less parameters are its degrees of freedom."""
+    """Student's t for 95 % intervals, with clusters less parameters as degrees of freedom."""
     return float(scipy.stats.t.ppf(0.975, max(len(fit.heldout) - len(fit.parameters), 1)))
 
 
 def unit(of: str, where: str) -> str:
-    """The unit at one place, of a parameter whose unit differs between moving and turning.
+    """The unit at one place, of a parameter whose unit differs between translation and rotation.
 
     A coefficient of one axis by the motion on another (`sway_from_yaw`) has the units of both.
     """
@@ -52,7 +52,7 @@ def unit(of: str, where: str) -> str:
 def values_of(
     bench: Bench, theta: Float[np.ndarray, " p"], rows: Sequence[int], joint: Fit
 ) -> dict[str, result.Value]:
-    """Parameters with intervals from the joint fit of all that is free, clustered by run."""
+    """Parameters with intervals from the joint fit of all free ones, clustered by run."""
     t = quantile(joint)
     found = {}
     for i in rows:
@@ -65,7 +65,7 @@ def values_of(
 
 
 def _assumed(bench: Bench, name: str, where: str) -> dict[str, result.Value]:
-    """What a cause's parameters refer to, without an interval."""
+    """Assumed values that a cause's parameters refer to, without intervals."""
     own = (e for e in bench.library.effects if e.name == name and where in e.places)
     told = next(own).assumed(where)
     return {what: result.Value(at, unit, (_NAN, _NAN)) for what, (at, unit) in told.items()}
@@ -99,7 +99,7 @@ def cause(
 
 
 def refitted(bench: Bench, look: Look, rows: Sequence[int], joint: Fit) -> list[result.Refitted]:
-    """Coefficients that were fitted beside the causes: believed and found."""
+    """Coefficients that were fitted with the causes: believed and found values."""
     found = []
     t = quantile(joint) if rows else 0.0
     for i in rows:
@@ -113,7 +113,7 @@ def refitted(bench: Bench, look: Look, rows: Sequence[int], joint: Fit) -> list[
 
 
 def residual(bench: Bench, look: Look) -> dict[str, result.AxisResidual]:
-    """What is left, channel by channel; not a number where nothing was measured."""
+    """Statistics of the residual by channel; NaN where nothing was measured."""
     n, correlation = bench.data.weight.sum(), look.correlation
     found = {}
     for i, name in enumerate(CHANNELS):
@@ -131,7 +131,7 @@ def left_over(
     look: Look,
     least: float,
 ) -> list[str]:
-    """What the causes leave that is no noise, in words."""
+    """Systematic residuals that the causes leave, in words."""
     left = following(residual, causes)
     if look.noise.estimated:
         return left
@@ -157,7 +157,7 @@ def _is_random(name: str) -> bool:
 
 
 def thrust_by_run(bench: Bench, look: Look) -> tuple[float, float]:
-    """Nats that a thrust scale of each run's own wins on data left out, and how they spread."""
+    """Held-out nats that a thrust scale by run wins, and the scales' standard deviation."""
     evidence, at = look.plain, bench.library.at("thrust_scale", "all")
     if not set(at) <= set(evidence.design.owner.tolist()) or len(evidence.runs) < 3:
         return 0.0, 0.0
@@ -169,9 +169,9 @@ def thrust_by_run(bench: Bench, look: Look) -> tuple[float, float]:
 def following(
     residual: Mapping[str, result.AxisResidual], causes: Sequence[result.Cause]
 ) -> list[str]:
-    """What errors that follow each other say: velocities' alone, and of no law that was named.
+    """A sentence where only errors of velocities are autocorrelated and no law was named.
 
-    A filter's estimates err slowly in the positions too.
+    A filter's estimates have autocorrelated errors of position too.
     """
     lasting = ("disturbance", "environment")
     if any(kind(c.name).family in lasting for c in causes if c.name != "unknown"):
@@ -193,7 +193,7 @@ def following(
 def law_cause(
     laws: Sequence[Law], rivals: Sequence[Law], bench: Bench, look: Look
 ) -> tuple[result.Cause, Effect]:
-    """Laws of one name as a cause, axis by axis, and the effect that has them."""
+    """Laws of one name as a cause, axis by axis, and their effect."""
     same = sorted(laws, key=lambda law: law.where in AXES[3:])  # newtons before newton metres
     top = max(laws, key=lambda law: law.heldout_gain)
     experiment = of_law(top, rivals, bench, look)
@@ -218,7 +218,7 @@ def law_cause(
 
 
 def _law_values(law: Law, bench: Bench, look: Look) -> dict[str, result.Value]:
-    """A law's numbers in the units of its effect, with intervals by the delta method."""
+    """A law's parameters in the units of its effect, with intervals by the delta method."""
     data = bench.data
     units = {p.name: unit(p.unit, law.where) for p in kind(law.name).parameters}
     if law.errors is not None:
@@ -254,13 +254,13 @@ def _law_values(law: Law, bench: Bench, look: Look) -> dict[str, result.Value]:
         low, high = value * np.exp(-1.96 * s), value * np.exp(1.96 * s)
         found[name] = result.Value(float(value), units[name], (float(low), float(high)))
     if law.name == "current_varying":
-        least = float(data.weight.sum(axis=0).mean() * data.dt)  # it stays over a run
+        least = float(data.weight.sum(axis=0).mean() * data.dt)  # constant over a run
         found["time_constant"] = result.Value(least, "s", (_NAN, _NAN))
     return found
 
 
 def _responses(bench: Bench, look: Look, axis: str) -> tuple[float, float]:
-    """Whitened innovation on an axis for a unit impulse, and in the end for a unit wrench."""
+    """Whitened innovation on an axis after a unit impulse; its steady state under a unit wrench."""
     if axis not in AXES:
         return 1.0, 1.0
     i, dt = AXES.index(axis), bench.data.dt
@@ -277,7 +277,7 @@ def _responses(bench: Bench, look: Look, axis: str) -> tuple[float, float]:
 
 
 def verdict(causes: Sequence[result.Cause], left: Sequence[str] = ()) -> result.Verdict:
-    """What the causes amount to, and what they leave (`left_over`)."""
+    """The verdict on causes and on the residuals that they leave (`left_over`)."""
     unknown = [c.name == "unknown" for c in causes]
     if not causes:
         return "unexplained" if left else "adequate"
@@ -292,7 +292,7 @@ def sentence(
     refitted: bool = False,
     left: Sequence[str] = (),
 ) -> str:
-    """The finding in a line or two; `refitted` if coefficients were fitted first."""
+    """The diagnosis in a line or two; `refitted` if coefficients were fitted first."""
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     first = f"The data have faults: {problems[0]}{more}. " if problems else ""
     if not causes and left:
@@ -312,14 +312,14 @@ def sentence(
 
 
 def with_coefficients_off(diagnosis: result.Diagnosis) -> result.Diagnosis:
-    """The finding on a belief whose coefficients explain what it gets wrong."""
+    """The diagnosis of a model whose errors are explained by its coefficients."""
 
     def factor(r: result.Ratio) -> float:
-        """How far off; what has the other sign counts for most."""
+        """Distance from the believed value in logarithms; infinite for the wrong sign."""
         share = r.found.value / r.believed
         return abs(np.log(share)) if share > 0 else np.inf
 
-    off: dict[str, result.Ratio] = {}  # of each kind the one that is off most
+    off: dict[str, result.Ratio] = {}  # the one with the largest factor, by kind
     for r in diagnosis.ratios:
         low, high = r.found.interval95
         turned = r.believed * r.found.value < 0 and not low <= 0 <= high
@@ -351,6 +351,6 @@ def noise_words(bench: Bench, look: Look) -> dict[str, float]:
 
 
 def joint_rows(found: Found, nuisance: Sequence[int], bench: Bench) -> list[int]:
-    """All parameters that are free in the end."""
+    """All parameters of the final joint fit."""
     rows = [*parameters_of(bench.library, found.hypotheses), *nuisance]
     return list(dict.fromkeys(rows))

@@ -1,4 +1,4 @@
-"""What a diagnosis says: the content of `diagnosis.json`, and its schema."""
+"""The result of a diagnosis: the content of `diagnosis.json`, and its schema."""
 
 import dataclasses
 import inspect
@@ -33,13 +33,13 @@ class Value:
 
 @dataclass(frozen=True)
 class Support:
-    """Why a cause is believed: a p value for all names together, and nats on data left out.
+    """Evidence for a cause: a p value over all causes tried, and nats on data left out.
 
     The p value is of a test clustered by runs; where few runs bound it, and the gain is clear (1.5
-    to 5 times what noise wins), of the gain less that factor in noise alone.
+    to 5 times what noise wins), of the gain divided by that factor in noise alone.
 
     Attributes:
-        p_value: probability that noise alone makes one of all names look so good; 0 where below
+        p_value: probability that in noise alone the best of all causes fits as well; 0 where below
             1e-300.
         heldout_gain: log likelihood won on data left out of the fit (nats, in all).
     """
@@ -50,7 +50,7 @@ class Support:
 
 @dataclass(frozen=True)
 class Rival:
-    """Another name and what it would have won.
+    """Another cause and the gain that it would have had.
 
     Attributes:
         name: of the effect.
@@ -65,18 +65,18 @@ class Rival:
 
 @dataclass(frozen=True)
 class Structure:
-    """What no name explains, as far as data tell where it lives.
+    """Structure that no cause explains: where it acts and what it depends on.
 
     Attributes:
-        acts_on: axes, thruster or frame that feel it.
-        variables: what it depends on, most telling first.
+        acts_on: axes, thruster or frame that it acts on.
+        variables: what it depends on, most informative first.
         description: one sentence.
-        lag: time over which it remembers (s), if it does.
-        frequency: at which it rings (Hz), if it does.
+        lag: time constant of its memory (s), if it has one.
+        frequency: of its oscillation (Hz), if it has one.
         region: of each variable, where it was seen: 2nd and 98th percentile (m, rad, m/s, rad/s,
             N).
         heldout_gain: won on data left out (nats, in all).
-        best_name_gain: what the best name would have won of them (nats, in all).
+        best_name_gain: what the best named cause would have won instead (nats, in all).
     """
 
     acts_on: str
@@ -94,16 +94,16 @@ class Cause:
     """One named cause.
 
     Attributes:
-        name: of the effect, or `unknown` for structure without a name.
+        name: of the effect, or `unknown` for structure that no effect explains.
         where: axis, thruster (1 to n, or `all`) or frame it is in.
         parameters: estimates by name, each with its unit.
-        evidence: why it is believed.
-        rivals: names that would have won most in its place, best first.
-        indistinguishable_from: names that these data can't tell it from; of its own also the place.
-        next_experiment: what would tell it from what it is confused with, in words.
-        experiments: nats a minute that each maneuver of a set is expected to tell by; empty where
-            maneuvers make no difference.
-        structure: what is known of structure without a name; null for a name.
+        evidence: p value and held-out gain.
+        rivals: causes that would have won most in its place, best first.
+        indistinguishable_from: causes that these data do not distinguish from it; of the same name
+            with the place.
+        next_experiment: what would distinguish it from these, or measure it better, in words.
+        experiments: expected nats a minute of each maneuver; empty where maneuvers don't matter.
+        structure: what is known of the structure of an `unknown`; null for a named cause.
     """
 
     name: str
@@ -119,11 +119,11 @@ class Cause:
 
 @dataclass(frozen=True)
 class AxisResidual:
-    """What is left on an axis, against what the noise explains.
+    """The residual on an axis, against the predicted noise.
 
     Attributes:
-        variance_ratio: innovations' variance over the predicted one, dimensionless; 1 is all
-            explained, null (all three) what was not measured.
+        variance_ratio: innovations' variance over the predicted one, dimensionless; 1 where noise
+            explains all, null (all three) where nothing was measured.
         autocorrelation: of innovations one step apart, dimensionless; 0 for white.
         mean: of innovations, in standard errors of a mean of independent numbers.
     """
@@ -138,7 +138,7 @@ class Interval:
     """A number with its 95 % interval by bootstrap over what was left out in turn.
 
     Attributes:
-        value: in the unit of the field that holds it; null of simulations that diverged.
+        value: in the unit of the field that holds it; null for simulations that diverged.
         interval95: lower and upper end, in the same unit.
     """
 
@@ -152,7 +152,7 @@ class ModelGain:
 
     Attributes:
         log_score: log density of the innovations (nats a sample); larger is better.
-        log_score_gain: what it wins over the base (nats a sample).
+        log_score_gain: gain over the base (nats a sample).
         energy_score: by horizon, of simulations with noise: their mean distance from the record
             less half their mean distance from each other, m, rad, m/s and rad/s counted alike;
             smaller is better.
@@ -180,7 +180,7 @@ class Refitted:
         name: of the effect that changes it.
         where: axis or thruster.
         parameter: of the effect.
-        believed: value of the belief, in the unit of `fitted`.
+        believed: value of the believed model, in the unit of `fitted`.
         fitted: value found.
     """
 
@@ -193,12 +193,12 @@ class Refitted:
 
 @dataclass(frozen=True)
 class Ratio:
-    """A coefficient over inertia, which data tell whatever the mass: believed and found.
+    """A coefficient over inertia, which data determine without the mass: believed and found.
 
     Attributes:
         name: of the coefficient.
         where: axis.
-        believed: value of the belief, in the unit of `found`.
+        believed: value of the believed model, in the unit of `found`.
         found: value found.
     """
 
@@ -210,16 +210,16 @@ class Ratio:
 
 @dataclass(frozen=True)
 class DataSummary:
-    """What was there, what was missing, what could not be told.
+    """The data that were used, their faults, and what is not identifiable from them.
 
     Attributes:
         scenarios: names.
-        runs: how many were looked at.
-        seconds: time of theirs that is predicted (s).
+        runs: how many were used.
+        seconds: total time that is predicted (s).
         step: mean time between samples (s).
-        command: what commands were made of: thruster_force, pwm or F_Bo_B.
+        command: kind of commands: thruster_force, pwm or F_Bo_B.
         problems: faults of the data, a sentence each.
-        limits: what these data can't tell, a sentence each.
+        limits: what is not identifiable from these data, a sentence each.
         noise: estimated levels: standard deviations of the records, mean over axes (`position_m`,
             `attitude_rad`, `velocity_m_s` in m/s, `rate_rad_s` in rad/s), and the diffusion of
             the disturbance (`diffusion_surge`, sway, heave in N√s; roll, pitch, yaw in N·m√s).
@@ -237,25 +237,25 @@ class DataSummary:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The whole finding.
+    """The whole diagnosis.
 
     Attributes:
         version: of this format.
-        verdict: adequate (no cause), explained (all by names, or by coefficients), partly_explained
-            (names and `unknown`), unexplained (`unknown` alone).
+        verdict: adequate (no cause), explained (all by named causes, or by coefficients),
+            partly_explained (named causes and `unknown`), unexplained (`unknown` alone).
         sentence: the verdict in words.
-        causes: what is named, first found first.
+        causes: those found, first found first.
         refitted: coefficients fitted before any cause was named.
-        ratios: what such a fit tells whatever the mass; with `--refit all` only.
-        residual: what the causes leave, by channel: x, y, z, roll, pitch, yaw, u, v, w, p, q, r.
-        gain: of base (the belief), refitted (its coefficients fitted, no cause named), extended
-            (with the causes, where there are any) and black_box (a regression beside the belief).
+        ratios: coefficients over inertia from such a fit; with `--refit all` only.
+        residual: left by the causes, by channel: x, y, z, roll, pitch, yaw, u, v, w, p, q, r.
+        gain: of base (the believed model), refitted (its coefficients fitted, no cause named),
+            extended (with the causes, if any) and black_box (the base with a learned correction).
         left_out: what was left out in turn, for gains here and in causes.
-        data: what was looked at.
-        tested: names tried.
-        threshold: what noise alone wins of so many names as often as `alpha` says (nats, in all).
-        alpha: rate of false alarms over all names together.
-        seconds: that it took (s).
+        data: summary of the data.
+        tested: number of causes tried.
+        threshold: gain that noise exceeds over all causes with probability `alpha` (nats, in all).
+        alpha: rate of false alarms over all causes together.
+        seconds: computing time (s).
     """
 
     version: int

@@ -1,1 +1,1 @@
-"""Recordings as arrays, and what is wrong with them before any physics."""
+"""Recordings as arrays, and checks of the data that need no model."""

@@ -18,9 +18,9 @@ SEGMENT = 256
 _BLOCKS, _LEAST = 8, 16
 """Pieces that a single run is cut into at least, and samples of a piece at least."""
 REMEMBERED, _OF_A_RUN = 0.5, 0.1
-"""Time (s) before a piece whose commands its actuators may remember; share of a run at most."""
+"""Time (s) before a piece whose commands may set its actuator states; share of a run at most."""
 _BEYOND = 8.0
-"""Times a thruster's largest force that no command asks for."""
+"""Multiple of a thruster's largest force above which commands can't be in newtons."""
 _MOST_FOLDS = 10
 _FEW_RUNS = 6
 _EVEN = 1e-6
@@ -28,7 +28,7 @@ _EVEN = 1e-6
 
 
 def all_equal(step: np.ndarray, dt: float) -> bool:
-    """Whether steps (s) are all equal, `dt` in the mean."""
+    """Whether steps (s) are all equal, with the mean `dt`."""
     return bool(np.ptp(step) <= _EVEN * dt)
 
 
@@ -40,7 +40,7 @@ class Data:
         X: recorded poses (N + 1, 7, R).
         V: recorded twists (N + 1, 6, R).
         u: commanded thruster forces (N), held from n to n + 1 (N, 8, R).
-        past: those of the steps before (N), oldest first (P, 8, R): what actuators remember.
+        past: those of the steps before (N), oldest first (P, 8, R): they set actuator states.
         past_step: how long each of these was held (s) (P, R).
         voltage: relative to the vehicle's nominal one (N, R).
         step: from sample n to n + 1 (s) (N, R).
@@ -49,10 +49,10 @@ class Data:
         run: which run a piece was cut from (R,).
         names: scenarios.
         dt: mean step (s).
-        command: what the commands were made of: thruster_force, pwm or F_Bo_B.
+        command: kind of commands: thruster_force, pwm or F_Bo_B.
         has_voltage: whether the voltage was recorded.
         unmeasured: coordinates of the position that are integrals of the velocity alone. Then no
-            coordinate tells of errors: in B they are mixed.
+            error of position is used: in B the coordinates are mixed.
     """
 
     X: Float[np.ndarray, "M 7 R"]
@@ -73,14 +73,14 @@ class Data:
 
     @property
     def told(self) -> Float[np.ndarray, "12"]:
-        """1 for errors (pose in B, twist) that records tell, 0 for others."""
+        """1 for errors (pose in B, twist) that are measured, 0 for others."""
         found = np.ones(12)
         found[:3] = not self.unmeasured
         return found
 
     @property
     def left_out(self) -> Literal["scenario", "run", "block"]:
-        """What is left out of a fit in turn: scenarios, of one scenario runs, of one run blocks."""
+        """What folds are: scenarios, runs of a single scenario, or blocks of a single run."""
         if len(np.unique(self.scenario)) > 1:
             return "scenario"
         return "run" if len(np.unique(self.run)) > 1 else "block"
@@ -95,7 +95,7 @@ class Data:
 
     @property
     def cluster(self) -> Int[np.ndarray, " R"]:
-        """Within which pieces may depend on each other: runs; of a few long runs their pieces.
+        """Clusters of pieces that may depend on each other: runs; with few runs single pieces.
 
         A test between clusters needs more of them than a handful.
         """
@@ -116,7 +116,7 @@ class Data:
     def past_steps(
         self, pieces: Int[np.ndarray, " K"] | slice = slice(None)
     ) -> Float[np.ndarray, "P _"]:
-        """Likewise of the steps before."""
+        """The same of the steps before."""
         return self.past_step[:, :1] if self.even else self.past_step[:, pieces]
 
     @property
@@ -145,9 +145,9 @@ def make_data(
     """Cut a recording into pieces and turn its commands into thruster forces.
 
     Thruster forces are taken as they are; PWM goes through the vehicle's curve at the recorded
-    voltage; a wrench is split over the thrusters with the least effort. Runs `without` (by number,
-    scenario by scenario) are left out, unless none would remain. What thrusters did before a run is
-    not known: its first `remembered` s (a tenth of it at most) are only what they remember.
+    voltage; a wrench is allocated to the thrusters with the least effort. Runs `without` (by
+    number, scenario by scenario) are left out, unless none would remain. Commands before a run are
+    not known: its first `remembered` s (a tenth of it at most) only set the actuator states.
     Positions that were not measured are dead-reckoned.
 
     Raises:
@@ -230,7 +230,7 @@ def make_data(
 def _refuse_units(
     recording: Recording, vehicle: Vehicle, thrust: Float[np.ndarray, "S K N n"]
 ) -> None:
-    """Forces far beyond what the thrusters give are no newtons."""
+    """Refuse forces far beyond what the thrusters give: they are not in newtons."""
     most = np.maximum(*(np.abs(np.asarray(f)) for f in vehicle.thrusters().force_limits()))
     share = np.nanmax(np.abs(thrust), axis=(0, 1, 2)) / most
     k = int(np.argmax(share))

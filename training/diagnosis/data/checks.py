@@ -1,4 +1,4 @@
-"""Data at fault, and what data can't tell, found before anything is explained by physics."""
+"""Faults of the data, and what is not identifiable from them, found before any model is fitted."""
 
 import numpy as np
 from jaxtyping import Float
@@ -17,11 +17,11 @@ _HELD = 0.25
 """Share of the samples that repeat the one before where an instrument is slower than the rows."""
 _INSTRUMENTS = {"x,y,z": slice(4, 7), "u,v,w": slice(7, 10), "p,q,r": slice(10, 13)}
 _LEAST_ROWS, _LEAST_SECONDS = 60, 3.0
-"""Data below which nothing is told."""
+"""Least data that a diagnosis needs."""
 _NAMED = 3
-"""Runs that are named."""
+"""Most runs that a sentence names."""
 _EVEN_SHARE, _SURE = 0.9, 5.0
-"""Share of even steps among which a longer one is odd; noises of a step that are no noise."""
+"""Least share of even steps for a longer one to be suspect; multiple of noise that it exceeds."""
 _STILL = 0.02
 """Share of the strongest axis' command below which an axis counts as not driven."""
 _CHANNELS = {
@@ -31,14 +31,14 @@ _CHANNELS = {
 
 
 def problems(recording: Recording) -> tuple[list[str], list[int]]:
-    """Sensors that stand still, jumps of pose and clock, outliers, stretches without samples.
+    """Stuck sensors, jumps of pose and clock, outliers, gaps.
 
     One sentence each, and the runs (by number, scenario by scenario) that have them. A channel is
     stuck where it repeats one value exactly for longer than half a second while others change; it
     is no fault if it does so in every run and is part of the pose (a vehicle held in place).
-    Samples on a straight line in all velocities were filled in: a gap or a jump of the clock. A
-    clock jumps in a step that is longer than others, though the vehicle moves as in one of them. An
-    outlier is a single velocity far from both its neighbours, which agree: no blow is that short.
+    Samples on a straight line in all velocities were filled in: a gap or a jump of the clock. The
+    clock has jumped where a step is longer than others, but the motion is that of a usual step. An
+    outlier is a single velocity far from both its neighbours, which agree: no impact is that short.
     Where a quarter of the samples repeat those before, an instrument is slower than the rows.
 
     Raises:
@@ -139,7 +139,7 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
 
 
 def motion(X_WB: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "M 6"]:
-    """Displacement and rotation vector from sample to sample, in the B in between."""
+    """Displacement and rotation vector from sample to sample, in B at mid-step."""
     turns = Rotation.from_quat(np.nan_to_num(X_WB[:, [1, 2, 3, 0]], nan=1.0))
     turn = (turns[:-1].inv() * turns[1:]).as_rotvec()
     middle = turns[:-1] * Rotation.from_rotvec(turn / 2)
@@ -151,7 +151,7 @@ def motion(X_WB: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "M 6"]:
 def clock_jump(
     moved: Float[np.ndarray, "M 6"], V: Float[np.ndarray, "M 6"], step: Float[np.ndarray, " M"]
 ) -> float:
-    """By how much (s) the longest step, among even ones, is too long for what moved in it; or 0."""
+    """Time (s) by which the longest step, among even ones, exceeds the motion in it; or 0."""
     usual = float(np.median(step))
     even = np.abs(step - usual) < 0.1 * usual
     if even.mean() < _EVEN_SHARE:
@@ -169,7 +169,7 @@ def clock_jump(
 
 
 def _refuse_signs(agreeing: Float[np.ndarray, "3 6"], samples: int) -> None:
-    """`agreeing`: sums of motion times velocity, and of the squares of both."""
+    """Refuse wrong signs; `agreeing`: sums of motion times velocity, and of the squares of both."""
     product, square, moved = agreeing
     slope = product / np.maximum(square, 1e-12)
     left = np.maximum(moved - slope * product, 0.0) / max(samples, 1)
@@ -184,7 +184,7 @@ def _refuse_signs(agreeing: Float[np.ndarray, "3 6"], samples: int) -> None:
 
 
 def require_enough(data: Data) -> None:
-    """Refuse data that tell nothing.
+    """Refuse data that are too few.
 
     Raises:
         UserError: they are too few.
@@ -204,13 +204,13 @@ def _longest(holds: np.ndarray) -> int:
 
 
 _ABOVE = 0.5
-"""Height (m) above the surface from which a vehicle does not dive."""
+"""Median height (m) above the surface from which depth counts as unknown."""
 SPARSE = 1.5
 """Steps between samples of commands from which these count as sparse."""
 
 
 def unexcited(data: Data, wrench_of: np.ndarray) -> list[str]:
-    """Axes that were not driven: what acts along them can't be told from these data.
+    """Axes that were not driven: effects along them are not identifiable from these data.
 
     `wrench_of` (6, n) is the wrench of unit thruster forces.
     """
@@ -230,7 +230,7 @@ def limits(
     estimated: bool = False,
     command_period: float = 0.0,
 ) -> list[str]:
-    """What these data can't tell, one sentence each."""
+    """What is not identifiable from these data, one sentence each."""
     found = [
         f"{axis} was not driven: its drag and inertia are not identifiable from these data"
         for axis in quiet

@@ -1,4 +1,4 @@
-"""What repeats: runs that had the same commands share the errors that a simulation makes."""
+"""Repeated runs: those with the same commands share the deterministic errors of a simulation."""
 
 from typing import NamedTuple
 
@@ -9,10 +9,10 @@ from ....models.effects.base import AXES
 from .arrays import Data
 
 _ALIKE = 0.1
-"""Share of their size by which commands of repeated runs may differ: by the supply, say."""
+"""Share of their size by which commands of repeated runs may differ, as with the supply voltage."""
 _CLEARLY, _MUCH = 6.0, 4.0
-"""Standard errors, and ratio to chance, from which errors repeat: a large current, drawn for every
-run, has a mean effect too, some twice what chance makes.
+"""Standard errors, and ratio to chance, from which errors count as repeating: the mean effect of a
+large current that is drawn for every run is about twice that of chance.
 """
 
 
@@ -50,7 +50,7 @@ def repeats(d: Data) -> list[Int[np.ndarray, " _"]]:
 
 
 def shares(z: Float[np.ndarray, "N a R"], d: Data) -> Shares:
-    """Where the variance of whitened errors comes from."""
+    """Decomposition of the variance of whitened errors by origin."""
     n = d.weight.sum(axis=0)
     some = n > 0
     means = (z * d.weight[:, None]).sum(axis=0)[:, some] / n[some]

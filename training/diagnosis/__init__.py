@@ -1,4 +1,4 @@
-"""What a simulation gets wrong, by name: innovations, probes, held-out scores.
+"""Diagnosis of model errors: named causes from Kalman innovations, tested on held-out data.
 
 The steps of a diagnosis, a folder each:
 
@@ -7,21 +7,21 @@ The steps of a diagnosis, a folder each:
               commands (`repeats`)
 `filter`      one-step predictions from every sample, their errors r and Jacobians A
               (`innovations`); diffusion and measurement noise from their covariances, and the
-              Kalman gain (`noise`); how every effect would change the innovations
-              (`sensitivities`), inner products of these by run (`gram`); all of it for one set of
-              parameters (`problem`)
-`candidates`  structure without a name: what a wrench could depend on besides, group by group
-`disturbance` laws of what is left: level, memory, heavy tails, waves, varying currents
-`selection`   fits, held-out gains and bounds of sets of causes (`hypotheses`); which causes are
-              there together (`search`); which name to give (`model_selection`); fits to forecasts
-              for states that were smoothed or resampled (`multi_step_fit`); all coefficients anew
+              Kalman gain (`noise`); responses of the innovations to every effect
+              (`sensitivities`), inner products of these by run (`gram`); all of these at one θ
+              (`problem`)
+`candidates`  unmodelled structure: groups of further regressors for the wrench
+`disturbance` laws of the residual: level, colour, heavy tails, waves, varying currents
+`selection`   fits, held-out gains and tests of sets of causes (`hypotheses`); forward selection of
+              causes (`search`) by the rules of `model_selection`; multi-step fits for states that
+              were smoothed or resampled (`multi_step_fit`); joint fit of all coefficients
               (`refit_all`)
-`validation`  what a model is worth on data left out: scores, simulations, bands, and a rival that
-              names nothing (`blackbox`)
+`validation`  scores on held-out data: log scores, simulations, coverage of bands, and a black-box
+              model to compare with (`blackbox`)
 `findings`    causes with intervals, in words; `diagnosis.json` (`result`); the next experiment
 
-`pipeline` does all of it, from a recording and a belief to a `result.Diagnosis` (`result.schema()`
-is its JSON Schema).
+`pipeline` runs all of these, from a recording and a believed model to a `result.Diagnosis`
+(`result.schema()` is its JSON Schema).
 
 The filter. A record y_n = h(x_n) + e_n is predicted from the record before it,
 r_n = y_(n+1) ⊖ h(f(h⁻¹(y_n), u_n)), with f a fourth-order step under the held command. To first
@@ -29,8 +29,8 @@ order in the noise the innovations of the Kalman filter with gain K follow from 
 
     ν_(n+1) = r_n + A_n (I - K_n) ν_n,
 
-so predictions need no sequence, noise levels may be changed afterwards, and the response of ν to
-an effect is the same linear recursion on the change that the effect makes in r. At the truth ν
-is white and independent of everything in the past, responses included: scores have no bias from
-noisy regressors.
+so samples are predicted independently, noise levels may be changed afterwards, and the response of
+ν to an effect is the same linear recursion on the change that the effect makes in r. Under the true
+model ν is white and independent of the past, responses included: scores have no bias from noisy
+regressors.
 """

@@ -1,4 +1,4 @@
-"""From a recording and a belief to named causes."""
+"""From a recording and a believed model to named causes."""
 
 import time
 from collections.abc import Callable
@@ -40,40 +40,40 @@ from .validation.validation import Contender, Simulated, judge, told, white_part
 Progress = Callable[[float, str], None]
 Refit = Literal["auto", "none", "scales", "linear", "command", "all"]
 _CLEARLY, _MANY = 0.05, 3
-"""Nats a sample that coefficients fitted to other runs must win over all causes together before a
-belief counts as wrong in most of them, and causes beyond which it may be."""
+"""Held-out nats a sample by which refitted coefficients must beat all causes together before most
+of them count as wrong, and number of causes above which they may be."""
 _MOST_UNKNOWN, _NAMES_FIRST = 2, 2
-"""Structures without a name at most, and names after which the first is looked for where more names
-are to come: what has none takes many."""
+"""Most unmodelled structures, and number of causes after which the first is sought where more
+causes pass: unmodelled structure can mimic several named causes."""
 _RIVALS = 0.25
-"""Share of what the best law wins below which names leave it to structure without a name."""
+"""Share of the best law's gain below which unmodelled structure is sought before causes."""
 _RESAMPLED, _OF_A_STEP, _NO_TIME = 0.02, 0.1, 0.06
-"""Nats a sample that a law, and share of a step that a time must have, in resampled data; share of
-a step below which a time is none in any: a simulation of ten substeps a sample whose pose feels a
-push half a substep late shows, without noise, as a clock that is off by a twentieth of a step."""
+"""In resampled data: nats a sample that a law must win, and least lag or delay (share of a step).
+In any data, delays below 6 % of a step are rejected: integration error looks like one. With ten
+substeps a step, a pose half a substep late shows, without noise, as a clock offset of 5 %."""
 _OF_A_COMMAND = 0.1
-"""Share of the time between sparse commands that a time must have: interpolation shows as one."""
+"""Least lag or delay, as a share of the period of sparse commands: interpolation looks like one."""
 _FINEST = 0.02
-"""Steps (s) of data that the extended model will be used on at least: delays are told by them."""
+"""Shortest step (s) that the extended model supports: it sets the length of delay buffers."""
 _LAW_MARGIN = 5.0
-"""Nats above the threshold of names that a law must win: it is tried on a grid on every axis."""
+"""Extra nats that a law must win: margin for the grid search's multiple comparisons."""
 
 
 @dataclass(frozen=True)
 class DiagnoseConfig:
-    """How to look.
+    """Options of a diagnosis.
 
     Attributes:
-        alpha: rate of false alarms over all names together.
-        refit: what is fitted before and beside every cause: `none` (every difference from the
-            belief is a cause), `scales` (one factor on all thrust), `linear` (added masses,
-            drag, buoyancy), `command` (a factor on the wrench of each axis, drag, buoyancy: for
-            commands of unknown scale; the inertia stays as believed) or `all` (these, the
-            thrusters' curve and levers, the centre of buoyancy: `identify`). `auto` is `none`
-            unless refitted coefficients forecast left-out runs clearly better than the causes
-            found: names don't explain a belief that is wrong in most of them, and `all` are fitted.
+        alpha: rate of false alarms over all causes together.
+        refit: what is fitted before the causes and stays free with them: `none` (every difference
+            from the believed model is a cause), `scales` (one factor on all thrust), `linear`
+            (added masses, drag, buoyancy), `command` (a factor on the wrench of each axis, drag,
+            buoyancy: for commands of unknown scale; the inertia stays as believed) or `all` (these,
+            the thrust curve and lever arms, the centre of buoyancy: `identify`). `auto` is `none`
+            unless refitted coefficients predict left-out runs clearly better than the causes found:
+            then most coefficients of the believed model are wrong, and `all` are fitted.
         most: causes at most.
-        horizon: length of the simulations that the gain is told by (s).
+        horizon: length of the simulations for validation (s).
         seed: of bootstraps and simulated noise.
     """
 
@@ -107,7 +107,7 @@ class Finding:
 
 
 class Diagnoser:
-    """One recording under one belief, looked at once: a `refit` of `auto` is `none` here."""
+    """One pass over a recording with one believed model: a `refit` of `auto` is `none` here."""
 
     def __init__(
         self,
@@ -139,12 +139,12 @@ class Diagnoser:
         self.rng = np.random.default_rng(self.config.seed)
 
     def progress(self, fraction: float, remark: str) -> None:
-        """Tell how far it is; it never goes back."""
+        """Report progress, which never decreases."""
         self.furthest = max(self.furthest, fraction)
         self.tell(self.furthest, remark)
 
     def run(self) -> Finding:
-        """All of it."""
+        """The whole diagnosis."""
         started = time.monotonic()
         config, bench = self.config, self.bench
         self.progress(0.02, "one-step predictions")
@@ -167,7 +167,7 @@ class Diagnoser:
         least = found.threshold + _LAW_MARGIN
         if self.resampled:  # interpolation makes the noise uneven
             least += _RESAMPLED * bench.data.steps
-        # what the names leave of their own is no law
+        # the residual of imperfectly fitted causes is no law
         least = max(least, OF_OTHERS * sum(choice.fit.heldout_gain for choice in found.accepted))
         least = max(least, found.left_undescribed)
         laws = [] if final.noise.estimated else all_laws(bench, final, least)
@@ -246,7 +246,7 @@ class Diagnoser:
             ) from error
 
     def _refitted(self, bench: Bench) -> Look:
-        """The belief with the coefficients fitted that are asked for."""
+        """The believed model with the coefficients of `refit` fitted."""
         if self.config.refit == "all":
             remark = "all coefficients together"
             return bench.look(identify(bench, lambda f: self.progress(0.03 + 0.07 * f, remark)))
@@ -256,7 +256,7 @@ class Diagnoser:
     def _together(
         self, bench: Bench, found: Found, rows: list[int]
     ) -> tuple[np.ndarray, Look, Fit]:
-        """All causes and what is refitted beside them, fitted jointly."""
+        """Joint fit of all causes and nuisance parameters."""
         if self.config.refit != "all":
             return bench.polish(found.current.theta, rows)
         causes = parameters_of(bench.library, found.hypotheses)
@@ -279,10 +279,10 @@ class Diagnoser:
     def _search(
         self, bench: Bench, nuisance: list[int], found: Found
     ) -> tuple[Bench, list[int], dict[Hypothesis, result.Structure]]:
-        """Names, structure without a name, and names beside it; it widens the library by an effect.
+        """Causes, unmodelled structure (a new effect in the library), and further causes.
 
-        Where a law of the disturbance wins far more than any name, structure is looked for first;
-        where more than two names are needed, it is looked for before the third.
+        Where a disturbance law wins far more than any cause, structure is sought first; where more
+        than two causes are needed, it is sought before the third.
         """
         config, structures = self.config, {}
         search = self._names(bench, nuisance, 0.1, 0.5)
@@ -296,7 +296,7 @@ class Diagnoser:
             if len(found.accepted) == _NAMES_FIRST and search.next(found)[0] is not None:
                 found.left = search.next(found)[1]
                 seen = seek(bench, nuisance, found, config.alpha, self.rng, self.quiet)
-            if found.accepted or seen is None:  # else in place of names
+            if found.accepted or seen is None:  # else structure replaces the causes
                 seen = None
                 bench = search.run(found).bench
         for number in range(_MOST_UNKNOWN):
@@ -328,7 +328,7 @@ class Diagnoser:
     ) -> tuple[dict[str, result.ModelGain], dict[str, Simulated]]:
         """Base, base refitted, extended model and black box on data left out of their fits.
 
-        `fitted` is the look of the final fit, with responses to the parameters of `rows`.
+        `fitted` is the evaluation of the final fit, with responses to the parameters of `rows`.
         """
         horizon, seed = self.config.horizon, self.config.seed
         self.progress(0.82, "gain: the belief")
@@ -374,13 +374,13 @@ def diagnose(
     config: DiagnoseConfig | None = None,
     progress: Progress = lambda fraction, remark: None,
 ) -> Finding:
-    """What the belief (`base`, or the vehicle's preset) gets wrong about a recording.
+    """The errors of the believed model (`base`, or the vehicle's preset) on a recording.
 
     Raises:
         UserError: the recording lacks pose or twist, or is too short.
     """
-    # threads of BLAS wait for each other in a loop: beside other work that is five times slower
-    from threadpoolctl import threadpool_limits  # it sets a variable as it is imported
+    # threads of BLAS busy-wait for each other: with other load on the cores it is five times slower
+    from threadpoolctl import threadpool_limits  # the import sets an environment variable
 
     with threadpool_limits(1, user_api="blas"):
         return _diagnose(recording, vehicle, base, config or DiagnoseConfig(), progress)
@@ -410,7 +410,7 @@ def _diagnose(
 
 
 def coefficients_are_off(diagnosis: result.Diagnosis) -> bool:
-    """Whether refitted coefficients win what causes do not, or it takes many causes."""
+    """Whether refitted coefficients win clearly more than the causes, or the causes are many."""
     causes = diagnosis.gain.get("extended")
     won = 0.0 if causes is None else max(causes.log_score_gain.value, 0.0)
     refitted = diagnosis.gain["refitted"].log_score_gain

@@ -7,7 +7,7 @@ The steps of a diagnosis, a folder each:
               commands (`repeats`)
 `filter`      one-step predictions from every sample, their errors r and Jacobians A
               (`innovations`); diffusion and measurement noise from their covariances, and the
-              Kalman gain (`noise`); responses of the innovations to every effect
+              Kalman gain (`noise`); sensitivities of the innovations to every effect
               (`sensitivities`), inner products of these by run (`gram`); all of these at one θ
               (`problem`)
 `candidates`  unmodelled structure: groups of further regressors for the wrench
@@ -29,8 +29,8 @@ order in the noise the innovations of the Kalman filter with gain K follow from 
 
     ν_(n+1) = r_n + A_n (I - K_n) ν_n,
 
-so samples are predicted independently, noise levels may be changed afterwards, and the response of
-ν to an effect is the same linear recursion on the change that the effect makes in r. Under the true
-model ν is white and independent of the past, responses included: scores have no bias from noisy
-regressors.
+so samples are predicted independently, noise levels may be changed afterwards, and the sensitivity
+of ν to an effect is the same linear recursion on the change that the effect makes in r. Under the
+true model ν is white and independent of the past, sensitivities included: scores have no bias from
+noisy regressors.
 """

@@ -328,7 +328,7 @@ class Diagnoser:
     ) -> tuple[dict[str, result.ModelGain], dict[str, Simulated]]:
         """Base, base refitted, extended model and black box on data left out of their fits.
 
-        `fitted` is the evaluation of the final fit, with responses to the parameters of `rows`.
+        `fitted` is the evaluation of the final fit, with sensitivities to the parameters of `rows`.
         """
         horizon, seed = self.config.horizon, self.config.seed
         self.progress(0.82, "gain: the belief")

@@ -90,7 +90,7 @@ def _through(
     weight: Array,
     step: Array,
 ) -> Float[Array, "N 12 L R"]:
-    """Whitened responses to accelerations d."""
+    """Whitened sensitivities to accelerations d."""
 
     def body(nu: Array, given: tuple) -> tuple[Array, Array]:
         a, A, gap, white, exists, h = given

@@ -33,7 +33,7 @@ class Seen:
 
 
 def responses_of(bench: Bench, look: Look, rows: list[int]) -> Float[np.ndarray, "m N12 R"] | None:
-    """Whitened responses to parameters, one small probe each."""
+    """Whitened sensitivities to parameters, one small probe each."""
     if not rows:
         return None
     design = Design.of(bench.library, look.theta, rows)

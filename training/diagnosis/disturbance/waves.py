@@ -86,7 +86,7 @@ def _drawn(screen: Screen, v: np.ndarray, a: np.ndarray, spread: np.ndarray) -> 
 
 
 def _responses(screen: Screen, v: np.ndarray, a: np.ndarray) -> Float[np.ndarray, "k N12 R"]:
-    """Whitened responses to velocities and accelerations of the water in W (N, 3, k, R)."""
+    """Whitened sensitivities to velocities and accelerations of the water in W (N, 3, k, R)."""
     by_v, by_a = screen.water
     return screen.passed(
         np.einsum("nijr,njkr->nikr", by_v, v) + np.einsum("nijr,njkr->nikr", by_a, a)
@@ -96,7 +96,7 @@ def _responses(screen: Screen, v: np.ndarray, a: np.ndarray) -> Float[np.ndarray
 def _about(
     screen: Screen, v: np.ndarray, a: np.ndarray, likely: Float[np.ndarray, "R k"]
 ) -> tuple[Float[np.ndarray, "N12 R"], Float[np.ndarray, "k N12 R"]]:
-    """Innovations in still water and responses, both linearised at a likely motion of the water."""
+    """Innovations in still water and sensitivities, linearised at a likely motion of the water."""
     push, slope = screen.in_current(np.einsum("nikr,rk->nir", v, likely))
     by_a = np.einsum("nijr,njkr->nikr", screen.water[1], a)
     J = screen.passed(np.einsum("nijr,njkr->nikr", slope, v) + by_a)
@@ -163,9 +163,9 @@ def find_current(bench: Bench, look: Look) -> Law:
     """A horizontal current that varies within runs: Gauss–Markov in W, drawn anew for each piece.
 
     Its Karhunen–Loève series is truncated after `_BENDS` cosines. Drag is nonlinear in the current,
-    so responses are relinearised at the most likely current of each piece (Laplace's method). The
-    time constant with the largest gain is taken; one of ten pieces and more is only known to be
-    longer than a piece.
+    so sensitivities are taken at the most likely current of each piece, iteratively (Laplace's
+    method). The time constant with the largest gain is taken; one of ten pieces and more is only
+    known to be longer than a piece.
     """
     screen = Screen(bench, look, None)
     v = _flow(bench, screen.kept)

@@ -1,4 +1,4 @@
-"""Inner products of whitened innovations and responses, by cluster."""
+"""Inner products of whitened innovations and sensitivities, by cluster."""
 
 import numpy as np
 import scipy.optimize

@@ -1,4 +1,4 @@
-"""The diagnosis problem: evaluation of θ (innovations, noise, responses), and exact fits of it."""
+"""The diagnosis problem: evaluation of θ (innovations, noise, sensitivities), and exact fits."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -197,7 +197,7 @@ class Bench:
         kalman: Filter | None = None,
         again: Look | None = None,
     ) -> Look:
-        """Evaluate θ: innovations, and responses to the parameters chosen.
+        """Evaluate θ: innovations, and sensitivities to the parameters chosen.
 
         By default these are all causes (in single thrusters only if they can't be in all of them),
         parameters in use, and those with bounds of their own (`within`). An evaluation at the same

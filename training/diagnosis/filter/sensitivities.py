@@ -1,4 +1,4 @@
-"""Responses of the whitened innovations to effects: probes passed through the same filter."""
+"""Sensitivities of the whitened innovations to effects: probes passed through the same filter."""
 
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -117,7 +117,7 @@ def _opponents(choice: Choice, named: Sequence[Hypothesis]) -> list[Hypothesis]:
 def _looked_at(
     bench: Bench, final: Look, there: Evidence
 ) -> dict[str, tuple[Float[np.ndarray, "m m"], float]]:
-    """Products of responses in each maneuver, with the design of `there`, and its minutes."""
+    """Products of sensitivities in each maneuver, with the design of `there`, and its minutes."""
     inverse, design = np.linalg.inv(bench.mass(final.theta)), there.design
     products: dict[str, np.ndarray] = {}
     minutes: dict[str, float] = {}

@@ -2,7 +2,7 @@
 
 Slow disturbances, a current that differs from run to run, and swell make innovations correlated.
 Causes that only change the mean then seem to explain them, for the state depends on past
-disturbances too. Innovations and responses are therefore whitened first: a slow disturbance is
+disturbances too. Innovations and sensitivities are therefore whitened first: a slow disturbance is
 predicted from past innovations (an ARMA(1, 1), as in `laws.colour`), and amplitudes drawn anew for
 each piece are integrated out (Woodbury 1950), with the variance of their law.
 """
@@ -23,7 +23,7 @@ class Beside:
         slow: of axes with slow disturbances, by index: ρ, κ, and the regression coefficients of
             the twelve innovations on the predicted disturbance.
         scale: standard deviations of the innovations without the slow disturbances.
-        drawn: whitened responses to the amplitudes drawn for each piece (k, N·12, R).
+        drawn: whitened sensitivities to the amplitudes drawn for each piece (k, N·12, R).
         precision: of each of these amplitudes (k,).
     """
 
@@ -33,7 +33,7 @@ class Beside:
     precision: Float[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0))
 
     def products(self, z: Float[np.ndarray, "m N12 R"]) -> Float[np.ndarray, "R m m"]:
-        """Inner products of innovations and responses by piece, after whitening."""
+        """Inner products of innovations and sensitivities by piece, after whitening."""
         if self.drawn is not None:
             z = np.concatenate([z, self.drawn])
         G = gram(self._unslowed(z))

@@ -1,7 +1,7 @@
 """Fits, held-out gains and tests of sets of causes, all from inner products by run.
 
-A hypothesis is a set of parameters; with columns J of responses the innovations are z + J θ, and
-½ |z + J θ|² is minus the log likelihood up to a constant. Parameters whose response is not linear
+A hypothesis is a set of parameters; with sensitivities J in columns the innovations are z + J θ,
+and ½ |z + J θ|² is minus the log likelihood up to a constant. Parameters with a nonlinear response
 (lag, delay, dead zone) have several probes; in between, a cubic spline through the probed
 responses is taken, which is again a combination of columns.
 """
@@ -109,7 +109,7 @@ def known_within(parameter: Parameter) -> float:
 
 
 class Evidence:
-    """Inner products of innovations (column 0) and probed responses, by run and by fold."""
+    """Inner products of innovations (column 0) and responses to probes, by run and by fold."""
 
     def __init__(
         self,
@@ -129,7 +129,7 @@ class Evidence:
         del labels
 
     def scaled(self, products: Float[np.ndarray, "*R m m"]) -> Float[np.ndarray, "*R m m"]:
-        """Products of responses per unit of each parameter, from those of responses to probes."""
+        """Products of sensitivities per unit of each parameter, from responses to the probes."""
         scale = np.concatenate([[1.0], 1 / self.design.size])
         return products * scale[:, None] * scale
 
@@ -336,9 +336,9 @@ class Evidence:
     ) -> Chance:
         """The largest held-out gain of any hypothesis in pure noise.
 
-        Under the fitted base the innovations are white and their products with the responses of a
-        fold are Gaussian with the responses' own products as covariance: no simulation of motion
-        is needed. The largest tenth is taken to be exponential.
+        Under the fitted base the innovations are white and their products with the sensitivities of
+        a fold are Gaussian with the sensitivities' own products as covariance: no simulation of
+        motion is needed. The largest tenth is taken to be exponential.
         """
         m = self.total.shape[0]
         linear = [

@@ -1,4 +1,4 @@
-"""Inertia of the water: other added masses, coupled ones, another Munk moment."""
+"""Errors of the added mass: diagonal, off-diagonal, and in the Munk moment."""
 
 from typing import ClassVar
 

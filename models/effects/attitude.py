@@ -42,9 +42,9 @@ class GyroBias(Effect):
 
 
 class HeadingError(Effect):
-    """ψ_recorded = ψ + s sin ψ + c cos ψ + o: a compass in the field of its own vehicle.
+    """ψ_recorded = ψ + s sin ψ + c cos ψ + o: compass deviation by the vehicle's own field.
 
-    ψ counts from east, counter-clockwise. The semicircular deviation of a compass is s, c (Bowditch
+    ψ is measured from east, counter-clockwise. s and c are the semicircular deviation (Bowditch
     2019, ch. 8); o is a constant offset.
     """
 
@@ -78,17 +78,17 @@ class HeadingError(Effect):
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
         sine, cosine = _heading(X_WB)
         error = self._error(X_WB, sine, cosine)
-        for _ in range(2):  # contracts by the error's own size each time
+        for _ in range(2):  # fixed-point iteration; contracts by the size of the error
             s, c = jnp.sin(error), jnp.cos(error)
             error = self._error(X_WB, sine * c - cosine * s, cosine * c + sine * s)
         return _turned(X_WB, -error), V_WB_B
 
 
 class ClockOffset(Effect):
-    """One channel's stamps are late by δ: what is recorded at t is the value of t - δ.
+    """The time stamps of one channel are late by δ: the record at t holds the value at t - δ.
 
-    `linear`, `angular`: velocities of an instrument, `twist` both; `pose`: X exp(-Ω), Ω being the
-    integral of the twist over δ, the first term of Magnus (1954). All against the command's clock.
+    `linear` and `angular` delay these velocities, `twist` both. `pose` records X exp(-Ω), with Ω
+    the integral of the twist over δ (first term of Magnus 1954). δ is against the command's clock.
     """
 
     name: ClassVar[str] = "clock_offset"
@@ -100,7 +100,7 @@ class ClockOffset(Effect):
     source: ClassVar[str] = "5 to 50 ms between computers"
 
     def _delays(self, V: Array) -> tuple[Array, Array]:
-        """Of the twist's six components, and of the pose."""
+        """Delays (s) of the twist's six components, and of the pose."""
         twist, pose, linear, angular = (self.part(i, V)[None] for i in range(4))
         return jnp.concatenate([twist + linear] * 3 + [twist + angular] * 3), pose
 
@@ -128,7 +128,7 @@ def _heading(X: Array) -> tuple[Array, Array]:
 
 
 def _turned(X: Array, angle: Array) -> Array:
-    """The pose with its attitude turned about W's z axis, its position kept."""
+    """The pose with its attitude rotated about W's z axis; the position is kept."""
     w, x, y, z = jnp.unstack(X[:4])
     c, s = jnp.cos(angle / 2), jnp.sin(angle / 2)
     q = [c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w]

@@ -1,8 +1,8 @@
-"""What a named physical effect offers: numbers that are zero when it is absent, and its hooks.
+"""Interface of a named physical effect: parameters that are zero when it is absent, and hooks.
 
 An effect is one possible difference between a simulation and the world. The same object serves the
 simulator (`extended.Extended`), the one-step predictor of a diagnosis and the extended model that
-comes out of it, so that a name means one equation everywhere.
+the diagnosis returns, so that a name means one equation everywhere.
 
 To add one, subclass `Effect`, state `name`, `family`, `parameters`, `places`, and override the
 hooks at the places of a simulation where it acts::
@@ -12,8 +12,8 @@ hooks at the places of a simulation where it acts::
     → `diffusion`, `advance` (noise laws) → `measure` (sensors; `unmeasure` is its inverse)
 
 Arrays are component first as in `models.se3`. `values` may carry batch axes of their own that
-broadcast against the state's (one column a hypothesis), so that one compiled program runs every
-hypothesis. All parameters are zero for "not there"; `neutral` values change nothing.
+broadcast against the state's (one column per hypothesis), so that one compiled program runs every
+hypothesis. A parameter of zero means absent; `neutral` values change nothing.
 """
 
 import math
@@ -35,7 +35,7 @@ AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 XYZ = ("x", "y", "z")
 THRUSTERS = ("1", "2", "3", "4", "5", "6", "7", "8")
 ALL_OR_ONE = ("all", *THRUSTERS)
-"""Places of an effect that may sit in every thruster alike or in a single one."""
+"""Places of an effect that acts on all thrusters alike or on a single one."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,13 @@ class Parameter:
     """One number of an effect: zero means absent.
 
     Attributes:
-        name: as reports say it.
+        name: name in reports.
         unit: SI unit, "1" for a ratio.
-        probes: sizes at which a diagnosis measures the response; several where it is not linear.
-        low: least admissible value; an estimate below it vetoes the name.
+        probes: values at which a diagnosis computes the response; several where it is not linear.
+        low: least admissible value; an estimate below it rejects the cause.
         high: largest admissible value.
-        spread: standard deviation of what is known of it beforehand; 0 stands for very little.
-        usual: what reports say where the value is zero: it counts from there.
+        spread: prior standard deviation; 0 stands for a weak prior.
+        usual: nominal value, reported where the value is zero; the value is relative to it.
     """
 
     name: str
@@ -81,12 +81,12 @@ class Effect(eqx.Module):
     Attributes:
         values: parameters by place: index = place × number of parameters + parameter.
         name: the cause's name in reports.
-        parameters: what one place has.
+        parameters: those of one place.
         places: where it can act (axis, thruster number, frame).
-        simpler: names that explain the same data with less; they win unless clearly beaten.
-        echoes: names of one family that leave traces of one another.
-        essential: parameters of which one at least must differ from zero for it to be this cause.
-        absorber: it soaks up slow structure of any origin, so it is ranked last.
+        simpler: causes that explain the same data with fewer parameters, preferred if as good.
+        echoes: causes with similar signatures, which may appear as each other's residue.
+        essential: parameters of which at least one must differ from zero for this cause.
+        absorber: whether it fits slow structure of any origin, and is therefore ranked last.
         order: actuation and measurement effects apply from small to large.
         source: where the admissible range comes from.
     """
@@ -118,7 +118,7 @@ class Effect(eqx.Module):
 
     @classmethod
     def index(cls, place: str, parameter: str) -> int:
-        """Where a parameter of a place stands in `values`.
+        """Index in `values` of a parameter at a place.
 
         Raises:
             UserError: the effect has no such place or parameter.
@@ -163,16 +163,16 @@ class Effect(eqx.Module):
         return getattr(cls, hook) is not getattr(Effect, hook)
 
     def assumed(self, place: str) -> dict[str, tuple[float, str]]:
-        """Values and units that parameters at a place refer to, and that are not estimated."""
+        """Assumed values and units that parameters at a place refer to; they are not estimated."""
         del place
         return {}
 
     def part(self, i: int, like: Array) -> Array:
-        """Value i, of the rank of one component of `like`."""
+        """Value i, expanded to the rank of one component of `like`."""
         return expand(self.values[i], like.ndim - 1)
 
     def each(self, k: int, like: Array) -> Array:
-        """Parameter k of every thruster, for places `ALL_OR_ONE`: the common part and its own."""
+        """Parameter k of every thruster, for places `ALL_OR_ONE`: common plus individual part."""
         own = expand(self.values[k :: len(self.parameters)], like.ndim)
         return own[:1] + own[1:]
 
@@ -182,23 +182,23 @@ class Effect(eqx.Module):
         return float(np.max(own[0] + np.maximum(own[1:], 0.0)))
 
     def column(self, like: Array) -> Array:
-        """All values as components, of the rank of `like`."""
+        """All values as components, expanded to the rank of `like`."""
         return expand(self.values, like.ndim)
 
     # --------------------------------------------------------------------------- actuation
 
     @property
     def memory_size(self) -> int:
-        """Numbers that the effect carries from step to step, for each thruster or in all."""
+        """Length of the memory that the effect carries from step to step."""
         return 0
 
     @property
     def memory_duration(self) -> float:
-        """For how long (s) what came before a motion still shows in it, to a percent or so."""
+        """Memory duration (s), to about 1 %."""
         return 0.0
 
     def initial(self, command: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
-        """The memory of an effect that has seen `command` for ever."""
+        """Steady-state memory under a constant `command`."""
         return jnp.zeros((self.memory_size, *command.shape[1:]), command.dtype)
 
     def actuate(
@@ -207,15 +207,15 @@ class Effect(eqx.Module):
         level: Float[Array, "n *#batch S"],
         dt: Float[Array, "..."],
     ) -> tuple[Float[Array, "m *#batch"], Float[Array, "n *#batch S"]]:
-        """Memory after a step of `dt` s and thruster forces (N), means over its S substeps.
+        """Memory after a step of `dt` s, and mean thruster forces (N) over its S substeps.
 
-        `dt` is one number, or (1, *batch) where columns take steps of their own.
+        `dt` is a scalar, or (1, *batch) where columns have different steps.
         """
         del dt
         return memory, level
 
     def for_steps_of(self, dt: float) -> "Effect":
-        """The same with a memory that suffices at steps of `dt` s."""
+        """The same effect with enough memory for steps of `dt` s."""
         del dt
         return self
 
@@ -225,7 +225,7 @@ class Effect(eqx.Module):
         V_WB_B: Float[Array, "6 *#batch"],
         dt: Any,
     ) -> tuple[Float[Array, "m *#batch"], Float[Array, "6 *#batch"]]:
-        """Memory after a step of `dt` s at a velocity, and the wrench F_Bo_B that it makes."""
+        """Memory after a step of `dt` s at a velocity, and the resulting wrench F_Bo_B."""
         del dt
         return memory, jnp.zeros_like(V_WB_B)
 
@@ -236,18 +236,18 @@ class Effect(eqx.Module):
         voltage: Float[Array, "1 *#batch"],
         plant: Plant,
     ) -> Float[Array, "n *#batch"]:
-        """Thruster forces (N) of those wanted; `voltage` relative to the nominal one."""
+        """Actual thruster forces (N) from the commanded; `voltage` is relative to the nominal."""
         del V_CB_B, voltage, plant
         return force
 
     def together(self, F_Bo_B: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
-        """The wrench of all thrusters (N, N·m), of the one that their forces make."""
+        """Actual wrench of all thrusters (N, N·m), from the allocated one."""
         return F_Bo_B
 
     # ---------------------------------------------------------------------- body and water
 
     def inertia(self, plant: Plant) -> Float[Array, "6 6 *batch"]:
-        """What is added to the mass matrix (kg, kg·m, kg·m²)."""
+        """Addition to the mass matrix (kg, kg·m, kg·m²)."""
         del plant
         return jnp.zeros((6, 6, *self.values.shape[1:]), self.values.dtype)
 
@@ -266,18 +266,18 @@ class Effect(eqx.Module):
 
     @property
     def noise_size(self) -> int:
-        """Unit Gaussians that one step of `advance` takes."""
+        """Number of unit Gaussians that one step of `advance` takes."""
         return 0
 
     @property
     def pushes(self) -> int:
-        """Length of the random state that `advance` moves and `push` reads."""
+        """Length of the random state that `advance` updates and `push` reads."""
         return 0
 
     def diffusion(
         self, V_WB_B: Float[Array, "6 *#batch"], b: Float[Array, "6 *#batch"]
     ) -> Float[Array, "6 *#batch"]:
-        """The diffusion (N√s, N·m√s) in place of b."""
+        """The diffusion (N√s, N·m√s) that replaces b."""
         del V_WB_B
         return b
 
@@ -310,7 +310,7 @@ class Effect(eqx.Module):
         V_WB_B: Float[Array, "6 *#batch"],
         recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        """What is recorded of a pose and twist that came about as `recent` says."""
+        """Recorded pose and twist from the true ones; `recent` is the twist's history."""
         del recent
         return X_WB, V_WB_B
 
@@ -320,7 +320,7 @@ class Effect(eqx.Module):
         V_WB_B: Float[Array, "6 *#batch"],
         recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        """The pose and twist of a record: the inverse of `measure`."""
+        """True pose and twist from the recorded ones: the inverse of `measure`."""
         del recent
         return X_WB, V_WB_B
 

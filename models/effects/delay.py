@@ -1,4 +1,4 @@
-"""Commands that arrive late."""
+"""Delay between command and thrust."""
 
 import dataclasses
 import math
@@ -15,9 +15,9 @@ from .base import ALL_OR_ONE, Effect, Parameter
 class ActuationDelay(Effect):
     """f(t) = u(t - δ): transport and processing time between the recorded command and the thrust.
 
-    The memory holds the last `steps` commands and how long each was held, so delays up to as many
-    steps are told apart, equal or not; the means over substeps of the shifted piecewise constant
-    command are exact.
+    The memory holds the last `steps` commands and how long each was held, so it represents delays
+    up to that many steps, of equal length or not. The means over substeps of the shifted piecewise
+    constant command are exact.
     """
 
     name: ClassVar[str] = "actuation_delay"
@@ -80,5 +80,5 @@ class ActuationDelay(Effect):
 
 
 def _overlap(start: Array, end: Array, low: Array, high: Array) -> Array:
-    """Length of what two intervals have in common."""
+    """Length of the intersection of two intervals."""
     return jnp.clip(jnp.minimum(end, high) - jnp.maximum(start, low), 0, None)

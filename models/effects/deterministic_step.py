@@ -18,7 +18,7 @@ _WEIGHT = np.array([1.0, 2.0, 2.0, 1.0]) / 6
 
 @runtime_checkable
 class Actuated(Protocol):
-    """A model at the level of its thrusters: `effects.Extended`, which documents these methods."""
+    """A model driven by thruster forces: `effects.Extended`, which documents these methods."""
 
     def actuate(
         self, memory: Memory, command: Array, dt: Any, substeps: int
@@ -27,7 +27,7 @@ class Actuated(Protocol):
         ...
 
     def feel(self, memory: Memory, V_WB_B: Array, dt: Any) -> tuple[Memory, Array | None]:
-        """Memories after a step at a velocity, and the wrench that they make, if any."""
+        """Memories after a step at a velocity, and the resulting wrench, if any."""
         ...
 
     def drift(
@@ -39,7 +39,7 @@ class Actuated(Protocol):
         voltage: Array | None = None,
         push: Array | None = None,
     ) -> Array:
-        """dV/dt under thruster forces that memory effects have passed, and a push."""
+        """dV/dt under thruster forces (memory effects applied) and a wrench `push`."""
         ...
 
 
@@ -59,13 +59,13 @@ def advance(
 ]:
     """Memory, pose and twist after `dt` s, and dV/dt and d²V/dt² at the end of the last substep.
 
-    The second derivative is what the first changed by over that substep.
+    The second derivative is the difference quotient of the first over that substep.
 
-    `dt` is one number, or (1, *batch) where columns take steps of their own.
+    `dt` is a scalar, or (1, *batch) where columns have different steps.
 
-    Runge–Kutta–Munthe-Kaas of order 4 for X' = X V (Munthe-Kaas 1999; Owren and Marthinsen 1999),
-    thruster forces linear over a substep, by their means over its halves: in a fast turn drag tells
-    early thrust from late within a hundredth of a second. `inertia` is `model.inertia()`. The four
+    Runge–Kutta–Munthe-Kaas of order 4 for X' = X V (Munthe-Kaas 1999; Owren and Marthinsen 1999).
+    Thruster forces are linear over a substep, with the means of its two halves: in a fast turn the
+    response depends on the timing of thrust within 0.01 s. `inertia` is `model.inertia()`. The four
     stages are one loop, so that a model of many effects compiles once.
     """
     memory, levels = model.actuate(memory, command, dt, 2 * substeps)

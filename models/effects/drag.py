@@ -1,4 +1,4 @@
-"""Damping that differs from the model's: by axis, direction, power and coupling."""
+"""Errors of the damping: by axis, direction, power and coupling."""
 
 from typing import ClassVar
 
@@ -19,7 +19,7 @@ COUPLINGS = (
     ("yaw_from_surge", 5, 0),
     ("surge_from_yaw", 0, 5),
 )
-"""(place, axis that feels it, axis whose velocity makes it): those that symmetry lets exist."""
+"""(place, axis of the force, axis of the velocity): those that symmetry allows."""
 
 
 class LinearDrag(Effect):

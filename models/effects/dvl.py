@@ -1,4 +1,4 @@
-"""Errors of the velocity log's mounting and scale."""
+"""Errors of the DVL's mounting and scale."""
 
 from typing import ClassVar
 
@@ -11,12 +11,12 @@ from .recent import Recent
 
 
 def _turn(angles: Float[Array, "3 *batch"]) -> Float[Array, "7 *batch"]:
-    """The pose turned by a rotation vector."""
+    """The pose of a rotation vector, at the origin."""
     return se3.exp(jnp.concatenate([jnp.zeros_like(angles), angles]))
 
 
 class DvlLeverArm(Effect):
-    """v_recorded = v + ω × l: the log sits l away from where it is believed."""
+    """v_recorded = v + ω × l: the DVL is mounted l away from its assumed position."""
 
     name: ClassVar[str] = "dvl_lever_arm"
     family: ClassVar = "measurement"
@@ -48,7 +48,7 @@ class DvlLeverArm(Effect):
 
 
 class DvlMisalignment(Effect):
-    """v_recorded = R(θ)ᵀ v: the log is turned by the rotation vector θ against B."""
+    """v_recorded = R(θ)ᵀ v: the DVL is rotated by the rotation vector θ relative to B."""
 
     name: ClassVar[str] = "dvl_misalignment"
     family: ClassVar = "measurement"
@@ -79,7 +79,7 @@ class DvlMisalignment(Effect):
 
 
 class DvlScale(Effect):
-    """v_recorded = (1 + s) v: the speed of sound is not what the log believes."""
+    """v_recorded = (1 + s) v: the DVL assumes a wrong speed of sound."""
 
     name: ClassVar[str] = "dvl_scale"
     family: ClassVar = "measurement"

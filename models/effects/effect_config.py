@@ -1,4 +1,4 @@
-"""Effects as settings: what a scenario's YAML says that a simulation has besides."""
+"""Configuration of effects in a scenario's YAML."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
@@ -16,7 +16,7 @@ class EffectConfig:
     """One effect by name: `{name: thruster_gain, where: "3", parameters: {gain: -0.5}}`.
 
     Attributes:
-        name: that of a cause (`library.KINDS`).
+        name: name of a cause (`library.KINDS`).
         where: axis, thruster or frame; may be left out where there is one place, or `all`.
         parameters: by name, in the units that the effect's class states; zero if left out.
         options: further fields of the class (the `floor` and `walls` of `proximity`).
@@ -72,10 +72,10 @@ def _counts(value: float | list[float]) -> bool:
 
 
 def check_distinct(effects: Iterable[EffectConfig]) -> None:
-    """Refuse an effect that is there twice at one place.
+    """Refuse two effects of one name at one place.
 
     Raises:
-        UserError: it is; the sentence names it.
+        UserError: there are two; the message names them.
     """
     seen: set[tuple[str, str]] = set()
     for effect in effects:

@@ -1,4 +1,4 @@
-"""A base model with effects: rolls out, is stored, and stands where any `Dynamics` stands."""
+"""A base model with effects; it is a `Dynamics` itself."""
 
 import dataclasses
 from typing import Any
@@ -24,15 +24,15 @@ FOR_EVER = 1e9
 
 
 def core(dynamics: Dynamics) -> Dynamics:
-    """A model without the effects about it."""
+    """The base of a model with effects; other models are returned as they are."""
     return dynamics.base if isinstance(dynamics, Extended) else dynamics
 
 
 class Extended(Dynamics):
-    """`base` with `effects`, at the level of its thrusters.
+    """`base` with `effects`, driven by thruster forces.
 
-    As a `Dynamics` it takes a wrench and splits it over the thrusters with the least effort; lag
-    and delay act in `integrate.rollout`. Random states (waves, coloured pushes) act where thruster
+    As a `Dynamics` it takes a wrench and allocates it to the thrusters with the least effort; lag
+    and delay act in `integrate.rollout`. Random states (waves, coloured noise) act where thruster
     forces are commanded: in `rollout`, and in the plant of a diagram.
     """
 
@@ -57,11 +57,11 @@ class Extended(Dynamics):
         return dataclasses.replace(self, effects=ordered)
 
     def with_base(self, base: Dynamics) -> "Extended":
-        """The same effects and thrusters about another base."""
+        """The same effects and thrusters on another base."""
         return dataclasses.replace(self, base=base)
 
     def trainable(self) -> "Extended":
-        """The same tree with True at what is trained of the base; effects stay as measured."""
+        """The same tree with True at the base's trainable leaves; effects are not trained."""
         own = getattr(self.base, "trainable", None)
         spec = jax.tree.map(eqx.is_inexact_array, self.base) if own is None else own()
         fixed = jax.tree.map(lambda _: False, self)
@@ -69,12 +69,12 @@ class Extended(Dynamics):
 
     @property
     def memory_duration(self) -> float:
-        """For how long (s) what came before a motion still shows in it."""
+        """Memory duration (s), to about 1 %."""
         return max((effect.memory_duration for effect in self.effects), default=0.0)
 
     @property
     def reads(self) -> bool:
-        """Whether instruments show anything else than the state."""
+        """Whether any effect makes the recorded state differ from the true one."""
         return self._any("measure")
 
     # ------------------------------------------------------------- what every `Dynamics` has
@@ -120,11 +120,11 @@ class Extended(Dynamics):
         return self.base.correlate(V_WB_B, dW)
 
     def potential(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "*#batch"]:
-        """Of the base: effects need not have a potential."""
+        """Potential of the base alone: effects need not have one."""
         return self.base.potential(X_WB)
 
     def potential_wrench(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "6 *#batch"]:
-        """Of the base alone."""
+        """Potential wrench of the base alone."""
         return self.base.potential_wrench(X_WB)
 
     def balance(
@@ -158,7 +158,7 @@ class Extended(Dynamics):
 
     @property
     def plant(self) -> Plant:
-        """What effects may refer to."""
+        """Constants of the vehicle that effects may refer to."""
         zero = jnp.zeros(6, self.positions.dtype)
         mass = self.base.coefficients(zero).mass.matrix()
         weight = getattr(self.base, "weight", self.base.displaced_mass * 9.80665)
@@ -209,7 +209,7 @@ class Extended(Dynamics):
     def scaled_diffusion(
         self, V: Float[Array, "6 *#batch"], b: Float[Array, "6 *#batch"]
     ) -> Float[Array, "6 *#batch"]:
-        """The diffusion in place of b, with the effects on it."""
+        """The diffusion that replaces b, with the effects on it."""
         for effect in self.effects:
             if effect.acts("diffusion"):
                 V, b = se3.align(V, b)
@@ -217,7 +217,7 @@ class Extended(Dynamics):
         return b
 
     def inertia(self) -> Inertia:
-        """The mass matrix of a base whose own is constant, for all columns of the effects' values.
+        """The mass matrix with effects, for a base of constant mass; batched as their values.
 
         Raises:
             ValueError: the base's mass depends on its velocity.
@@ -248,7 +248,7 @@ class Extended(Dynamics):
         return F_Bo_B
 
     def _through_water(self, X: Array, V: Array) -> tuple[Array, Array | None]:
-        """Velocity relative to the effects' steady flow, and how B's turning changes that flow.
+        """Velocity relative to the effects' steady flow, and that flow's rate in B as B rotates.
 
         For a uniform steady flow the equations hold unchanged in the relative velocity (Fossen
         2011, property 8.1: Galilean invariance).
@@ -267,7 +267,7 @@ class Extended(Dynamics):
         V_CB_B: Float[Array, "6 *#batch"],
         extra: Float[Array, "6 6 *#batch"] | None = None,
     ) -> Float[Array, "6 *#batch"]:
-        """What the effects add to the wrench balance besides thrust."""
+        """Wrench of the effects, other than thrust."""
         total = jnp.zeros_like(V_CB_B)
         if extra is not None:
             total = total + se3.coad_apply(V_CB_B, times(extra, V_CB_B))
@@ -300,7 +300,7 @@ class Extended(Dynamics):
         voltage: Float[Array, "1 *#batch"] | None = None,
         push: Float[Array, "6 *#batch"] | None = None,
     ) -> Float[Array, "6 *#batch"]:
-        """dV/dt under thruster forces that memory effects have passed, and a random push."""
+        """dV/dt under thruster forces (memory effects applied) and a random wrench `push`."""
         V_r, turning = self._through_water(X_WB, V_WB_B)
         F = self.push(level, X_WB, V_WB_B, voltage)
         F = F if push is None else F + push
@@ -312,11 +312,11 @@ class Extended(Dynamics):
     # ---------------------------------------------------------------------------- memories
 
     def for_steps_of(self, dt: float) -> "Extended":
-        """The same, its effects with memories that suffice at steps of `dt` s."""
+        """The same model, its effects with enough memory for steps of `dt` s."""
         return self.with_effects(tuple(e.for_steps_of(dt) for e in self.effects))
 
     def remember(self, command: Float[Array, "n *batch"]) -> Memory:
-        """Memories that have seen a command for ever."""
+        """Steady-state memories under a constant command."""
         return tuple(e.initial(command) for e in self.effects if e.memory_size)
 
     def actuate(
@@ -336,7 +336,7 @@ class Extended(Dynamics):
     def feel(
         self, memory: Memory, V_WB_B: Float[Array, "6 *#batch"], dt: Any
     ) -> tuple[Memory, Float[Array, "6 *#batch"] | None]:
-        """Memories after a step at a velocity, and the wrench that they make, if any."""
+        """Memories after a step at a velocity, and the resulting wrench, if any."""
         kept, total, i = [], None, 0
         for effect in self.effects:
             if not effect.memory_size:
@@ -353,13 +353,13 @@ class Extended(Dynamics):
 
     @property
     def body(self) -> "Extended":
-        """The same without effects on the actuation: it takes the wrench that thrusters make."""
+        """The same without effects on the actuation: its input is the thrusters' wrench."""
         hooks = ("actuate", "thrust", "together")
         rest = (e for e in self.effects if not any(e.acts(hook) for hook in hooks))
         return self.with_effects(tuple(rest))
 
     def simulation_state(self, command: Float[Array, "n *batch"]) -> tuple[Memory, Random]:
-        """What a simulation carries from step to step: at rest, under `command` (N) for ever."""
+        """Initial memories, steady state under a constant `command` (N), and random states."""
         batch = command.shape[1:]
         return self.remember(command), tuple(
             jnp.zeros((e.pushes, *batch), command.dtype) for e in self.effects if e.pushes
@@ -372,7 +372,7 @@ class Extended(Dynamics):
         V_WB_B: Float[Array, "6 *#batch"],
         voltage: Float[Array, "1 *#batch"] | None = None,
     ) -> Float[Array, "6 *#batch"]:
-        """The thrusters' wrench on the body, of forces that memory effects have passed."""
+        """The thrusters' wrench on the body, from forces with memory effects applied."""
         V_r, _ = self._through_water(X_WB, V_WB_B)
         return self.together(self.allocate(self.thrust(level, V_r, voltage)))
 
@@ -382,7 +382,7 @@ class Extended(Dynamics):
         V_WB_B: Float[Array, "6 *#batch"],
         recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        """What is recorded of a state that came about as `recent` says, without noise."""
+        """Recorded pose and twist without noise; `recent` is the twist's history."""
         for effect in self.effects:
             if effect.acts("measure"):
                 X_WB, V_WB_B = effect.measure(X_WB, V_WB_B, recent)
@@ -394,7 +394,7 @@ class Extended(Dynamics):
         V_WB_B: Float[Array, "6 *#batch"],
         recent: Recent,
     ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        """The state of a record: the inverse of `observe`."""
+        """True pose and twist from the recorded ones: the inverse of `observe`."""
         for effect in reversed(self.effects):
             if effect.acts("measure"):
                 X_WB, V_WB_B = effect.unmeasure(X_WB, V_WB_B, recent)
@@ -404,7 +404,7 @@ class Extended(Dynamics):
 
     @property
     def noise_size(self) -> int:
-        """Unit Gaussians that a step of `rollout` takes: six for b dW, then the effects'."""
+        """Number of unit Gaussians per step of `rollout`: six for b dW, then the effects'."""
         return 6 + sum(effect.noise_size for effect in self.effects)
 
     def rollout(
@@ -418,9 +418,9 @@ class Extended(Dynamics):
     ) -> tuple[Float[Array, "T 7 *batch"], Float[Array, "T 6 *batch"]]:
         """States at dt, 2 dt, … under thruster commands (N), each held for a step.
 
-        `w` holds `noise_size` unit Gaussians a step, of which the first draw random states from
-        their stationary law; without it the motion is noise-free. Values of the effects must have
-        no batch axes, or ones that broadcast against the state's.
+        `w` holds `noise_size` unit Gaussians per step. Those of the first step draw random states
+        from their stationary law; without `w` the motion is noise-free. Values of the effects must
+        have no batch axes, or ones that broadcast against the state's.
         """
         inertia = self.inertia()
         memory, state = self.simulation_state(command[0])
@@ -452,9 +452,9 @@ class Extended(Dynamics):
         w: Float[Array, "k *#batch"],
         dt: float | Float[Array, ""],
     ) -> tuple[Random, Float[Array, "6 *#batch"]]:
-        """Random states after a step, and their wrench, drag of moving water included.
+        """Random states after a step, and their wrench, including drag of the moving water.
 
-        `w` holds `noise_size` unit Gaussians, the first six of which are left for b dW.
+        `w` holds `noise_size` unit Gaussians, the first six of which are reserved for b dW.
         """
         h = jnp.asarray(dt, V_WB_B.dtype)
         moved, push, at, i = [], jnp.zeros_like(V_WB_B), 6, 0

@@ -1,4 +1,4 @@
-"""How drives follow commands that they can't follow at once, by one number each."""
+"""Response of drives with backlash or a rate limit to a held command, one parameter each."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,13 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 Follower = Callable[[Array, Array, Any, Any], tuple[Array, Array]]
-"""What follows a command that is held for a time (s): at the end of it, and its mean."""
+"""(output before, command, hold time in s, parameter) → (output at the end, mean output)."""
 
 
 def taken_up(
     before: Float[Array, "*#b"], command: Float[Array, "*#b"], held: Any, play: Any
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
-    """With backlash of ± `play` (N): it moves where the command pushes it.
+    """Backlash of ± `play` (N): the output moves only where the command pushes it.
 
     The play operator of hysteresis (Krasnosel'skii and Pokrovskii 1989).
     """
@@ -25,7 +25,7 @@ def taken_up(
 def ramped(
     before: Float[Array, "*#b"], command: Float[Array, "*#b"], held: Any, rate: Any
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
-    """At most at `rate` (N/s): a straight way to the command, then the command; exact means."""
+    """Rate limit `rate` (N/s): a linear ramp to the command, then the command; exact means."""
     way, most = command - before, rate * held
     after = before + jnp.clip(way, -most, most)
     there = jnp.abs(way) < most

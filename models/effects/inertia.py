@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 
 class Inertia(NamedTuple):
-    """The constant mass matrix with its inverse, of the effects' own batch; made once a call."""
+    """Constant mass matrix and its inverse, with the effects' batch axes; computed once a call."""
 
     matrix: Float[Array, "6 6 *batch"]
     inverse: Float[Array, "6 6 *batch"]

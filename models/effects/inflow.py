@@ -9,7 +9,7 @@ from .base import ALL_OR_ONE, Effect, Parameter, Plant
 
 
 class InflowThrustLoss(Effect):
-    """f = u - k √|u| v_a, with v_a the water's speed along the thruster that its motion makes.
+    """f = u - k √|u| v_a, with v_a the thruster's velocity through the water along its axis.
 
     First order of the thrust coefficient in the advance ratio: T = T_0 - k √T_0 v_a (Fossen 2011,
     section 12.3; Whitcomb and Yoerger 1999).

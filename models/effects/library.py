@@ -1,4 +1,4 @@
-"""All named causes, and how their numbers lie in one vector."""
+"""All named causes, and the layout of their parameters in one vector."""
 
 import itertools
 from collections.abc import Iterable, Iterator
@@ -97,11 +97,11 @@ COEFFICIENTS: dict[str, type[Effect]] = {
         CentreOfBuoyancy,
     )
 }
-"""What is refitted where `--refit` asks for it, and never named as a cause."""
+"""Effects that `--refit` estimates and that are never reported as a cause."""
 
 
 def kind(name: str) -> type[Effect]:
-    """The class of a cause; `unknown` is one for what has no name.
+    """The class of a cause; `unknown` stands for structure without a name.
 
     Raises:
         UserError: there is no such cause.
@@ -116,7 +116,7 @@ def kind(name: str) -> type[Effect]:
 
 
 class Entry(NamedTuple):
-    """One number of the vector of all values."""
+    """One component of the vector of all values."""
 
     cause: str
     where: str
@@ -124,7 +124,7 @@ class Entry(NamedTuple):
 
 
 class Library:
-    """Effects side by side, their values one vector θ with zero for absent."""
+    """A set of effects whose values form one vector θ; zero means absent."""
 
     def __init__(self, effects: Iterable[Effect]):
         self.effects = tuple(sorted(effects, key=lambda effect: effect.order))
@@ -142,7 +142,7 @@ class Library:
         return len(self.entries)
 
     def index(self, cause: str, where: str, parameter: str) -> int:
-        """Where a number stands in θ."""
+        """Index of a parameter in θ."""
         return self._index[cause, where, parameter]
 
     def has(self, cause: str) -> bool:
@@ -150,13 +150,13 @@ class Library:
         return any(effect.name == cause for effect in self.effects)
 
     def at(self, cause: str, where: str) -> list[int]:
-        """Where the numbers of one cause at one place stand in θ."""
+        """Indices in θ of the parameters of one cause at one place."""
         return [i for i, e in enumerate(self.entries) if e.cause == cause and e.where == where]
 
     def hypotheses(self, single: bool | None = None) -> list[tuple[str, str]]:
         """Every (cause, where).
 
-        `single` keeps those in one thruster of causes that may be in all, or leaves them out.
+        `single` selects (True) or drops (False) single thrusters of causes that may affect all.
         """
         every = list(dict.fromkeys((e.cause, e.where) for e in self.entries))
         if single is None:
@@ -171,7 +171,7 @@ class Library:
         return jax.tree.unflatten(self._structure, leaves)
 
     def used(self, theta: Float[np.ndarray, " p"]) -> tuple[Effect, ...]:
-        """Those effects of one θ that are not absent."""
+        """The effects that are not absent in one θ."""
         chosen = self.filled(theta)
         return tuple(effect for effect in chosen if bool(np.any(np.asarray(effect.values) != 0)))
 

@@ -1,4 +1,4 @@
-"""Forces across the motion."""
+"""Lift: forces perpendicular to the motion."""
 
 from typing import ClassVar
 

@@ -1,4 +1,4 @@
-"""What hangs on the vehicle: buoyancy, the centre of gravity, a payload."""
+"""Buoyancy, centres of gravity and buoyancy, and payload."""
 
 from typing import ClassVar
 
@@ -18,8 +18,8 @@ def up_in_body(X_WB: Float[Array, "7 *batch"]) -> Float[Array, "3 *batch"]:
 class NetBuoyancy(Effect):
     """A constant upward force ΔB (N), at Bo or at the centre of buoyancy.
 
-    The second is what another displaced volume makes of Fossen's restoring forces (2011, eq. 4.6):
-    a moment p_BoCb × ΔB besides.
+    The second is the effect of another displaced volume on Fossen's restoring forces (2011,
+    eq. 4.6), which adds the moment p_BoCb × ΔB.
     """
 
     name: ClassVar[str] = "net_buoyancy"
@@ -41,7 +41,7 @@ class CentreOfGravity(Effect):
     """The centre of gravity moved by r along an axis of B: moment r × weight, and inertia.
 
     The mass matrix about Bo couples translation and rotation by m S(r) (Fossen 2011, eq. 3.44); its
-    part of second order in r is left out.
+    second-order term in r is neglected.
     """
 
     name: ClassVar[str] = "centre_of_gravity"
@@ -77,9 +77,9 @@ class CentreOfBuoyancy(Effect):
 class Payload(Effect):
     """A load at (x, y, z): mass m, weight in water w, and their moments about Bo.
 
-    The mass includes the water that moves with it. The moments w x, w y are what data tell; x and y
+    The mass includes the water that moves with it. Data determine the moments w x and w y; x and y
     follow from them and the weight, z is the height. m acts at that point: coupling m S(r) and
-    inertia -m S(r)²; its own rotational inertia is left out.
+    inertia -m S(r)²; its own rotational inertia is neglected.
     """
 
     name: ClassVar[str] = "payload"
@@ -116,7 +116,7 @@ class Payload(Effect):
 
 
 _LIGHT = 0.05
-"""Weight (N) below which a load's place is not told by its moments."""
+"""Weight (N) below which its moments do not determine a load's position."""
 
 
 def _skew(r: Float[Array, "3 *batch"]) -> Float[Array, "3 3 *batch"]:
@@ -127,7 +127,7 @@ def _skew(r: Float[Array, "3 *batch"]) -> Float[Array, "3 3 *batch"]:
 
 
 def _coupled(moment: Float[Array, "3 *batch"]) -> Float[Array, "6 6 *batch"]:
-    """A mass matrix's coupling of translation and rotation by a first moment m r."""
+    """Mass matrix of a first moment m r: it couples translation and rotation."""
     S = _skew(moment)
     zero = jnp.zeros_like(S)
     upper, lower = jnp.concatenate([zero, -S], axis=1), jnp.concatenate([S, zero], axis=1)

@@ -1,4 +1,4 @@
-"""Laws of the disturbance: its level, memory, tails and dependence on speed."""
+"""Laws of the disturbance: its intensity, colour, impacts and dependence on speed."""
 
 from typing import ClassVar
 
@@ -10,7 +10,7 @@ from .base import AXES, Effect, Parameter
 
 
 class DisturbanceLevel(Effect):
-    """b_i (1 + c_i): white disturbance stronger or weaker than believed."""
+    """b_i (1 + c_i): white disturbance stronger or weaker than modelled."""
 
     name: ClassVar[str] = "disturbance_level"
     family: ClassVar = "disturbance"
@@ -25,7 +25,7 @@ class DisturbanceLevel(Effect):
 
 
 class DisturbanceStateDependence(Effect):
-    """b_i √(1 + k_i |v|²): a wake of one's own, in translation (v, m/s) and rotation alike."""
+    """b_i √(1 + k_i |v|²): disturbance that grows with speed (v, m/s), on every axis alike."""
 
     name: ClassVar[str] = "disturbance_state_dependence"
     family: ClassVar = "disturbance"
@@ -78,7 +78,7 @@ class DisturbanceColour(Effect):
 
 
 class DisturbanceImpacts(Effect):
-    """Blows: impulses of std J on an axis (N·s, N·m·s), `rate` a second, each spread over one step.
+    """Impulses of std J on an axis (N·s, N·m·s), `rate` per second, each spread over one step.
 
     The wrench of a step is J w / dt with probability rate · dt, else zero.
     """
@@ -99,7 +99,7 @@ class DisturbanceImpacts(Effect):
 
     @property
     def noise_size(self) -> int:
-        """Whether and how hard, for each axis."""
+        """Occurrence and size, for each axis."""
         return 12
 
     def advance(

@@ -1,4 +1,4 @@
-"""Bottom, surface and walls near by."""
+"""Effects of a nearby bottom, surface or wall."""
 
 from typing import ClassVar
 
@@ -10,15 +10,15 @@ from .base import Effect, Parameter, Plant, force_only
 from .load import up_in_body
 
 REACH = 0.5
-"""Length (m) over which a boundary is felt, about that of the hull, unless told otherwise."""
+"""Default decay length (m) of a boundary's effect, about the length of the hull."""
 
 
 class Proximity(Effect):
     """More drag and a vertical force near a boundary: e^(-d / ℓ) times g D(ξ) and times F.
 
     d is the clearance to the height `floor` (`bottom`), to z = 0 (`surface`), or to a vertical wall
-    at the edge of the box `walls` (west, east, south, north; m in W), ℓ its `length`. Where the
-    boundary itself lies can't be told from the drag: g refers to the places stated.
+    at the edge of the box `walls` (west, east, south, north; m in W), ℓ its `length`. The drag does
+    not determine the position of the boundary: g refers to the stated positions.
     """
 
     name: ClassVar[str] = "proximity"
@@ -34,7 +34,7 @@ class Proximity(Effect):
     walls: Float[Array, "4"] = eqx.field(converter=jnp.asarray, default=(-10.0, 10.0, -10.0, 10.0))
 
     def assumed(self, place: str) -> dict[str, tuple[float, str]]:
-        """Where the boundary is taken to be (m in W: a height, or east or north)."""
+        """Assumed position of the boundary (m in W: a height, or east or north)."""
         at = (self.floor, 0.0, *self.walls)[self.places.index(place)]
         return {"boundary": (float(at), "m")}
 

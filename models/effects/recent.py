@@ -1,23 +1,23 @@
-"""How a twist came to be what it is: what instruments that are late still show."""
+"""History of recent twists, for delayed instruments."""
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 STEPS = 4
-"""Steps that are remembered; what was before is extrapolated."""
+"""Number of stored steps; earlier motion is extrapolated."""
 
 
 class Recent(eqx.Module):
-    """The twist of the last steps against that of now, a cubic over each step, latest first.
+    """The twist over the last steps relative to the current one: a cubic per step, latest first.
 
     Within a step V(t - τ) = V(t) - c₁ τ + c₂ τ²/2 + c₃ τ³, where t is the step's end.
 
     Attributes:
-        bends: c₁, c₂ and c₃ (m/s², rad/s² and per s more).
+        bends: c₁ (m/s², rad/s²), c₂ (1/s more) and c₃ (1/s² more).
         step: lengths of the steps (s).
-        V: the twist of now that these steps led to, where records may say otherwise.
-        slope: what a difference from that makes of the acceleration, ∂a/∂V (1/s, m/s and rad/s).
+        V: the current twist that these steps predict, where recorded ones may differ from it.
+        slope: Jacobian of the acceleration at V, ∂a/∂V (1/s; m/s and rad/s).
     """
 
     bends: Float[Array, "S 3 6 *batch"]
@@ -31,7 +31,7 @@ class Recent(eqx.Module):
         A_WB_B: Float[Array, "6 *batch"],
         step: float | Float[Array, "1 *#batch"],
     ) -> "Recent":
-        """One acceleration (dV/dt by components) for ever; steps of `step` s will follow."""
+        """A constant acceleration (dV/dt by components); steps of `step` s will follow."""
         zero = jnp.zeros_like(A_WB_B)
         bends = jnp.stack([A_WB_B, zero, zero])
         step = jnp.broadcast_to(jnp.asarray(step, zero.dtype), zero[:1].shape)
@@ -53,7 +53,7 @@ class Recent(eqx.Module):
         return cls(bends, step[None])
 
     def after(self, latest: "Recent") -> "Recent":
-        """The same when the steps of `latest` have followed."""
+        """This history with the steps of `latest` added."""
         n = len(latest.step)
         return Recent(
             jnp.concatenate([latest.bends, self.bends[:-n]]),
@@ -63,16 +63,16 @@ class Recent(eqx.Module):
         )
 
     def keeping(self, V: Float[Array, "6 *batch"], slope: Float[Array, "6 6 *batch"]) -> "Recent":
-        """The same with the twist of now and what becomes of differences from it."""
+        """The same with the predicted current twist and the Jacobian of the acceleration."""
         return Recent(self.bends, self.step, V, slope)
 
     def now(
         self, seen: Float[Array, "6 *#batch"], late: Float[Array, "#6 *#batch"]
     ) -> Float[Array, "6 *#batch"]:
-        """V(t) of the twist that is seen of it δ = `late` s later: V(t - δ).
+        """V(t) from the twist V(t - δ) that is `seen`, with the delay δ = `late` (s).
 
-        What is seen differs from what these steps led to by pushes and noise, of which exp(∂a/∂V δ)
-        is left until now: exact for each component by itself, to first order between them.
+        It differs from the predicted one by disturbances and noise, which propagate to t with
+        exp(∂a/∂V δ): exact within each component, of first order between components.
         """
         change = self.back(late)[0]
         V = seen - change
@@ -90,9 +90,9 @@ class Recent(eqx.Module):
     def back(
         self, late: Float[Array, "#6 *#batch"]
     ) -> tuple[Float[Array, "6 *#batch"], Float[Array, "6 *#batch"]]:
-        """V(t - δ) - V(t), and its integral over the last δ = `late` s; δ < 0 lies ahead.
+        """V(t - δ) - V(t), and its integral over the last δ = `late` s; δ < 0 is in the future.
 
-        What lies ahead has the derivatives of now, what lies before the first step those there.
+        The future is extrapolated with the current derivatives, the past with the first step's.
         """
         change = way = jnp.zeros_like(self.bends[0, 0])
         last = len(self.step) - 1

@@ -1,7 +1,7 @@
-"""Recorded motion of a model with effects under recorded commands to its thrusters.
+"""Simulated measurements of a model with effects under recorded thruster commands.
 
-What a window of a recording is compared with: the motion starts from what instruments showed, acts
-on what was commanded before the window too, and ends as instruments would show it.
+A window of a recording is compared with them: the motion starts from the measured state, includes
+the memory of commands before the window, and is returned as instruments would measure it.
 """
 
 from typing import Any, NamedTuple
@@ -17,13 +17,13 @@ from .stepping import advanced
 
 
 class Commands(NamedTuple):
-    """What thrusters were commanded in a window and before it.
+    """Thruster commands in a window and before it.
 
     Attributes:
         level: force along each thruster's axis (N), held for a step.
-        voltage: of the battery, relative to the nominal one.
+        voltage: voltage of the battery, relative to the nominal one.
         before: commands (N) of the steps before the window.
-        V_before: recorded twists at which these steps began.
+        V_before: recorded twists at the start of these steps.
     """
 
     level: Float[Array | np.ndarray, "T n *batch"]
@@ -33,7 +33,7 @@ class Commands(NamedTuple):
 
 
 def gaussians(model: Extended) -> int:
-    """Unit Gaussians a substep of `simulate_recorded`: b dW, effects, coloured pushes."""
+    """Unit Gaussians per substep of `simulate_recorded`: b dW, effects, coloured noise."""
     return model.noise_size + model.base.brownian_size - 6
 
 
@@ -46,11 +46,11 @@ def simulate_recorded(
     noise: Float[Array, "T S k *batch"] | None = None,
     substeps: int = 1,
 ) -> tuple[Float[Array, "T 7 *batch"], Float[Array, "T 6 *batch"]]:
-    """What instruments show at dt, 2 dt, …, from what they showed at 0, each step in substeps.
+    """Measured states at dt, 2 dt, … from the measured state at 0.
 
     `noise` holds `gaussians` unit Gaussians for each of S substeps; without it the motion is that
-    of the drift, in `substeps`. `model.for_steps_of(dt)` must have been taken. Late instruments
-    show the motion as linear between steps.
+    of the drift, in `substeps`. `model` must come from `for_steps_of(dt)`. For delayed instruments
+    the twist is linear between steps.
     """
     count = substeps if noise is None else noise.shape[1]
     commands = jax.tree.map(jnp.asarray, commands)
@@ -87,7 +87,7 @@ def simulate_recorded(
 
 
 def _after(model: Extended, memory: Any, commands: Commands, dt: float) -> Any:
-    """Memories when the steps before the window are over."""
+    """Memories after the steps before the window."""
     if not memory:
         return memory
 
@@ -102,7 +102,7 @@ def _after(model: Extended, memory: Any, commands: Commands, dt: float) -> Any:
 def _beginning(
     model: Extended, memory: Any, X: Array, V: Array, commands: Commands, dt: float
 ) -> Recent:
-    """How the motion came to be what it is at the window's start, under the command before it."""
+    """Twist history at the window's start: constant acceleration under the command before it."""
     level = model.actuate(memory, commands.before[-1], dt, 1)[1][..., 0]
     F = model.push(level, X, V, commands.voltage[0])
     return Recent.steady(model.body.acceleration(X, V, F), dt)

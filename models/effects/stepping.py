@@ -1,4 +1,4 @@
-"""A model with effects, period by period: what a plant in a diagram does."""
+"""Steps of a model with effects over a period, as a plant in a diagram takes them."""
 
 from collections.abc import Sequence
 from itertools import accumulate
@@ -28,10 +28,10 @@ def advanced(
     started: Any = True,
     water: Sequence[Flow | None] | None = None,
 ) -> tuple[tuple[Memory, Random], Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-    """What is carried, pose and twist after a `period` (s) under held thruster forces.
+    """Simulation state, pose and twist after a `period` (s) under held thruster forces.
 
-    It takes a substep for each wrench of `F_Bo_B`, which act besides the thrusters; `noise` has
-    unit Gaussians of each (`Extended.noise_size`), `water` its flow. Before anything has `started`
+    It takes a substep for each wrench of `F_Bo_B`, which adds to the thrusters'; `noise` holds the
+    unit Gaussians of each substep (`Extended.noise_size`), `water` its flow. If not `started`, the
     random states are drawn from their stationary law; without noise they are left out.
     """
     memory, random = carried
@@ -58,14 +58,14 @@ def advanced(
 
 
 class Stepper:
-    """Steps a model under thruster forces held for a period, with all that its effects carry.
+    """Steps a model and the state of its effects under thruster forces held for a period.
 
-    Memories and random states travel as one vector: `start` before the first period, when no
-    thruster has been commanded yet; random states are drawn from their stationary law in it.
+    Memories and random states are one vector: `start` before the first period, with commands of
+    zero. In the first period random states are drawn from their stationary law.
     """
 
     def __init__(self, model: Extended, period: float, substeps: int):
-        """`period` in s; a period takes `substeps` steps."""
+        """`period` in s, divided into `substeps`."""
         self.model = model.for_steps_of(period)
         self.period, self.substeps = period, substeps
         carried = self.model.simulation_state(
@@ -73,30 +73,30 @@ class Stepper:
         )
         parts, self._structure = jax.tree.flatten(carried)
         self._ends = list(accumulate(part.size for part in parts))
-        # the last number tells whether it has started
+        # the last number is 1 once the first period is over
         self.start = (
             np.concatenate([*map(np.asarray, parts), np.zeros(1)]) if parts else np.zeros(0)
         )
 
     @property
     def gaussians(self) -> int:
-        """Unit Gaussians of a substep: six for b dW, then those of random states."""
+        """Unit Gaussians per substep: six for b dW, then those of random states."""
         return self.model.noise_size
 
     @property
     def reads(self) -> bool:
-        """Whether instruments show anything else than the state."""
+        """Whether any effect makes the recorded state differ from the true one."""
         return self.model.reads
 
     @property
     def lags(self) -> bool:
-        """Whether the model says itself how thrusters follow their command."""
+        """Whether the model has a thruster lag of its own."""
         return any(effect.name == "thruster_lag" for effect in self.model.effects)
 
     def seen(
         self, X_WB: Float[Array, "7"], V_WB_B: Float[Array, "6"], A_WB_B: Float[Array, "6"]
     ) -> tuple[Float[Array, "7"], Float[Array, "6"]]:
-        """Pose and twist as instruments show them, of a state that accelerates by A."""
+        """Pose and twist as instruments measure them, at acceleration A."""
         return self.model.observe(X_WB, V_WB_B, Recent.steady(A_WB_B, self.period))
 
     def __call__(
@@ -110,10 +110,10 @@ class Stepper:
         noise: Float[Array, "S k"],
         water: Sequence[Flow | None],
     ) -> tuple[Float[Array, "7"], Float[Array, "6"], Float[Array, " m"]]:
-        """Pose, twist and what is carried after a period.
+        """Pose, twist and simulation state after a period.
 
-        `level` are the thrusters' forces (N) before effects, `voltage` is relative to the nominal
-        one, `F_Bo_B` acts besides; `noise` has S substeps of unit Gaussians, `water` their flow.
+        `level` holds thruster forces (N) before effects, `voltage` is relative to the nominal one,
+        `F_Bo_B` is added to theirs; `noise` has unit Gaussians of S substeps, `water` their flow.
         """
         *parts, started = jnp.split(carried, self._ends) if self._ends else [carried]
         before = jax.tree.unflatten(self._structure, parts)

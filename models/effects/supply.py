@@ -1,4 +1,4 @@
-"""Thrust that depends on the battery: its voltage, and the load of all thrusters together."""
+"""Dependence of thrust on the battery's voltage and on the load of all thrusters together."""
 
 from typing import ClassVar
 
@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from .base import Effect, Parameter, Plant
 
 FULL_LOAD = 8 * 40.0**1.5
-"""Σ|f|^1.5 of eight thrusters at 40 N each: about the load at which a pack droops by its R I."""
+"""Σ|f|^1.5 of eight thrusters at 40 N each: the reference load of `LoadDroop`."""
 
 
 class VoltageSag(Effect):
@@ -31,16 +31,16 @@ class VoltageSag(Effect):
 
 
 class VoltageExponent(VoltageSag):
-    """The same with either sign: the believed curve may depend on the voltage too much."""
+    """The same with either sign: the modelled curve may depend on the voltage too much."""
 
     name: ClassVar[str] = "voltage_exponent"
     parameters: ClassVar = (Parameter("exponent", "1", (0.3,), -4.0, 4.0, 1.0),)
 
 
 class LoadDroop(Effect):
-    """f = u (1 - c Σ|u|^1.5 / L): all thrusters lose when many work; L is 8 thrusters at 40 N.
+    """f = u (1 - c Σ|u|^1.5 / L): thrust lost to the common load; L is 8 thrusters at 40 N.
 
-    Current grows as |u|^1.5 (momentum theory), the pack's voltage falls in proportion to it.
+    Current grows as |u|^1.5 (momentum theory), and the pack's voltage falls in proportion to it.
     """
 
     name: ClassVar[str] = "load_droop"

@@ -1,4 +1,4 @@
-"""The pull of a tether that is made fast somewhere."""
+"""The pull of an anchored tether."""
 
 from typing import ClassVar
 
@@ -10,7 +10,7 @@ from .base import Effect, Parameter, Plant
 
 
 class Tether(Effect):
-    """F = -k (p_T - p_A): a spring from its fastening T on the vehicle to an anchor A, both fixed.
+    """F = -k (p_T - p_A): a spring from the attachment T on the vehicle to an anchor A in W.
 
     Written as F_0 - k p_T in W; the anchor is p_A = F_0 / k. A force that does not grow with
     distance (k = 0) is a steady pull. T lies at `arm` in B.

@@ -1,4 +1,4 @@
-"""Static errors of the thrusters' curve: dead zone, exponent, reverse, single and common gains."""
+"""Static errors of the thruster curve: dead zone, exponent, reverse, single and common gains."""
 
 from typing import ClassVar
 
@@ -9,11 +9,11 @@ from ..thruster_curves import RESTING
 from .base import ALL_OR_ONE, AXES, THRUSTERS, Effect, Parameter, Plant
 
 REFERENCE = 10.0
-"""Force (N) at which a changed exponent changes nothing."""
+"""Reference force F_0 (N), at which the exponent has no influence."""
 
 
 class ThrusterDeadZone(Effect):
-    """f = sign(u) max(|u| - w, 0): the first w newtons asked of a thruster are lost."""
+    """f = sign(u) max(|u| - w, 0): the first w newtons commanded of a thruster are lost."""
 
     name: ClassVar[str] = "thruster_dead_zone"
     family: ClassVar = "actuation"
@@ -36,8 +36,8 @@ class ThrusterDeadZone(Effect):
 class ThrustCurve(Effect):
     """f = (1 + g) F_0 sign(u) |u / F_0|^(1 + e) with F_0 = 10 N: another exponent of the curve.
 
-    The gain g goes with the exponent because the force at which old and new curve meet is not
-    known.
+    The gain g is estimated with the exponent because the force at which the two curves cross is
+    not known.
     """
 
     name: ClassVar[str] = "thrust_curve"
@@ -65,7 +65,7 @@ class ThrustCurve(Effect):
 
 
 class ThrustAsymmetry(Effect):
-    """f = (1 + a) u for u < 0: reverse thrust differs from what is believed."""
+    """f = (1 + a) u for u < 0: reverse thrust differs from the modelled."""
 
     name: ClassVar[str] = "thrust_asymmetry"
     family: ClassVar = "actuation"
@@ -85,7 +85,7 @@ class ThrustAsymmetry(Effect):
 
 
 class ThrusterGain(Effect):
-    """f_i = (1 + g_i) u_i: one thruster is weak (g < 0), dead (-1) or turns backwards (-2)."""
+    """f_i = (1 + g_i) u_i: one thruster is weak (g < 0), dead (-1) or reversed (-2)."""
 
     name: ClassVar[str] = "thruster_gain"
     family: ClassVar = "actuation"
@@ -124,13 +124,13 @@ class ThrustScale(Effect):
 
 
 KNOTS = (1.0, 2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0)
-"""Forces (N), each way, between which `ThrustTable` is linear."""
+"""Forces (N), forward and reverse, between which `ThrustTable` is linear."""
 
 
 class ThrustTable(Effect):
-    """f = u + c(u) with c = c_k F_k at the knots F_k, each way; in proportion to u beyond them.
+    """f = u + c(u), c = c_k F_k at the knots ± F_k, linear between, proportional to u beyond.
 
-    It takes what exponent, dead zone and reverse gain leave of a curve that is another one.
+    It fits what exponent, dead zone and reverse gain leave of a different curve.
     """
 
     name: ClassVar[str] = "thrust_table"
@@ -162,10 +162,10 @@ class ThrustTable(Effect):
 
 
 class ThrustOffset(Effect):
-    """f = u + o sign(u) min(|u| / ε, 1)²: a dead band that is narrower than believed.
+    """f = u + o sign(u) min(|u| / ε, 1)²: a dead band that is narrower than modelled.
 
-    Thrusters push o more from the believed band's edge on, and within the band, where u only tells
-    the pulse (ε is `thruster_curves.RESTING`), as its square.
+    Thrust is larger by o beyond the modelled band. Within it, where u only encodes the pulse (ε is
+    `thruster_curves.RESTING`), it grows with the square of u.
     """
 
     name: ClassVar[str] = "thrust_offset"
@@ -186,9 +186,9 @@ class ThrustOffset(Effect):
 
 
 class AxisThrust(Effect):
-    """F_i = (1 + s_i) F_i: all thrusters together push more along an axis than they should.
+    """F_i = (1 + s_i) F_i: all thrusters together give more along an axis than modelled.
 
-    It stands for positions, angles and losses that the vehicle file has otherwise, and for a
+    It stands for positions, angles and losses that differ from the vehicle file, and for a
     command whose gains are unknown.
     """
 
@@ -215,7 +215,7 @@ LEVERS = (
 
 
 class ThrustLever(Effect):
-    """M_i += l F_j: the thrust along axis j has another lever about axis i than believed (m)."""
+    """M_i += l F_j: error l (m) of the lever arm about axis i of thrust along axis j."""
 
     name: ClassVar[str] = "thrust_lever"
     family: ClassVar = "actuation"

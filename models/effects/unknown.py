@@ -1,4 +1,4 @@
-"""What no name explains: a sparse residual of a few weighted terms on stated inputs."""
+"""Unnamed structure: a sparse residual of a few weighted terms in stated inputs."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -28,27 +28,27 @@ MOTION: dict[str, Callable[[Array], Array]] = {
 POSE = ("cos ψ", "sin ψ", "cos 2ψ", "sin 2ψ", "φ", "θ")
 """Terms in heading ψ, roll φ and pitch θ."""
 POWERS = ("|f|f", "f²", "f³")
-"""Terms in a thruster's own force, in tens of newtons."""
+"""Terms in a thruster's force, in units of 10 N."""
 WORLD = ("east", "north", "up")
 _SIZES = {"flow": 0.004, "place": 0.1, "depth": 0.1, "play": 0.3, "slew": 0.3, "exchange": 0.1}
 _FOLLOWED = 2.0
-"""Seconds of commands after which it is known where thrusters that follow them are, about."""
+"""Memory duration (s) assumed for thrusters with backlash or a rate limit."""
 _PUSHES = ("motion", "pose", "place", "depth", "damping")
 
 
 class Unknown(Effect):
     """Σ_k w_k φ_k on one axis, thruster or in W; φ by `kind`, with its constants in `numbers`.
 
-    `motion`: terms of `MOTION` by number, a wrench on an axis. `pose`: all of `POSE`, likewise.
+    `motion`: terms of `MOTION` by index, a wrench on an axis. `pose`: all of `POSE`, likewise.
     `memory`: ξ, Re z and Im z with z' = (-1/T + 2πi f) z + ξ, ξ a velocity; numbers T (s), f (Hz)
-    and which of the six, the axis' own if left out. `thruster`: all of `POWERS` on one thruster.
+    and its index, by default that of the axis. `thruster`: all of `POWERS` on one thruster.
     `place`: a force in W of bumps exp(-½ |p - c|² / s²) over the horizontal plane, east and north
     for each; numbers s (m) and centres. `flow`: the same as a velocity of the water. `depth`: a
     force in W of (z - c) / s and its square, in three directions; numbers c and s (m). `damping`:
     a wrench on an axis of (z - c) / s times its own velocity, and times that velocity's square.
-    `play` and `slew`: one thruster or all (`thrusters`) follow commands with backlash of
-    ± numbers[0] (N) or at most at numbers[0] (N/s), weighed against following them at once.
-    `exchange`: two thrusters, by number, take each other's command, of which it is the share.
+    `play` and `slew`: one thruster or all (`thrusters`) have backlash of ± numbers[0] (N) or a
+    rate limit of numbers[0] (N/s); the weight 0 is no such effect, 1 the full one.
+    `exchange`: two thrusters, by number, take this share of each other's command.
     """
 
     name: ClassVar[str] = "unknown"
@@ -68,7 +68,7 @@ class Unknown(Effect):
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """What each value weighs."""
+        """The term that each value weights."""
         if self.kind == "motion":
             return tuple(list(MOTION)[int(i)] for i in self.numbers)
         if self.kind == "memory":
@@ -111,9 +111,9 @@ class Unknown(Effect):
     def of_state(
         self, X_WB: Float[Array, "7 *#b"], V_CB_B: Float[Array, "6 *#b"]
     ) -> Float[Array, "k *b"]:
-        """φ of all kinds that depend on the present pose and velocity alone.
+        """φ of the kinds that depend on the current pose and velocity alone.
 
-        Those in W have one row for each bump or power, to be used in each direction.
+        Those in W have one row for each bump or power, shared by all directions.
         """
         if self.kind == "motion":
             names = list(MOTION)
@@ -134,7 +134,7 @@ class Unknown(Effect):
         return jnp.exp(-((X_WB[4][None] - x) ** 2 + (X_WB[5][None] - y) ** 2) / (2 * width**2))
 
     def _vector(self, X: Array, V: Array) -> Array:
-        """Σ w φ in the directions of W."""
+        """Σ w φ as a vector in W."""
         phi = self.of_state(X, V)
         w = self.column(X)
         count = len(phi)
@@ -181,7 +181,7 @@ class Unknown(Effect):
 
     @property
     def remembered(self) -> int:
-        """Which component of the twist a memory remembers."""
+        """Index of the twist component that a memory filters."""
         return int(self.numbers[2]) if len(self.numbers) > 2 else AXES.index(self.acts_on)
 
     @property
@@ -195,7 +195,7 @@ class Unknown(Effect):
         return 5 * self.numbers[0] if self.kind == "memory" else 0.0
 
     def initial(self, command: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
-        """Of thrusters that follow, the command itself: where they are is not known."""
+        """For backlash and rate limits the command itself, as the actual output is not known."""
         return command if self.kind in FOLLOWERS else super().initial(command)
 
     def actuate(

@@ -1,4 +1,4 @@
-"""Water that moves."""
+"""Current and waves."""
 
 from typing import ClassVar
 
@@ -9,7 +9,7 @@ from .base import Effect, Parameter
 
 
 class CurrentSteady(Effect):
-    """A uniform current, constant in W: drag and added mass feel the velocity relative to it."""
+    """A uniform current, constant in W: drag and added mass act on the relative velocity."""
 
     name: ClassVar[str] = "current_steady"
     family: ClassVar = "environment"
@@ -26,7 +26,7 @@ class CurrentSteady(Effect):
 
 
 class CurrentVarying(Effect):
-    """A horizontal current that wanders: each component Gauss–Markov in W."""
+    """A varying horizontal current: each component is a Gauss–Markov process in W."""
 
     name: ClassVar[str] = "current_varying"
     family: ClassVar = "environment"
@@ -66,9 +66,9 @@ class Waves(Effect):
     """Orbital motion of long-crested swell: a narrow-band velocity with the depth's decay.
 
     Waves of `amplitude` a and `frequency` ω run towards `direction`; water moves by aω cos along it
-    and by aω sin up, decaying with exp(ω² z / g) (Faltinsen 1990, table 2.1, deep water). Two
-    damped oscillators (quality 12) give both: a is the amplitude of a regular wave of the same
-    orbital speed, of which each has a standard deviation of aω / √2.
+    and by aω sin up, decaying with exp(ω² z / g) (Faltinsen 1990, table 2.1, deep water). A damped
+    oscillator (quality factor 12) gives both as its quadratures, each of standard deviation
+    aω / √2: a is the amplitude of a regular wave of the same mean square orbital speed.
     """
 
     name: ClassVar[str] = "waves"

@@ -1,4 +1,4 @@
-"""What pushes and carries the vehicle: body wrenches, moving water, the tether."""
+"""Disturbances of the vehicle: body wrenches, moving water, the tether."""
 
 from .base import Disturbance as Disturbance
 from .combined import Combined as Combined

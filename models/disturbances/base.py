@@ -1,4 +1,4 @@
-"""What every disturbance offers to a simulation."""
+"""Interface of disturbances."""
 
 import abc
 
@@ -28,16 +28,16 @@ class Disturbance(abc.ABC):
     @property
     @abc.abstractmethod
     def state_size(self) -> int:
-        """Components of the state."""
+        """Length of the state."""
 
     @property
     def noise_size(self) -> int:
-        """Unit Gaussians that one advance takes."""
+        """Number of unit Gaussians that one advance takes."""
         return 0
 
     @property
     def initial_noise_size(self) -> int:
-        """Unit Gaussians that the initial state takes."""
+        """Number of unit Gaussians that the initial state takes."""
         return 0
 
     def initial(self, w: Float[Array, "w *batch"]) -> Float[Array, "s *batch"]:

@@ -24,9 +24,9 @@ Kind = WhiteWrench | OrnsteinUhlenbeckWrench | GaussMarkovCurrent | JonswapWaves
 
 @dataclass(frozen=True)
 class Combined(Disturbance):
-    """The sum of its members: states and noises one after the other, wrenches and flows added.
+    """The sum of its members: states and noises are concatenated, wrenches and flows added.
 
-    Every member's `wrench` sees the flow of all members together.
+    Every member's `wrench` receives the flow of all members together.
 
     Attributes:
         members: the disturbances; may be empty.
@@ -149,7 +149,7 @@ def preset(name: str) -> Combined:
     `still` is still water without noise and `calm` a small white wrench. `harbour` follows the
     field conditions of the method's paper (slack to flood tide in a bay: wind waves, ship wake,
     a current that varies between 0 and 0.5 m/s), with Hs = 0.25 m waves, one wake of 0.3 m in
-    the first minute and unexplained pushes; `slack_tide` and `flood_tide` are its two ends.
+    the first minute and a random wrench; `slack_tide` and `flood_tide` are its two extremes.
 
     Raises:
         UserError: if there is no such set.

@@ -13,12 +13,12 @@ from .base import Disturbance
 
 @dataclass(frozen=True)
 class GaussMarkovCurrent(Disturbance):
-    """A current whose speed, heading and vertical part are first-order Gauss–Markov processes.
+    """A current whose speed, heading and vertical speed are first-order Gauss–Markov processes.
 
-    Speed: dx = −μ (x − mean) dt + std √(2μ) dW, of which the water's speed is x clipped to
+    Speed: dx = −μ (x − mean) dt + std √(2μ) dW; the water's speed is x clipped to
     [min_speed, max_speed] (Fossen 2011, section 8.3). The process itself is not clipped, so its
     stationary law and autocorrelation are exact and only the output saturates. Within a step the
-    velocity runs linearly from its old to its new value: it is continuous, and the acceleration,
+    velocity is linear from its old to its new value: it is continuous, and the acceleration,
     constant over the step, is exactly its time derivative and so averages to zero, clipped or not.
 
     The state holds x − mean, heading − direction and vertical speed at the end of the step, then
@@ -94,7 +94,7 @@ class GaussMarkovCurrent(Disturbance):
         dt: Scalar,
         w: Float[Array, "3 *batch"],
     ) -> Float[Array, "11 *batch"]:
-        """Advance the processes by dt and lay the velocity's ramp over [t, t + dt)."""
+        """Advance the processes by dt and set the velocity's ramp over [t, t + dt)."""
         del X_WB, V_WB_B
         times = (self.time_constant, self.direction_time_constant, self.time_constant)
         x = gauss_markov(state[:3], self._std(state), column(times, state), dt, w)

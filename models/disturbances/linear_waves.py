@@ -12,7 +12,7 @@ def wave_number(omega: Any, water_depth: float, gravity: float, xp: ModuleType =
     """Wave number k (rad/m) of the angular frequency ω > 0 (rad/s): ω² = g k tanh(k h).
 
     A fixed number of Newton steps on y tanh y = y₀, y = k h, y₀ = ω² h / g, from the explicit
-    start y₀ / √tanh y₀ (Eckart 1952), which is within 5 % everywhere; five steps reach rounding.
+    start y₀ / √tanh y₀ (Eckart 1952), within 5 % everywhere; five steps reach machine precision.
     `xp` is the array module, `numpy` for constants of a configuration.
     """
     y0 = omega * omega * (water_depth / gravity)
@@ -27,7 +27,7 @@ def orbital_factors(k: Any, z: Any, water_depth: float, xp: ModuleType = jnp) ->
     """Orbital velocity over a ω at height z (m, mean surface 0), horizontal and vertical.
 
     cosh k(z+h) / sinh kh and sinh k(z+h) / sinh kh (Dean and Dalrymple 1991, eqs. 4.9 and 4.10),
-    in exponentials that can't overflow. Between mean surface and crest the value at z = 0 holds.
+    in exponentials that can't overflow. Above the mean surface the value at z = 0 is used.
     """
     z = xp.clip(z, -water_depth, 0.0)
     up, down = xp.exp(k * z), xp.exp(-k * (z + 2 * water_depth))

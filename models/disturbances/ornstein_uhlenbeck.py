@@ -1,4 +1,4 @@
-"""Ornstein–Uhlenbeck wrench: pushes that last for a while."""
+"""Ornstein–Uhlenbeck wrench: a coloured disturbance."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -17,13 +17,13 @@ from .base import Disturbance
 class OrnsteinUhlenbeckWrench(Disturbance):
     """A mean-reverting wrench, dF = −F/τ dt + σ √(2/τ) dW, discretised exactly.
 
-    It starts in its stationary law; the autocorrelation is σ² exp(−|lag|/τ) (Uhlenbeck and
+    It starts from its stationary law; the autocorrelation is σ² exp(−|lag|/τ) (Uhlenbeck and
     Ornstein 1930).
 
     Attributes:
         std: stationary standard deviation σ of fx, fy, fz (N) and τx, τy, τz (N·m).
         time_constant: τ of each component (s).
-        frame: axes the components belong to: `body`, or `world` for pushes that keep their
+        frame: axes of the components: `body`, or `world` for wrenches that keep their
             direction while the vehicle turns. Moments are about Bo in both.
     """
 
@@ -80,7 +80,7 @@ class OrnsteinUhlenbeckWrench(Disturbance):
         t: Scalar,
         flow: Flow | None = None,
     ) -> Float[Array, "6 *batch"]:
-        """Return the present wrench, turned into B if its components belong to W."""
+        """Return the current wrench, rotated into B if its components are in W."""
         del V_WB_B, t, flow
         if self.frame == "body":
             return state

@@ -14,41 +14,41 @@ from ..randomness import Scalar, column
 from .base import Disturbance
 
 _POINTS = (0.125, 0.375, 0.625, 0.875)  # quadrature points of the line, from anchor to vehicle
-_SURFACE = 0.05  # half width of the waterline across which segments become wet (m)
+_SURFACE = 0.05  # half width of the transition between dry and wet at the surface (m)
 _TINY = 1e-6
 
 
 @dataclass(frozen=True)
 class Tether(Disturbance):
-    """A quasi-static line of two straight halves, bowed by its load between anchor and vehicle.
+    """A quasi-static line of two straight halves, deflected by its load between anchor and vehicle.
 
-    A line of length L whose ends are D apart takes the shape of two halves that meet
-    s = ½ √(L² − D²) beside the middle of the chord, on the side its load pushes it to. Every
-    wet piece carries its weight in water and the drag of the flow relative to it,
+    A line of length L whose ends are D apart is modelled as two halves that meet at the distance
+    s = ½ √(L² − D²) from the middle of the chord, in the direction of the transverse load. Every
+    wet segment carries its weight in water and the drag of the flow relative to it,
     f = ½ ρ d (C_n |u_n| u_n + π C_t |u_t| u_t) per metre, normal and tangential; its own velocity
-    runs from zero at the anchor to the vehicle's. Each piece hands its load to the two ends by the
-    lever rule; balance at the bend then asks for a pull Q D / (8 s) along the chord, Q being the
-    load across the chord: the statics of two hinged links under an even load, and the parabolic
-    cable's value (Irvine 1981, eq. 2.4). As D nears L the slack L − D fades smoothly into
-    `taut_range`, beyond which a spring stretches, damped while it lengthens. The force has no jump
-    in pose, velocity or flow.
+    grows linearly from zero at the anchor to the vehicle's. Each segment's load is shared by the
+    two ends by the lever rule. Balance at the joint requires a tension Q D / (8 s) along the chord,
+    Q being the transverse load: the statics of two hinged links under a uniform load, and the
+    parabolic cable's value (Irvine 1981, eq. 2.4). As D approaches L the slack L − D fades smoothly
+    within `taut_range`; beyond it acts a spring, damped while it lengthens. The force is continuous
+    in pose, velocity and flow.
 
-    The water moves as `wrench`'s `flow` says, all along the line; `Combined` fills it in.
+    The flow passed to `wrench` holds all along the line; `Combined` provides it.
 
     Attributes:
         anchor: p_WA_W, the anchor in the world (m); above z = 0 the line is dry.
         attachment: p_BoT_B, the attachment in the body (m), aft and on top.
         length: L (m).
         diameter: d (m).
-        weight: weight in water per metre (N/m); negative floats. The default is a line of
-            0.043 kg/m and 7.6 mm, neutral in fresh water, in sea water.
+        weight: weight in water per metre (N/m); negative floats. The default is that of a line of
+            0.043 kg/m and 7.6 mm, neutral in fresh water, when it is in sea water.
         normal_drag: C_n (von Benzon et al. 2022).
         tangential_drag: C_t (von Benzon et al. 2022).
         water_density: ρ (kg/m³).
         taut_range: distance over which the line becomes taut (m).
-        stiffness: pull per metre beyond L (N/m); far below the material's, for sag and for the
-            integrator's sake.
-        damping: pull per speed of lengthening when taut (N·s/m).
+        stiffness: tension per metre beyond L (N/m); far below the material's, to allow for sag and
+            to keep the integration stable.
+        damping: tension per speed of lengthening when taut (N·s/m).
     """
 
     anchor: Vector3 = (0.0, 0.0, 0.0)
@@ -74,7 +74,7 @@ class Tether(Disturbance):
 
     @property
     def state_size(self) -> int:
-        """None: the line is quasi-static."""
+        """Zero: the line is quasi-static."""
         return 0
 
     def _load(self, u_W: Array, tangent_W: Array, z: Array) -> Array:

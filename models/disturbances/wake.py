@@ -1,4 +1,4 @@
-"""Ship wake: one packet of waves, the long ones first."""
+"""Ship wake: one packet of waves, the longest first."""
 
 import math
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ from .linear_waves import orbital_factors, wave_number
 class ShipWake(Disturbance):
     """The wake of a passing ship, a chirped packet with the envelope sin²(π s), s in [0, 1].
 
-    With s the share of the packet that has passed a point, the frequency climbs as
-    ω(s) = ω_m c^(2s − 1) from ω_m / c to ω_m c, and the orbital velocity is that of a linear wave
-    of this frequency and height H sin²(π s) in water of finite depth, so it decays with depth as
-    its frequency then demands. The crests travel at the phase speed of the middle period. The
+    With s the fraction of the packet that has passed a point, the frequency rises as
+    ω(s) = ω_m c^(2s − 1) from ω_m / c to ω_m c. The orbital velocity, with its decay over depth, is
+    that of a linear wave of this frequency and of height H sin²(π s) in water of finite depth. The
+    crests travel at the phase speed of the middle period. The
     acceleration is the exact derivative of the velocity in time, and both vanish smoothly at the
     ends. The state holds the start time at the origin of W and the phase.
 
     Attributes:
         height: crest-to-trough height H at the middle of the packet (m).
-        period: period there, 2π/ω_m (s).
+        period: period at the middle of the packet, 2π/ω_m (s).
         duration: time the packet takes to pass (s).
         chirp: c, the ratio of the first period to the middle one.
         earliest_start: lower end of the range of start times (s).

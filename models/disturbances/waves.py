@@ -61,15 +61,15 @@ def _components(sea: "JonswapWaves") -> _Components:
 class JonswapWaves(Disturbance):
     """Orbital motion under a random sea, η = Σ a_i cos(k_i·x − ω_i t + φ_i), of linear theory.
 
-    Each component carries the energy of its bin and stands at the bin's centre of energy; bins
-    widen geometrically, so no two frequencies share a difference and the sea does not repeat.
+    Each component has the energy of its bin and the frequency of the bin's energy centroid. Bins
+    widen geometrically, so no two frequency differences are equal and the sea does not repeat.
     Velocity and acceleration are those at a fixed point of the water, consistent to the first
     order of the theory. The state holds the random phases, then with spreading the directions
     relative to the mean.
 
     Attributes:
         significant_height: Hs = 4 √m₀ (m).
-        peak_period: Tp (s); the spectrum is meant for 3.6 < Tp/√Hs < 5 (DNV-RP-C205).
+        peak_period: Tp (s); the spectrum is valid for 3.6 < Tp/√Hs < 5 (DNV-RP-C205).
         peak_enhancement: γ; 1 is a Pierson–Moskowitz sea.
         direction: mean direction the waves travel to (rad), counter-clockwise from W's x axis.
         spreading: s of the directional law cos²ˢ(θ/2) (Longuet-Higgins et al. 1963); 0 for
@@ -105,7 +105,7 @@ class JonswapWaves(Disturbance):
 
     @property
     def initial_noise_size(self) -> int:
-        """As many as states."""
+        """One for each state."""
         return self.state_size
 
     def initial(self, w: Float[Array, "w *batch"]) -> Float[Array, "s *batch"]:
@@ -134,7 +134,7 @@ class JonswapWaves(Disturbance):
     def elevation(
         self, state: Float[Array, "s *batch"], p_W: Float[Array, "3 *batch"], t: Scalar
     ) -> Float[Array, "*batch"]:
-        """Height of the surface above its mean (m) over or under a point of W."""
+        """Elevation of the surface above its mean (m) at the horizontal position of p_W."""
         amplitude = column(_components(self).amplitude, state)
         return jnp.sum(amplitude * jnp.cos(self._argument(state, p_W, t)[0]), axis=0)
 

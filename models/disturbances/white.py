@@ -1,4 +1,4 @@
-"""White body wrench: the sum of everything that forgets at once."""
+"""White body wrench: the sum of all disturbances without memory."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ class WhiteWrench(Disturbance):
     """Gaussian white noise in the body frame, constant over each step: F = b w / √dt.
 
     The impulse over a time T then has the variance b² T for any step. The state is the wrench of
-    the present step; it is zero before the first advance, which alone knows dt.
+    the current step; it is zero before the first advance, since its size depends on dt.
 
     Attributes:
         intensity: b of fx, fy, fz (N·√s) and τx, τy, τz (N·m·√s).

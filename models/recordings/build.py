@@ -1,4 +1,4 @@
-"""From single trajectories to a padded dataset, and windows of such a dataset."""
+"""Assembly of trajectories into a padded dataset, and windows of such a dataset."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,12 +28,12 @@ class Trajectory:
     """One run on a uniform time grid, time first: the unit that importers and simulations yield.
 
     Attributes:
-        scenario: name; trajectories of one name become the repetitions of one scenario.
+        scenario: name; trajectories of equal name are repetitions of one scenario.
         X_WB: poses; quaternion w x y z, position (m).
         V_WB_B: body twists (m/s, rad/s).
         commands: one or more of `F_Bo_B` (N, 6), `thruster_force` (N, 8), `pwm` (N, 8).
         sensors: optional further variables of the schema, `voltage` (N,) and the like.
-        start: time of index 0 on the source's own clock (s).
+        start: time of index 0 on the source's clock (s).
     """
 
     scenario: str
@@ -142,7 +142,7 @@ def _lift(mask: np.ndarray, ndim: int) -> np.ndarray:
 def window(
     dataset: xr.Dataset, first: Int[np.ndarray, "J K"], stop: Int[np.ndarray, "J K"]
 ) -> xr.Dataset:
-    """Return samples first … stop-1 of every trajectory, moved to index 0; time starts anew."""
+    """Return samples first … stop-1 of every trajectory, moved to index 0 and time 0."""
     mask = dataset["mask"].to_numpy()
     lengths = np.maximum(np.minimum(stop, mask.sum(axis=2)) - first, 0)
     N = max(int(lengths.max()), 1)

@@ -1,7 +1,7 @@
-"""Recordings as CSV files that anyone can write: one a trajectory, and a `recording.yaml` beside.
+"""Recordings as a folder of CSV files, one per trajectory, and a `recording.yaml`.
 
 `docs/recording.md` is the user's page. Thruster forces and PWM are scalars along each thruster's
-own axis, positive as ArduSub's positive PWM, and therefore the same in either choice of frames.
+axis, positive as ArduSub's positive PWM, and therefore the same in either choice of frames.
 """
 
 import difflib
@@ -36,14 +36,14 @@ _LACKABLE = MAY_LACK["X_WB"] + MAY_LACK["V_WB_B"]
 _SHORTEST_STEP, _LONGEST_STEP = 1e-5, 1e3
 _UNIFORM, _GAP_STEPS, _GAP_S = 1e-3, 10.0, 1.0
 _FEW_STEPS, _USUAL = 4.5, 0.9
-"""Where samples stay in their places a step is too long at so many times the 90th percentile: files
-whose lines come in bursts are not cut at each of them."""
+"""Without resampling a run is cut at steps longer than 4.5 times the 90th percentile, so that files
+whose lines come in bursts are not cut at each burst."""
 _NORM = 0.02
 _RANGES = {"pwm": (500.0, 2500.0, "µs (1500 is stopped)"), "voltage": (1.0, 100.0, "V")}
 _LATEST = 1e10
-"""s, more than since 1970."""
+"""Latest time (s): beyond any count of seconds since 1970."""
 _MOST_SAMPLES = 10_000_000
-"""Of a run on its grid: a week at 16 Hz."""
+"""Largest number of samples of a run on its grid: a week at 16 Hz."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,10 @@ class CsvFolder:
     Attributes:
         frames: of all files: `ENU/FLU` or `NED/FRD` (world/body).
         vehicle: name of a preset or path of a vehicle file.
-        files: scenario of each CSV file; without it every `*.csv` beside is a scenario of its name.
-        rate: Hz of the recording; without it that of the files.
+        files: scenario of each CSV file; by default every `*.csv` in the folder, named as the file.
+        rate: rate of the recording (Hz); by default that of the files.
         ignore: columns to leave out.
-        check: compare poses with velocities, and refuse what can't be.
+        check: compare poses with velocities, and refuse contradictions.
         source, notes: free text.
     """
 
@@ -76,7 +76,7 @@ class CsvFolder:
 
 @dataclass(frozen=True)
 class _Run:
-    """One file's content in W and B, component first, at its own times."""
+    """One file's content in W and B, component first, at the times of its samples."""
 
     scenario: str
     t: np.ndarray
@@ -93,8 +93,8 @@ def read_csv(
 
     Uneven time steps are resampled to `rate` (Hz; by default that of the YAML, else of the files):
     commands held, poses along the geodesic, twists linearly. At long gaps a run is cut in two.
-    With `resample` off samples stay where they are (`Recording.elapsed`), and a run is cut wherever
-    a step is longer than 4.5 times the 90th percentile: commands are not known there.
+    Without `resample` samples keep their times (`Recording.elapsed`), and a run is cut wherever a
+    step is longer than 4.5 times the 90th percentile, as commands are not known there.
 
     Raises:
         UserError: one sentence naming file, line, column and remedy.
@@ -155,7 +155,7 @@ def _run(table: Table, scenario: str, meta: CsvFolder, notes: list[str]) -> _Run
     return _Run(scenario, t, X, V, commands, voltage)
 
 
-# what is refused
+# checks
 
 
 def _groups(table: Table, ignore: Sequence[str]) -> dict[str, list[str]]:
@@ -226,7 +226,7 @@ def _check_finite(table: Table, columns: Sequence[str]) -> None:
 
 
 def _check_limits(table: Table, groups: dict[str, list[str]]) -> None:
-    """Refuse what no vehicle does, with the units that files are in."""
+    """Refuse values beyond what any vehicle does, with the units of the files."""
     columns = {"X_WB": ["", "", "", "", *_POSITION], "V_WB_B": list(TWIST)} | groups
     for variable, names in columns.items():
         if variable in _RANGES:
@@ -251,7 +251,7 @@ def _check_range(table: Table, columns: list[str], low: float, high: float, unit
 
 def _unit(table: Table) -> np.ndarray:
     q = table[_QUATERNION]
-    with np.errstate(over="ignore"):  # an infinite length is as wrong as another
+    with np.errstate(over="ignore"):  # an infinite norm is refused like any other wrong one
         norm = np.linalg.norm(q, axis=0)
     bad = np.abs(norm - 1) > _NORM
     if bad.any():
@@ -267,7 +267,7 @@ def _unit(table: Table) -> np.ndarray:
 
 
 def _cut(run: _Run, table: Table, notes: list[str], resample: bool) -> list[_Run]:
-    """Cut a run where samples are missing for long."""
+    """Cut a run at long gaps between samples."""
     step = np.diff(run.t)
     limit = max(_GAP_STEPS * np.median(step), _GAP_S)
     if not resample:
@@ -336,7 +336,7 @@ def _on_grid(run: _Run, dt: float) -> Trajectory:
         t = grid(run.t[0], run.t[-1], dt)
         if np.isfinite(run.X).all():
             X = geodesic(t, run.t, run.X)
-        else:  # without a full position: the rotation's geodesic and what there is of the rest
+        else:  # position incomplete: geodesic of the rotation, linear interpolation of the rest
             turned = slerp(t, run.t, run.X[:4])
             X = np.concatenate([turned, linear(t, run.t, run.X[4:])])
         V = linear(t, run.t, run.V)
@@ -346,7 +346,7 @@ def _on_grid(run: _Run, dt: float) -> Trajectory:
 
 
 def _as_recorded(run: _Run, dt: float) -> Trajectory:
-    """The samples themselves, with their times where these are not on a grid."""
+    """The samples without resampling, with their times if these are not on a grid."""
     return _trajectory(run, {} if _even(run.t, dt) else {UNEVEN: run.t - run.t[0]})
 
 
@@ -369,7 +369,7 @@ def _trajectory(run: _Run, sensors: dict[str, np.ndarray]) -> Trajectory:
 def write_csv(
     recording: Recording, folder: str | os.PathLike[str], *, frames: Frames = "ENU/FLU"
 ) -> None:
-    """Write one CSV file a trajectory and `recording.yaml`; raw sensors but the voltage stay out.
+    """Write one CSV file per trajectory and `recording.yaml`; of raw sensors only the voltage.
 
     Raises:
         UserError: if the folder exists and is not empty.

@@ -31,14 +31,14 @@ class Table:
         return self.values[:, [self.names.index(name) for name in names]].T
 
     def at(self, row: int) -> str:
-        """Place of a row: `file:line`."""
+        """Location of a row: `file:line`."""
         return f"{self.path}:{self.lines[row]}"
 
 
 def read_table(path: Path) -> Table:
     """Read a CSV file with one header line; comma, semicolon or tab; `#` starts a comment line.
 
-    With semicolons or tabs a decimal comma is understood.
+    With semicolons or tabs a decimal comma is accepted.
 
     Raises:
         UserError: naming file, line, column and remedy.

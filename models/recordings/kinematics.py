@@ -1,8 +1,8 @@
-"""Do poses and twists tell the same motion? If not, which mix-up of units or frames explains it.
+"""Consistency of poses and twists, and the wrong unit or frame that explains a contradiction.
 
-Over windows of about half a second the displacement seen in the poses, expressed in the body,
-must equal the integral of the body twist. Mix-ups (degrees, scalar-last quaternions, velocities in
-the world frame, other axis conventions) leave a residual that one change of reading removes.
+Over windows of about half a second the displacement of the poses, expressed in the body, must equal
+the integral of the body twist. Wrong conventions (degrees, scalar-last quaternions, velocities in
+the world frame, other axes) leave a residual that one change of convention removes.
 """
 
 from collections.abc import Callable
@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float
 from .resample import conjugate, continuous, multiply, rotate, rotation_log
 
 _WINDOW_S, _LONGER_S = 0.5, (2.0, 5.0)
-_MOVES_M, _TURNS_RAD = 0.02, 0.02  # rms in a window below which nothing can be told
+_MOVES_M, _TURNS_RAD = 0.02, 0.02  # rms displacement in a window below which nothing is compared
 _AGREED, _EXPLAINED, _DOUBTFUL, _CONTRADICTED = 0.98, 0.9, 0.8, 0.5
-_SHORT = (0.1, 5.0)  # m/s, rad/s: second difference that is no outlier yet
-_MOST = 0.5  # share of the windows that must contradict, all but faults of an instrument
-_SPIKE, _FEW = 20.0, 8  # times the usual second difference; samples that tell what is usual
-_SEVERAL = 4  # windows that tell noise from a mix-up that has no name
-_BETTER = 0.3  # a reading that leaves less than this part of the residual is the right one
+_SHORT = (0.1, 5.0)  # m/s, rad/s: largest second difference that is not an outlier
+_MOST = 0.5  # share of the windows that must contradict; fewer are faults of an instrument
+_SPIKE, _FEW = 20.0, 8  # factor on the median second difference; samples needed for a median
+_SEVERAL = 4  # windows needed to separate noise from an unnamed wrong convention
+_BETTER = 0.3  # a convention that leaves less than this share of the residual is the right one
 
 Arrays = tuple[np.ndarray, np.ndarray]
 
@@ -30,7 +30,7 @@ class Agreement:
     """How well the integrated twist explains the displacement of the poses.
 
     Attributes:
-        slope: least-squares factor from integrated twist to displacement, 1 if all is well.
+        slope: least-squares factor from integrated twist to displacement, 1 if consistent.
         explained: 1 − |residual|²/|displacement|² with slope 1; NaN if there is too little motion.
     """
 
@@ -87,7 +87,7 @@ def dead_reckoned(
 ) -> Float[np.ndarray, "N 7"]:
     """Poses with coordinates that were not measured (NaN) integrated from the twist, from zero.
 
-    Velocities are turned into W by the recorded attitude; trapezoids from sample to sample.
+    Velocities are rotated into W by the recorded attitude and integrated by the trapezoidal rule.
     """
     v_W = rotate(X_WB[:, :4].T, V_WB_B[:, :3].T).T
     moved = np.cumsum((v_W[1:] + v_W[:-1]) / 2 * np.diff(t)[:, None], axis=0)
@@ -155,7 +155,7 @@ _ANGULAR: list[tuple[str, Callable[[np.ndarray, np.ndarray], Arrays]]] = [
 
 
 def _mostly(t: np.ndarray, X_WB: np.ndarray, V: np.ndarray, rows: slice) -> float:
-    """What is explained in the half of the windows that agrees best."""
+    """Explained share in the half of the windows that agrees best."""
     moved, integrated = (a[rows] for a in _increments(t, X_WB, V))
     off = np.sum((moved - integrated) ** 2, axis=0)
     kept = np.argsort(off)[: max(round(_MOST * off.size), 1)]
@@ -164,9 +164,9 @@ def _mostly(t: np.ndarray, X_WB: np.ndarray, V: np.ndarray, rows: slice) -> floa
 
 
 def spikes(V: Float[np.ndarray, "6 N"]) -> Bool[np.ndarray, "6 N"]:
-    """Single samples far from both their neighbours, which agree: outliers of an instrument.
+    """Single samples far from both neighbours, which agree: outliers of an instrument.
 
-    A hull's turning may be damped within a sample, so rates must lie far off.
+    A hull's rotation may be damped within one sample, so for rates the threshold is large.
     """
     found = np.zeros(V.shape, bool)
     if V.shape[1] < _FEW:
@@ -179,7 +179,7 @@ def spikes(V: Float[np.ndarray, "6 N"]) -> Bool[np.ndarray, "6 N"]:
 
 
 def _without(V: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Spikes replaced by the mean of their neighbours."""
+    """V with spikes replaced by the mean of their neighbours."""
     mean = np.concatenate([V[:, :1], (V[:, 2:] + V[:, :-2]) / 2, V[:, -1:]], axis=1)
     return np.where(found, mean, V)
 
@@ -187,11 +187,11 @@ def _without(V: np.ndarray, found: np.ndarray) -> np.ndarray:
 def contradictions(
     t: Float[np.ndarray, " N"], X_WB: Float[np.ndarray, "7 N"], V_WB_B: Float[np.ndarray, "6 N"]
 ) -> tuple[list[str], list[str]]:
-    """Return (errors, doubts): sentences on poses and twists that can't both be right.
+    """Return (errors, doubts): messages on poses and twists that contradict each other.
 
-    An error names the reading that would make them agree, or says that none known does. Faults of
-    an instrument are no such mix-up: single outliers, what at most half of the windows contradicts,
-    and what does not grow with their length, as noise of positions does not, are doubts.
+    An error names the convention that makes them agree, or says that none known does. Faults of an
+    instrument are doubts: single outliers, contradictions in at most half of the windows, and those
+    that do not grow with the length of the window, such as noise of the positions.
     """
     if t.size < 3:
         return [], []
@@ -215,7 +215,7 @@ def contradictions(
         best = int(np.nanargmax([-np.inf if np.isnan(s) else s for s in scores]))
         if scores[best] > _EXPLAINED and 1 - scores[best] < _BETTER * (1 - now.explained):
             errors.append(f"{found}: {readings[best][0]}")
-            break  # what follows from a wrong attitude need not be told again
+            break  # consequences of a wrong attitude are not reported again
         longer = (agreement(t, X_WB, V_WB_B, s)[part].explained for s in _LONGER_S)
         explained = [now.explained, _mostly(t, X_WB, V_WB_B, rows), *longer]
         if np.nanmax(explained) < _CONTRADICTED and t[-1] - t[0] > _SEVERAL * _WINDOW_S:

@@ -1,7 +1,7 @@
-"""Uneven or too fast samples brought to a uniform grid; NumPy in float64, time on the last axis.
+"""Resampling of uneven or faster samples to a uniform grid; NumPy float64, time on the last axis.
 
-Commands are held (zero order), velocities taken linearly, poses along the geodesic: the motion of
-constant body twist from one sample to the next. Arrays are component first, as in `models/se3.py`.
+Commands are held (zero order), velocities interpolated linearly, poses along the geodesic: constant
+body twist from one sample to the next. Arrays are component first, as in `models/se3.py`.
 """
 
 import numpy as np
@@ -11,14 +11,14 @@ _SMALL = 1e-8
 
 
 def grid(first: float, last: float, dt: float) -> Float[np.ndarray, " N"]:
-    """Return first, first + dt, … up to last (with a rounding's grace)."""
+    """Return first, first + dt, … up to last (within rounding)."""
     return first + dt * np.arange(int(np.floor((last - first) / dt + 1e-9)) + 1)
 
 
 def linear(
     t_new: Float[np.ndarray, " N"], t: Float[np.ndarray, " n"], x: Float[np.ndarray, "*c n"]
 ) -> Float[np.ndarray, "*c N"]:
-    """Linear interpolation; outside the samples the end values hold."""
+    """Linear interpolation; constant outside the samples."""
     i, s = _locate(t_new, t)
     return x[..., i] + s * (x[..., i + 1] - x[..., i])
 
@@ -29,9 +29,9 @@ def hold(
     x: Float[np.ndarray, "*c n"],
     dt: float,
 ) -> Float[np.ndarray, "*c N"]:
-    """Mean over [t_new, t_new + dt) of the signal that keeps each sample until the next.
+    """Mean over [t_new, t_new + dt) of the zero-order hold of the samples.
 
-    Where the source changes at most once a step and on the grid this is the sample itself; where it
+    Where the source changes at most once per step, on the grid, this is the sample itself; where it
     is faster, the mean is the constant command with the same impulse.
     """
     widths = np.diff(t)
@@ -75,7 +75,7 @@ def hermite(
     p: Float[np.ndarray, "*c n"],
     v: Float[np.ndarray, "*c n"],
 ) -> Float[np.ndarray, "*c N"]:
-    """Cubic through positions p with slopes v: for slow position fixes that come with velocity."""
+    """Cubic through positions p with slopes v: for slow position fixes with velocity."""
     i, s = _locate(t_new, t)
     h = t[i + 1] - t[i]
     a, b = p[..., i], p[..., i + 1]
@@ -175,6 +175,6 @@ def _left_jacobian(omega: np.ndarray) -> np.ndarray:
 
 
 def _locate(t_new: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Index of the interval and the fraction along it, held at the ends."""
+    """Index of the interval and the fraction along it, clipped at the ends."""
     i = np.clip(np.searchsorted(t, t_new, side="right") - 1, 0, t.size - 2)
     return i, np.clip((t_new - t[i]) / (t[i + 1] - t[i]), 0.0, 1.0)

@@ -1,6 +1,6 @@
-"""What a recording has to look like: names, dimensions, units, and the check of all of them.
+"""Schema of a recording: names, dimensions, units, and their check.
 
-`docs/recording.md` is the page for people who write such files; this module is the same for code.
+`docs/recording.md` documents the same schema for people who write such files.
 """
 
 from collections.abc import Hashable, Mapping
@@ -29,7 +29,7 @@ COMMANDS = {
     "pwm": ("thruster", "us"),
 }
 UNEVEN = "elapsed"
-"""Time since a trajectory's index 0, where its steps differ from dt; dt is then a nominal step."""
+"""Time since a trajectory's index 0, where its steps are uneven; dt is then a nominal step."""
 SENSORS: dict[str, tuple[str | None, str]] = {
     "voltage": (None, "V"),
     "imu_specific_force": ("axis", "m/s^2"),
@@ -60,9 +60,9 @@ LIMITS: dict[str, tuple[float, float]] = {
     "channel": (0.0, 65535.0),
     "time": (0.0, 1e9),
 }
-"""What no vehicle exceeds, in the units above: beyond it numbers are damaged or of another unit.
+"""Limits of plausible values in the units above; beyond them data are damaged or in another unit.
 
-Positions may be those of a map's grid, whose northings go to 1e7 m."""
+Positions may be map grid coordinates, whose northings go to 1e7 m."""
 QUANTITIES: dict[str, tuple[str, ...]] = {
     "X_WB": ("attitude",) * 4 + ("position",) * 3,
     "V_WB_B": ("velocity",) * 3 + ("rate",) * 3,
@@ -77,8 +77,8 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
     "rc": ("channel",),
     UNEVEN: ("time",),
 }
-"""Of the components of a variable, or of all of them."""
-# Channels that a log may simply not have; they are then NaN throughout a trajectory.
+"""Quantity of each component of a variable, or one for all."""
+# Channels that a log may lack; they are then NaN throughout a trajectory.
 MAY_LACK = {"X_WB": ("x", "y", "z"), "V_WB_B": TWIST}
 _NORM_TOLERANCE = 1e-4
 _SHORTEST_STEP, _LONGEST_STEP = 1e-6, 1e4
@@ -103,15 +103,15 @@ def present(dataset: xr.Dataset, kinds: Mapping[str, tuple[str | None, str]]) ->
 def observed(
     values: Float[np.ndarray, "J K N C"], mask: Bool[np.ndarray, "J K N"]
 ) -> Bool[np.ndarray, "J K C"]:
-    """Tell which channels of which trajectories hold numbers."""
+    """Whether each channel of each trajectory has any finite value."""
     return np.any(np.isfinite(values) & mask[..., None], axis=2)
 
 
 def check(dataset: xr.Dataset) -> None:
-    """Refuse a dataset that is no recording.
+    """Refuse a dataset that is not a recording.
 
     Raises:
-        ValueError: with one sentence naming the variable, the place and the remedy.
+        ValueError: with one sentence naming the variable, the location and the remedy.
     """
     _check_layout(dataset)
     _check_time(dataset)
@@ -130,10 +130,10 @@ def check(dataset: xr.Dataset) -> None:
 
 
 def check_plausible(dataset: xr.Dataset) -> None:
-    """Refuse measured data that hold what no vehicle can do; a diverged simulation may hold it.
+    """Refuse measured data outside `LIMITS`; data of a diverged simulation may exceed them.
 
     Raises:
-        ValueError: with one sentence naming the variable, the place and the remedy.
+        ValueError: with one sentence naming the variable, the location and the remedy.
     """
     for name, quantities in QUANTITIES.items():
         if name not in dataset:
@@ -272,7 +272,7 @@ def _may_lack(dataset: xr.Dataset, name: str) -> np.ndarray:
 
 
 def _check_quaternions(dataset: xr.Dataset, mask: np.ndarray) -> None:
-    with np.errstate(over="ignore"):  # an infinite length is as wrong as another
+    with np.errstate(over="ignore"):  # an infinite norm is refused like any other wrong one
         norm = np.linalg.norm(dataset["X_WB"].to_numpy()[..., :4], axis=-1)
     off = mask & (np.abs(norm - 1) > _NORM_TOLERANCE)
     if off.any():

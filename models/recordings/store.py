@@ -1,4 +1,4 @@
-"""Recordings: measured or simulated motion with its commands, in one checked form for every part.
+"""Recordings: measured or simulated motion with its commands, in one checked form.
 
 An `xarray.Dataset` with dims (scenario, trajectory, time, component); poses, twists and wrenches in
 the conventions of `models/se3.py`, but batch first. `docs/recording.md` is the user's page.
@@ -39,7 +39,7 @@ class Recording:
     """A checked dataset of trajectories; every method that changes something returns a new one.
 
     Raises:
-        ValueError: at construction, if the dataset is not what `docs/recording.md` says.
+        ValueError: at construction, if the dataset does not follow `docs/recording.md`.
     """
 
     dataset: xr.Dataset
@@ -57,10 +57,10 @@ class Recording:
         source: str = "",
         notes: Sequence[str] = (),
     ) -> "Recording":
-        """Stack trajectories of equal step `dt` (s); equal scenario names make repetitions."""
+        """Stack trajectories of equal step `dt` (s); equal scenario names are repetitions."""
         return cls(assemble(trajectories, dt, vehicle=vehicle, source=source, notes=notes))
 
-    # what is there
+    # content
 
     @property
     def dt(self) -> float:
@@ -69,7 +69,7 @@ class Recording:
 
     @property
     def command_period(self) -> float:
-        """Time (s) between samples of commands where they were logged; `dt` if nothing tells."""
+        """Period (s) of the commands in the log; `dt` if unknown."""
         return float(self.dataset.attrs.get("command_period", self.dt))
 
     @property
@@ -99,18 +99,18 @@ class Recording:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the source had and lacked, one sentence each."""
+        """Remarks on the source and what it lacked, one sentence each."""
         text = str(self.dataset.attrs.get("notes", ""))
         return tuple(line for line in text.split("\n") if line)
 
     @property
     def commands(self) -> tuple[str, ...]:
-        """Which of F_Bo_B, thruster_force, pwm are there."""
+        """Which of F_Bo_B, thruster_force, pwm the recording has."""
         return present(self.dataset, COMMANDS)
 
     @property
     def thrust_from(self) -> str:
-        """Which of the commands says most of the thrusters' forces."""
+        """The most direct command of the thrusters' forces."""
         return next(c for c in ("thruster_force", "pwm", "F_Bo_B") if c in self.commands)
 
     @property
@@ -159,7 +159,7 @@ class Recording:
 
     @property
     def uneven(self) -> bool:
-        """Whether samples stand at times of their own (`elapsed`) and not on a grid."""
+        """Whether samples have individual times (`elapsed`) instead of a grid."""
         return UNEVEN in self.dataset
 
     def elapsed(self, scenario: int, trajectory: int) -> np.ndarray:
@@ -174,11 +174,11 @@ class Recording:
     # inputs
 
     def wrench(self, vehicle: Any = None) -> xr.DataArray:
-        """Return the commanded wrench F_Bo_B (N, N·m), from what the recording holds.
+        """Return the commanded wrench F_Bo_B (N, N·m).
 
-        In this order: `F_Bo_B` itself; thruster forces through the vehicle's allocation; PWM and
-        voltage through its thruster curve (steady state: no lag) and the allocation. Samples
-        without a voltage take the vehicle's nominal one.
+        The first of these that the recording has: `F_Bo_B` itself; thruster forces with the
+        vehicle's allocation; PWM and voltage with its thruster curve (steady state: no lag) and the
+        allocation. Samples without a voltage take the vehicle's nominal one.
 
         Args:
             vehicle: a `Vehicle`, the name of a preset, or None for the one named in the recording.
@@ -206,8 +206,8 @@ class Recording:
         """Return the thrusters' commanded forces (N) and the voltage relative to the nominal one.
 
         Arrays (scenario, trajectory, time, n) and (scenario, trajectory, time), finite throughout.
-        Forces are taken as they are, else PWM through the vehicle's curve at the recorded voltage
-        (steady state: no lag), else the wrench split over the thrusters with the least effort.
+        They are the recorded forces, else PWM with the vehicle's curve at the recorded voltage
+        (steady state: no lag), else the wrench allocated to the thrusters with the least effort.
 
         Args:
             vehicle: a `Vehicle`, the name of a preset, or None for the one named in the recording.
@@ -226,7 +226,7 @@ class Recording:
         return np.nan_to_num(np.moveaxis(np.asarray(level), 0, -1)), volts
 
     def _forces(self, name: str, thrusters: Any) -> Array:
-        """Forces (n, scenario, trajectory, time) of a command to thrusters."""
+        """Forces (n, scenario, trajectory, time) of a command in forces or PWM."""
         values = self.dataset[name].to_numpy()
         count = thrusters.allocation.shape[1]
         if values.shape[-1] != count:
@@ -265,7 +265,7 @@ class Recording:
         """Return only the named scenarios.
 
         Raises:
-            UserError: if a name is not there; the sentence lists those that are.
+            UserError: if a name is unknown; the message lists the known ones.
         """
         names = [scenarios] if isinstance(scenarios, str) else list(scenarios)
         unknown = [name for name in names if name not in self.scenarios]
@@ -279,7 +279,7 @@ class Recording:
         return type(self)(window(kept, np.zeros_like(stop), stop))
 
     def cut(self, start: float = 0.0, stop: float = np.inf) -> "Recording":
-        """Return the samples with start ≤ t < stop (s) of every trajectory; time starts anew."""
+        """Return the samples with start ≤ t < stop (s) of every trajectory; time restarts at 0."""
         N = self.mask.shape[2]
         first, last = (
             int(np.clip(np.ceil(t / self.dt - 1e-6), 0, N)) for t in (start, min(stop, N * self.dt))
@@ -292,9 +292,9 @@ class Recording:
     def split_by_time(
         self, held_out: float = 0.25, gap: float = 1.0
     ) -> "tuple[Recording, Recording]":
-        """Split every trajectory: the first part to learn from, the last part held out.
+        """Split every trajectory: the first part for training, the last part held out.
 
-        The `gap` (s) between them is dropped so that the end of one doesn't tell the other.
+        The `gap` (s) between them is dropped so that the two parts are nearly independent.
         """
         _check_fraction(held_out)
         skip = int(np.ceil(gap / self.dt - 1e-9))
@@ -312,8 +312,8 @@ class Recording:
     ) -> "tuple[Recording, Recording]":
         """Split by whole runs: named scenarios held out, or a fraction of each scenario's runs.
 
-        With a fraction every scenario keeps at least one run on both sides; the last ones are held
-        out, or with a seed a random choice.
+        With a fraction every scenario keeps at least one run on each side. The last runs are held
+        out, or a random choice if a seed is given.
         """
         if not isinstance(held_out, float | int):
             inside = [name for name in self.scenarios if name not in set(held_out)]
@@ -344,16 +344,16 @@ class Recording:
         by: Literal["auto", "time", "run"] = "auto",
         gap: float = 1.0,
     ) -> "tuple[Recording, Recording]":
-        """Split honestly: by run where every scenario has several, else by time."""
+        """Split by run where every scenario has several runs, else by time."""
         if by == "auto":
             by = "run" if (np.count_nonzero(self.lengths, axis=1) > 1).all() else "time"
         return self.split_by_run(held_out) if by == "run" else self.split_by_time(held_out, gap)
 
     @classmethod
     def concat(cls, recordings: "Sequence[Recording]") -> "Recording":
-        """Join recordings of equal step; scenarios of equal name gain repetitions.
+        """Join recordings of equal step; runs of equal scenario names become repetitions.
 
-        Commands that not all of them hold are dropped; other variables are NaN where they lack.
+        Commands that some recording lacks are dropped; other variables are NaN where missing.
 
         Raises:
             UserError: for unequal steps, thruster counts or vehicles, or no command in common.
@@ -393,7 +393,7 @@ class Recording:
     # files
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write NetCDF-4 (compressed); the file appears whole or not at all."""
+        """Write NetCDF-4 (compressed), atomically."""
         encoding = {
             name: {"zlib": True, "complevel": 4, "shuffle": True}
             for name, variable in self.dataset.data_vars.items()
@@ -406,7 +406,7 @@ class Recording:
         """Read what `save` wrote, into memory.
 
         Raises:
-            UserError: if the file is missing, no NetCDF, or no recording.
+            UserError: if the file is missing, not NetCDF, or not a recording.
         """
         path = Path(path)
         dataset = load_netcdf(path)
@@ -425,7 +425,7 @@ class Recording:
 
     @staticmethod
     def is_one(path: Path) -> bool:
-        """Whether a file says that `save` wrote it, whatever else is wrong with it."""
+        """Whether a file carries the format mark of `save`, valid or not."""
         try:
             return _is_recording(load_netcdf(path))
         except UserError:
@@ -433,7 +433,7 @@ class Recording:
 
 
 def _is_recording(dataset: xr.Dataset) -> bool:
-    """Of this version's format or another's."""
+    """Whether a dataset has this format, in any version."""
     return str(dataset.attrs.get("format", "")).startswith(FORMAT.rsplit(" ", 1)[0])
 
 

@@ -1,4 +1,4 @@
-"""A recording told in a few lines of text."""
+"""A summary of a recording in a few lines of text."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ def _range(values: np.ndarray) -> str:
 
 
 def summarize(recording: Recording) -> str:
-    """Return size, scenarios, ranges of every state, command and sensor, what is missing, notes."""
+    """Return size, scenarios, ranges of states, commands and sensors, missing channels, notes."""
     dataset = recording.dataset
     lengths = recording.lengths
     runs = int(np.count_nonzero(lengths))

@@ -15,7 +15,7 @@ class WindowConfig:
 
     length_s: float = 4.0
     stride_s: float = 0.5
-    """Between the starts of training windows; held-out windows don't overlap."""
+    """Time between the starts of training windows; held-out windows don't overlap."""
     normalise: Literal["heading", "identity", "none"] = "heading"
     held_out: float = 0.25
     by: Literal["auto", "time", "run"] = "auto"
@@ -38,7 +38,7 @@ class PretrainConfig:
     speed: float = 1.0
     """Standard deviation of sampled velocities (m/s and rad/s)."""
     tolerance: float = 0.01
-    """Mean squared relative error below which there is nothing to fit."""
+    """Mean squared relative error below which the fit is skipped."""
 
     def __post_init__(self) -> None:
         check_numbers(self)
@@ -53,28 +53,27 @@ class DriftConfig:
     """Least squares on the output biases before the law is trained (`training.fitting.drift`)."""
 
     iterations: int = 12
-    """At most so many steps of each of two passes; 0 leaves the fit out."""
+    """Largest number of solver steps in each of two passes; 0 skips the fit."""
     length_s: float = 1.0
-    """Seconds of the pieces whose noise-free motion is compared."""
+    """Duration (s) of the segments whose noise-free motion is compared."""
     pieces: int = 256
-    """Pieces used, evenly taken from all."""
+    """Number of segments used, out of all."""
     prior: float = 1e-4
-    """Weight of the squared change of a raw bias (a change of 1 doubles a coefficient, about) and
-    of the relative change of the potential's bound and net buoyancy, against the mean squared error
-    in the units of what the model misses."""
+    """Weight of the squared change of a raw bias (a change of 1 about doubles a coefficient) and of
+    the relative change of the potential's bound and net buoyancy, relative to the mean squared
+    error in units of the model's typical error."""
     innovations: Literal["auto", "always", "never"] = "auto"
-    """Whether constants and b are fitted from sample to sample instead
-    (`training.fitting.likelihood`): the
-    best there is for states that are known exactly, and misled by noise of measurement. `auto` does
-    it where the innovations that are left are correlated by less than `white`."""
+    """Whether constants and b are fitted to one-step innovations instead
+    (`training.fitting.likelihood`): efficient for exactly known states, biased by measurement
+    noise. `auto` does it if the correlation of the remaining innovations is below `white`."""
     white: float = 0.1
-    """Largest correlation of neighbouring innovations, on any axis, that counts as none. Noise of
-    measurement of a tenth of an innovation's variance makes it -0.08."""
+    """Largest correlation of neighbouring innovations, on any axis, that counts as white.
+    Measurement noise of a tenth of an innovation's variance makes it -0.08."""
     most_steps: int = 50000
-    """Steps from sample to sample that are used, an even choice of all."""
+    """Largest number of one-step innovations used, spread evenly over all."""
     prior_sd: float = 3.0
-    """Standard deviation of raw biases about the preset's in that fit; 3 is a factor of ten in a
-    coefficient. 0 stands for no prior."""
+    """Prior standard deviation of raw biases about the preset's in that fit; 3 is a factor of ten
+    in a coefficient. 0 stands for no prior."""
 
     def __post_init__(self) -> None:
         check_numbers(self)
@@ -91,7 +90,7 @@ class DriftConfig:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """One training run; the defaults suit some minutes of data of one vehicle on two cores."""
+    """One training run; the defaults suit a few minutes of data of one vehicle on two cores."""
 
     objective: ObjectiveConfig = field(default_factory=Fdm)
     model: SpinnConfig = field(default_factory=lambda: SpinnConfig(constant_mass=True))
@@ -100,7 +99,7 @@ class TrainingConfig:
     drift: DriftConfig = field(default_factory=DriftConfig)
     steps: int = 400
     batch: int = 16
-    """Windows a step."""
+    """Windows per step."""
     learning_rate: float = 3e-3
     """Adam's peak rate; the paper's is 1e-4, constant."""
     schedule: Literal["cosine", "constant"] = "cosine"
@@ -108,19 +107,19 @@ class TrainingConfig:
     warm_up: int = 50
     """Steps of linear rise to the peak rate."""
     clip: float = 1.0
-    """Largest norm of a step's gradient; 0 leaves it as it is."""
+    """Norm to which a step's gradient is clipped; 0 disables clipping."""
     head_decay: float = 30.0
     """Decoupled decay (Loshchilov and Hutter 2019) of the networks' output weights: coefficients
     stay as constant in velocity as the data allow."""
     refit_at: tuple[float, ...] = (0.3,)
-    """Fractions of the run at which bandwidths are fitted to the remaining errors anew."""
+    """Fractions of the run at which bandwidths are refitted to the remaining errors."""
     seed: int = 0
     validate_every: int = 50
     patience: int = 0
-    """Validations without a better one after which training stops; 0 never does."""
+    """Validations without improvement after which training stops; 0 disables early stopping."""
     checkpoint_every: int = 100
     max_recoveries: int = 8
-    """Bad steps survived before the run is given up."""
+    """Non-finite steps that are recovered from before the run fails."""
 
     def __post_init__(self) -> None:
         check_numbers(self)

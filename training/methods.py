@@ -1,6 +1,6 @@
 """Every method of the paper's simulation study by name, each as one typed `TrainingConfig`.
 
-The study's default is the better physics: windows normalised by heading with the gravity
+The study's default follows the physics: windows normalised by heading with the gravity
 potential. The paper's own form (windows from the identity, a potential of the whole pose) is
 `windows.normalise: identity` with `model.potential: pose` in a settings file.
 """
@@ -23,7 +23,7 @@ from .losses.moments import Moments
 
 @dataclass(frozen=True)
 class Method:
-    """A named method: its settings, and those among them that make it this method."""
+    """A named method: its settings, and those among them that define it."""
 
     summary: str
     config: TrainingConfig
@@ -31,10 +31,10 @@ class Method:
     """Settings (dotted) that a file must not change; the objective's kind is always one."""
 
     def check(self, name: str, config: TrainingConfig, source: str) -> None:
-        """Refuse settings that are another method's.
+        """Refuse settings of another method.
 
         Raises:
-            UserError: a setting that makes the method this one differs.
+            UserError: a setting that defines this method differs.
         """
         wanted, found = type(self.config.objective).__name__, type(config.objective).__name__
         if wanted != found:
@@ -54,14 +54,14 @@ class Method:
 
 _MODEL = SpinnConfig(constant_mass=True)
 _SLOW: dict[str, Any] = {"learning_rate": 1e-4, "head_decay": 300.0}
-"""The paper's rate, and networks held back as much as biases hold themselves.
+"""The paper's rate, and a weight decay at which networks and biases drift equally.
 
-The start is as near the truth as the data allow. From there what training adds is mostly the noise
-of its gradients, of which Adam makes a walk by the rate r a step: over n steps with cosine decay a
-bias moves r √(0.37 n), 0.0015; an output weight under decay d moves √(r / 2 d), and the 32 of an
-output, with features of 0.6, 3.4 times that. The two are equal at d = 260. With d = 30 the networks
-moved the law away again (geodesic FDM on sparse data: W₂ from 1.06, 1.04, 1.09 to 1.20, 1.13, 1.26
-times the floor). Real logs, which the start fits less well, want a larger rate and less decay."""
+The starting model is as close to the truth as the data allow. From there training adds mostly
+gradient noise, which Adam turns into a random walk of r per step: over n steps with cosine decay a
+bias drifts by r √(0.37 n), 0.0015; an output weight under decay d drifts by √(r / 2 d), and the 32
+of an output, with features of 0.6, by 3.4 times that. The two are equal at d = 260. With d = 30 the
+networks made the law worse (geodesic FDM on sparse data: W₂ from 1.06, 1.04, 1.09 to 1.20, 1.13,
+1.26 times the floor). Real logs, which the start fits less well, need more rate and less decay."""
 _KIND = ("model.stochastic", "model.coordinates", "model.diffusion")
 
 
@@ -89,7 +89,7 @@ _PUBLISHED = {
     "clip": 0.0,
     "refit_at": (),
 }
-"""Adam from 1e-2 without clipping, as the code of the distance-aware methods has it."""
+"""Adam from 1e-2 without clipping, as in the published code of the distance-aware methods."""
 
 
 _FDM = ("pose_kernel", "mse_weight")
@@ -143,17 +143,17 @@ METHODS: dict[str, Method] = {
         **_PUBLISHED,
     ),
 }
-"""All methods; `+mse` is the paper's ocean objective, with the rate that real logs want."""
+"""All methods; `+mse` is the paper's ocean objective, with the rate that real logs need."""
 
 
 def method_config(name: str, settings: str | Path | None = None) -> TrainingConfig:
-    """The settings of a method, with those that a YAML file names in place of its own.
+    """The settings of a method, overridden by those in a YAML file.
 
-    The file may set anything but what makes the method this one (`Method.fixed`), so neither
+    The file may set anything except what defines the method (`Method.fixed`), so neither
     overrides the other silently.
 
     Raises:
-        UserError: the name is unknown, or the file is wrong or contradicts the method.
+        UserError: the name is unknown, or the file is invalid or contradicts the method.
     """
     if name not in METHODS:
         raise UserError(f"method '{name}' is unknown; take one of {', '.join(METHODS)}")

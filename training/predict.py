@@ -24,18 +24,17 @@ def predict(
     place: Int[Array, " W"] | None = None,
     commands: Commands | None = None,
 ) -> tuple[Float[Array, "T 7 P W"], Float[Array, "T 6 P W"]]:
-    """Draw `samples` motions from each window's first state and commands, at t_1 … t_T.
+    """Draw `samples` motions from each window's initial state and commands, at t_1 … t_T.
 
-    `with_path_of_drift` appends the noise-free motion as one more sample. Increments come from
-    `key` and the windows' places (0, 1 … W - 1 unless given). A model with effects acts on the
-    thrusters' `commands`, where they are given, and shows what instruments would show
-    (`simulate_recorded`).
+    `with_path_of_drift` appends the noise-free motion as one more sample. Increments depend on
+    `key` and the windows' places (0, 1 … W - 1 by default). A model with effects takes the
+    thrusters' `commands`, if given, and returns simulated measurements (`simulate_recorded`).
     """
     T, _, W = F.shape
     count = samples + with_path_of_drift
     place = jnp.arange(W) if place is None else place
 
-    # one axis of all windows' samples: loops over it are long, whatever W and P are
+    # one axis for windows and samples: inner loops over it are long for any W and P
     def flat(a: Array) -> Array:
         a = jnp.broadcast_to(a[..., None], (*a.shape, count))
         return a.reshape(*a.shape[:-2], W * count)
@@ -52,7 +51,7 @@ def predict(
             model, flat(X_0), flat(V_0), jax.tree.map(flat, commands), dt, w, substeps
         )
         return _by_sample(Xs, W), _by_sample(Vs, W)
-    # substeps as steps of their own: the compiled step is one, however many there are
+    # substeps become steps, so that one step is compiled for any number of them
     dt = dt / substeps
     dW = jnp.asarray(dt**0.5, F.dtype) * drawn(T * substeps, 1, model.brownian_size)
     Xs, Vs = rollout(model, flat(X_0), flat(V_0), jnp.repeat(flat(F), substeps, axis=0), dt, dW)
@@ -62,7 +61,7 @@ def predict(
 def normal_by_window(
     key: Array, place: Int[Array, " W"], shape: tuple[int, ...], samples: int, dtype: DTypeLike
 ) -> Float[Array, "*shape W P"]:
-    """Standard normal numbers, those of a window a function of `key` and its place alone."""
+    """Standard normal numbers; those of a window depend on `key` and its place alone."""
 
     def draw(number: Array) -> Array:
         return jax.random.normal(jax.random.fold_in(key, number), (*shape, samples), dtype)
@@ -84,7 +83,7 @@ def predict_drift(
     substeps: int = 1,
     commands: Commands | None = None,
 ) -> tuple[Float[Array, "T 7 W"], Float[Array, "T 6 W"]]:
-    """The noise-free motion of each window at t_1 … t_T; `commands` as of `predict`."""
+    """The noise-free motion of each window at t_1 … t_T; `commands` as in `predict`."""
     if isinstance(model, Extended) and commands is not None:
         return simulate_recorded(model, X_0, V_0, commands, dt, substeps=substeps)
     Xs, Vs = rollout(model, X_0, V_0, jnp.repeat(F, substeps, axis=0), dt / substeps)

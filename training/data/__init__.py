@@ -1,1 +1,1 @@
-"""Data to train on: windows, groups, simulated maneuvers, provenance."""
+"""Training data: windows, groups, simulated maneuvers, provenance."""

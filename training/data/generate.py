@@ -20,7 +20,7 @@ from .maneuvers import MANEUVERS, maneuver_wrench
 
 @dataclass(frozen=True)
 class GenerateConfig:
-    """What to simulate; the defaults make the paper's sparse regime."""
+    """Simulation settings; the defaults are the paper's sparse regime."""
 
     maneuvers: tuple[str, ...] = tuple(MANEUVERS)
     trajectories: Annotated[int, Within(1, 100_000)] = 20
@@ -28,13 +28,13 @@ class GenerateConfig:
     duration: Annotated[float, SECONDS] = 10.0
     """Seconds of each trajectory."""
     rate: Annotated[float, Within(0.1, 1000)] = 20.0
-    """Samples a second."""
+    """Sampling rate (Hz)."""
     substeps: Annotated[int, Within(1, 1000)] = 10
-    """Integration steps a sample."""
+    """Integration steps per sample."""
     effort: Annotated[float, Within(0, 1, above=True)] = 0.3
     """Share of the largest wrench in each maneuver's direction."""
     diffusion: Annotated[Vector6, Within(0, 1e6)] = (2.0, 2.0, 2.0, 0.2, 0.2, 0.2)
-    """Diffusion b of the simulated vehicle (N√s, N·m√s), where none is given with the model."""
+    """Diffusion b of the simulated vehicle (N√s, N·m√s), unless the given model has its own."""
     depth: Annotated[float, Within(0, 11_000)] = 5.0
     """Depth of the start (m)."""
     start_spread: Annotated[Vector6, Within(0, 100)] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -55,9 +55,9 @@ def generate(
 ) -> Recording:
     """Simulate every maneuver `trajectories` times from rest, under noise and disturbances.
 
-    The vehicle is `dynamics`, or the preset with the configured diffusion. Thrusters keep their
-    limits and have no lag. All trajectories run as one batch with independent noise; equal seeds
-    give equal recordings.
+    The vehicle is `dynamics`, or the preset with the configured diffusion. Thruster limits apply;
+    there is no lag. All trajectories run as one batch with independent noise; equal seeds give
+    equal recordings.
 
     Raises:
         UserError: a maneuver is unknown.

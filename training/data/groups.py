@@ -1,8 +1,8 @@
-"""Pooled groups: windows that are draws of one law because they share scenario and start.
+"""Pooled groups: windows that are samples of one law because they share scenario and start.
 
 A law's moments need several observations. Windows of the runs of one scenario that begin at the
-same time on the runs' clocks form a group; their first states differ by what happened before, so a
-group's law is the mixture over its own starts, for the prediction as for the data.
+same time on the runs' clocks form a group. Their initial states differ, so a group's law is the
+mixture over its initial states, for the prediction as for the data.
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ def members(
 
 
 def group_size(windows: Windows, at_most: int) -> int:
-    """How many windows of a group make a step: `at_most`, or what half of the groups have.
+    """Number of windows per group in a step: `at_most`, or the median group size if smaller.
 
     Raises:
         UserError: groups have one window only.
@@ -46,9 +46,9 @@ def group_size(windows: Windows, at_most: int) -> int:
 
 
 def batch_indices(seed: int, number: int, batch: int, usable: np.ndarray) -> np.ndarray:
-    """Indices of one step: consecutive pieces of endless shuffles of all of `usable`.
+    """Indices of one step: consecutive parts of repeated shuffles of all of `usable`.
 
-    A function of its arguments alone, so a resumed run draws what it would have drawn.
+    A function of its arguments alone, so that a resumed run draws the same indices.
     """
     count = usable.size
     positions = np.arange(number * batch, (number + 1) * batch)
@@ -70,7 +70,7 @@ def step_indices(
 ) -> Int[np.ndarray, " B"]:
     """Windows of one step, about `batch` of them: whole groups one after the other if `size` > 1.
 
-    Groups take turns as windows do; of a larger group other `size` windows are drawn each time.
+    Groups take turns as windows do; from a larger group `size` windows are drawn anew each time.
     The number of indices depends on `batch` and `size` alone. Empty if no group is large enough.
     """
     if size == 1:

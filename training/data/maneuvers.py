@@ -1,8 +1,8 @@
 """The ten feedforward maneuvers of the simulated and ocean data sets (Palmer et al., figure 3).
 
-Each holds one wrench from rest. The paper names no numbers: both directions of surge, sway and
-heave, yaw, and three combinations that move every axis. Sizes are fractions of what the thrusters
-can give along each direction.
+Each holds one wrench from rest. The paper gives no numbers; these are both directions of surge,
+sway and heave, yaw, and three combinations that move every axis. Sizes are fractions of the largest
+wrench of the thrusters along each direction.
 """
 
 import jax.numpy as jnp
@@ -26,8 +26,8 @@ MANEUVERS: dict[str, tuple[float, float, float, float, float, float]] = {
 }
 """Direction of each wrench, in units of the largest one along each single axis.
 
-Without moments about roll and pitch no data told these axes' inertia, damping, restoring moment
-and diffusion but in proportion to each other."""
+Without roll and pitch moments only ratios of these axes' inertia, damping, restoring moment and
+diffusion are identifiable."""
 
 
 def maneuver_wrench(
@@ -36,7 +36,7 @@ def maneuver_wrench(
     """Wrench (N, N·m) and thruster forces (N) of a maneuver at a fraction of full effort.
 
     The direction is scaled to the largest wrench that respects every thruster's limits, then by
-    `effort`; the forces allocated to it are returned with the wrench that they really give.
+    `effort`; the allocated forces are returned with the wrench that they produce.
 
     Raises:
         UserError: the name is unknown or `effort` is not in (0, 1].

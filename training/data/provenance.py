@@ -1,4 +1,4 @@
-"""What a run was made of: versions, source revision and a fingerprint of the data."""
+"""Provenance of a run: versions, source revision and a fingerprint of the data."""
 
 import hashlib
 import platform
@@ -15,7 +15,7 @@ PACKAGES = ("spinndrift", "jax", "jaxlib", "equinox", "optax", "diffrax", "numpy
 
 
 def fingerprint(windows: Windows) -> str:
-    """A digest of the windows' numbers: equal data, equal text."""
+    """A digest of the windows' numbers: equal data have equal digests."""
     digest = hashlib.sha256()
     arrays = (windows.X, windows.V, windows.F, windows.start, *(windows.commands or ()))
     for array in arrays:
@@ -26,7 +26,7 @@ def fingerprint(windows: Windows) -> str:
 
 
 def revision() -> str | None:
-    """The git commit of the sources, with `+` if files were changed since; None without git."""
+    """The git commit of the sources, with `+` if files have changed since; None without git."""
     folder = Path(__file__).resolve().parent
 
     def git(*arguments: str) -> str | None:
@@ -51,7 +51,7 @@ def revision() -> str | None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide a run's numbers."""
+    """Versions of Python and of the packages that affect a run's numbers."""
     found = {"python": platform.python_version(), "machine": platform.machine()}
     for name in PACKAGES:
         try:

@@ -1,7 +1,7 @@
-"""Windows of recordings: short pieces of equal length that a model is trained and judged on.
+"""Windows of recordings: short segments of equal length for training and evaluation.
 
-Every window is one draw of a conditional law: given its own first state and its commands, how does
-the vehicle move on? Arrays are time-major, component-first, windows last (`models.se3`).
+Every window is one sample of a conditional law: that of the motion given the initial state and the
+commands. Arrays are time-major, component-first, windows last (`models.se3`).
 """
 
 from collections.abc import Sequence
@@ -30,10 +30,10 @@ class Windows:
         dt: step (s).
         scenario: index into `names` of each window's scenario.
         run: label of the trajectory within its scenario.
-        start: time of t_0 since the beginning of the run's own clock (s).
+        start: time of t_0 on the run's clock (s).
         names: scenario names.
-        normalise: what was made of the windows' first pose.
-        commands: what the thrusters were commanded, and what came before, for models with effects.
+        normalise: normalisation of the windows' first pose.
+        commands: thruster commands in the windows and before them, for models with effects.
     """
 
     X: Float[np.ndarray, "N 7 W"]
@@ -86,7 +86,7 @@ class Windows:
         return self.take(np.linspace(0, len(self) - 1, count).round().astype(int))
 
     def subdivide(self, steps: int) -> "Windows":
-        """Cut every window into ⌊T / steps⌋ shorter ones, normalised like the long ones."""
+        """Cut every window into ⌊T / steps⌋ shorter ones with the same normalisation."""
         if not 1 <= steps <= self.steps:
             raise ValueError(f"steps: must lie between 1 and {self.steps}, got {steps}")
         parts = [
@@ -128,7 +128,7 @@ class Windows:
         )
 
     def overlaps(self, other: "Windows") -> bool:
-        """Tell whether a window here shares a moment of the same run with one of `other`."""
+        """Whether a window here overlaps one of `other` in time, in the same run."""
         mine = [self.names[s] for s in self.scenario]
         theirs = [other.names[s] for s in other.scenario]
         for i, name in enumerate(mine):
@@ -154,14 +154,14 @@ def make_windows(
     remembered: float | None = None,
     dtype: Any = np.float32,
 ) -> Windows:
-    """Cut every trajectory of a recording into windows of `length_s`, one each `stride_s`.
+    """Cut every trajectory of a recording into windows of `length_s`, one every `stride_s`.
 
     `normalise` moves each window's start: "heading" to the origin with zero yaw, so that gravity
     keeps its direction; "identity" to the group's identity, as the paper does; "none" leaves it.
     `stride_s` defaults to a quarter of the length. Trajectories shorter than a window are left
-    out; `vehicle` is what `Recording.wrench` takes. With `remembered` the windows have what the
-    thrusters were commanded too, and in so many seconds before them; the beginning of a run is
-    taken as it was for ever.
+    out; `vehicle` is as in `Recording.wrench`. With `remembered` (s) the windows also have the
+    thruster commands, in the window and for that time before it; before the beginning of a run its
+    first command is assumed.
 
     Raises:
         UserError: no trajectory is long enough, or a channel of pose or twist is missing.
@@ -232,14 +232,14 @@ def make_windows(
 def _normalised(
     X_WB: Float[np.ndarray, "N 7 W"], normalise: Normalisation
 ) -> Float[np.ndarray, "N 7 W"]:
-    """Poses seen from the frame that `normalise` attaches to each window's start."""
+    """Poses in the frame that `normalise` attaches to each window's start."""
     if normalise == "none":
         return X_WB
     w, x, y, z = X_WB[0, :4].astype(np.float64)
     if normalise == "heading":
         half = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) / 2
         w, x, y, z = np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)
-    # the inverse of the start's rotation, applied to all poses; NumPy, as it keeps double precision
+    # the inverse of the start's rotation, applied to all poses; in NumPy for double precision
     u = np.stack([-x, -y, -z])
     q, p = X_WB[:, :4].astype(np.float64), (X_WB[:, 4:] - X_WB[:1, 4:]).astype(np.float64)
     scalar = w * q[:, 0] - np.sum(u * q[:, 1:], axis=1)
@@ -263,11 +263,11 @@ def split_windows(
     normalise: Normalisation = "heading",
     dtype: Any = np.float32,
 ) -> tuple[Windows, Windows]:
-    """Windows to learn from and windows held out, which share no moment of any run.
+    """Training windows and held-out windows, which do not overlap in any run.
 
     The recording is split first (`Recording.split`: by whole runs where every scenario has
     several, else each run's last part is held out after a gap) and cut afterwards. Held-out
-    windows don't overlap one another either (their stride is their length).
+    windows don't overlap each other (their stride is their length).
 
     Raises:
         UserError: one of the two sides has no trajectory as long as a window.

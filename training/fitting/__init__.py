@@ -1,1 +1,1 @@
-"""Where training starts from, its steps, its guards and its folder."""
+"""Starting model, training steps, non-finite checks and the run folder."""

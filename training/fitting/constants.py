@@ -1,4 +1,4 @@
-"""The constants of a SPINN: the numbers that make M, D, D^f and V where its networks give zero."""
+"""The constants of a SPINN: the values of M, D, D^f and V where its networks give zero."""
 
 from typing import Any, TypeVar
 
@@ -16,7 +16,7 @@ Model = TypeVar("Model", bound=Dynamics)
 
 
 def constants(model: Dynamics) -> list[Any]:
-    """The numbers that make M, D, D^f and V of a SPINN, or of one with effects about it.
+    """The constants of M, D, D^f and V of a SPINN, or of one with effects.
 
     Raises:
         TypeError: it is another model.
@@ -49,7 +49,7 @@ def _network(potential: Potential) -> BoundedScalar | EulerPotential:
 
 
 def without_networks(model: Model) -> Model:
-    """The same function by the smallest networks, where the heads' weights are zero."""
+    """The same function with networks of one unit, if all heads' weights are zero."""
     if isinstance(model, Extended):
         return model.with_base(_small(_spinn(model)))
     return _small(_spinn(model))

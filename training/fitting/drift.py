@@ -1,11 +1,11 @@
 """A first fit of the drift: the networks' output biases by nonlinear least squares.
 
-A preset may be off by factors, where kernels hardly feel a difference, and a gradient step sees
-masses and drags through very unequal slopes. With the networks' weights left alone a SPINN is a
-vehicle with constant M, D and D^f: some 70 numbers, which a trust region (Moré 1978, SciPy's)
-finds in a few steps from the noise-free motion over short pieces. What the data don't tell (an axis
-that never moves) stays where the preset has it, held by a weak prior. It is meant for measured
-states; `likelihood` tells much more of exact ones.
+A preset may be wrong by factors: kernels are then insensitive, and the gradients with respect to
+masses and drags differ by orders of magnitude. With its networks' weights fixed a SPINN is a
+vehicle with constant M, D and D^f: some 70 numbers, which a trust region method (Moré 1978,
+SciPy's) fits in a few steps to the noise-free motion over short segments. What the data do not
+excite (an axis that never moves) is kept near the preset by a weak prior. The fit is meant for
+measured states; for exact ones `likelihood` is much more efficient.
 """
 
 from collections.abc import Callable
@@ -40,10 +40,10 @@ def fit_drift(
     substeps: int,
     progress: Progress | None = None,
 ) -> Model:
-    """The model with the biases that fit the motion of short pieces best.
+    """The model with the biases that fit the motion of short segments best.
 
     Raises:
-        UserError: the model's motion runs away in most of the pieces.
+        UserError: the model's motion diverges in most of the segments.
     """
     if config.iterations == 0:
         return model
@@ -53,7 +53,7 @@ def fit_drift(
     start, unravel = ravel_pytree(constants(model))
     residuals = _residuals(config, unravel, start, substeps, pieces.dt)
 
-    # once with the preset's errors as the units, once with the errors that are left
+    # the first pass scales errors by the preset's, the second one by those that remain
     values = np.asarray(start, float)
     for n in range(_PASSES):
         if progress is not None:
@@ -74,7 +74,7 @@ def _solved(
     dtype: Any,
     steps: int,
 ) -> Float[np.ndarray, " p"]:
-    """Where the sum of squared residuals is least, after at most so many steps from `values`."""
+    """The least-squares solution after at most `steps` evaluations from `values`."""
     known: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
     def both(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -83,25 +83,25 @@ def _solved(
             errors, jacobian = (
                 np.asarray(a, float) for a in residuals(jnp.asarray(x, dtype), given)
             )
-            # what has run away has no slope
+            # entries of diverged motions are not finite
             known[x.tobytes()] = errors, np.where(np.isfinite(jacobian), jacobian, 0.0)
         return known[x.tobytes()]
 
     def slopes(x: np.ndarray) -> np.ndarray:
         return both(x)[1]
 
-    jac: Any = slopes  # SciPy's stubs know names alone
+    jac: Any = slopes  # SciPy's stubs only allow names of schemes
     return scipy.optimize.least_squares(
         lambda x: both(x)[0], values, jac, xtol=1e-3, ftol=1e-4, max_nfev=steps
     ).x
 
 
 def _telling(pieces: Windows, model: Dynamics, count: int, substeps: int) -> Windows:
-    """Half of `count` evenly spread over all, half where the model expects the largest changes.
+    """Half of `count` evenly spread over all, half where the model predicts the largest changes.
 
-    A change of velocity tells masses apart from drags, and a recording may hold few of them. Chosen
-    are the largest expected changes on each axis: they follow from states and commands, not from
-    the noise that is to come, so the choice favours no outcome.
+    A change of velocity separates masses from drags, and a recording may have few of them. The
+    largest predicted changes on each axis are chosen: they depend on states and commands, not on
+    the noise within the segment, so that the choice does not bias the fit.
     """
     if len(pieces) <= count:
         return pieces
@@ -132,8 +132,8 @@ def _residuals(
             model, batch.X[0], batch.V[0], batch.F, dt, substeps=substeps, commands=batch.commands
         )
         errors = jnp.stack(unit.by_axis(X[:, :, None], V[:, :, None], batch))
-        errors = errors[:, :, 1::4]  # neighbouring times say nearly the same
-        # a far step of the solver may run away: a large finite error tells it to go back
+        errors = errors[:, :, 1::4]  # neighbouring times are nearly redundant
+        # a large step of the solver may diverge: a large finite error makes it step back
         errors = jnp.where(jnp.isfinite(errors), jnp.clip(errors, -1e3, 1e3), 1e3)
         change = (values - start) / jnp.maximum(1, jnp.abs(start))
         return jnp.concatenate([errors.ravel() / errors.size**0.5, config.prior**0.5 * change])

@@ -1,8 +1,8 @@
 """Several runs of one method, such as its seeds, whose steps are taken in one batched program.
 
-A small model leaves most of a processor idle; several of them fill it. Each run keeps its own data,
-minibatches, noise, validation, recoveries and folder, the same as `fit` would write, so that `fit`
-may resume any of them alone.
+One small model leaves most of a processor idle. Each run keeps its own data, minibatches, noise,
+validation, recoveries and folder, which are the same as those of `fit`, so that `fit` may resume
+any of them alone.
 """
 
 from collections.abc import Sequence
@@ -32,11 +32,11 @@ def fit_ensemble(
 ) -> list[TrainingResult | TrainingError]:
     """Train `models[i]` on `windows[i]` with seed `seeds[i]`, all runs' steps in one program.
 
-    A run that fails is left out from then on and its error stands in its place; `progress` tells
+    A run that fails is dropped and its error takes its place in the result; `progress` receives
     the slowest run's steps and the mean loss. All else is as in `fit`.
 
     Raises:
-        UserError: what `fit` refuses.
+        UserError: as in `fit`.
         ValueError: the models' structures differ.
     """
     if not len(seeds) == len(models) == len(windows) > 0:
@@ -78,9 +78,9 @@ def fit_ensemble(
 def _advance(
     step: EnsembleStep, runs: list[Run], results: dict[int, TrainingResult | TrainingError]
 ) -> None:
-    """One step of every run that is under way; a run that ends or fails puts down its result."""
+    """One step of every active run; the result of a run that ends or fails goes to `results`."""
     plans = {i: run.plan() for i, run in enumerate(runs) if i not in results}
-    filler = next(iter(plans.values()))  # an ended run's place: the program's shape stays
+    filler = next(iter(plans.values()))  # takes an ended run's place, so that shapes stay the same
     done = step([plans.get(i, filler) for i in range(len(runs))])
     for i, plan in plans.items():
         run = runs[i]

@@ -1,4 +1,4 @@
-"""Training: minibatches of windows, Adam, checkpoints that resume bit for bit, guarded steps."""
+"""Training: minibatches of windows, Adam, bit-exact checkpoints, recovery of non-finite steps."""
 
 import logging
 import signal
@@ -46,20 +46,20 @@ _FLUSH_EVERY = 20
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What a run ends with.
+    """Result of a run.
 
     Attributes:
-        model: the best model on the validation windows, the start among them, or without those the
-            last.
+        model: the best model on the validation windows, including the starting one; without
+            validation windows the last one.
         last: the model after the last step.
-        steps: steps done, also those of earlier parts of a resumed run.
-        best_step: after how many steps `model` was reached.
-        metrics: columns of metrics.csv by name (this process' rows alone without a folder).
-        events: recoveries, each with its step and what happened.
+        steps: steps done, including those of earlier parts of a resumed run.
+        best_step: number of steps after which `model` was reached.
+        metrics: columns of metrics.csv by name (only this process' rows without a folder).
+        events: recoveries, each with its step and a description.
         seconds: time spent in training.
         stopped_early: whether `patience` ended it.
-        refits: steps before which bandwidths were fitted anew; losses before and after one are of
-            different scales.
+        refits: steps before which bandwidths were refitted; losses before and after have different
+            scales.
     """
 
     model: Dynamics
@@ -86,21 +86,21 @@ def fit(
 ) -> TrainingResult:
     """Train all arrays of `model` that receive a gradient.
 
-    `validation` windows choose the best model; judge the result on yet other ones. With `out_dir`
-    the run leaves checkpoint.npz, metrics.csv, config.yaml, run.json and model.spinn (with
-    `metadata`).
-    With `resume` a checkpoint there is continued, to the same bits as without the break. The first
-    Ctrl-C ends the step at hand, writes a checkpoint and raises KeyboardInterrupt.
+    `validation` windows select the best model; evaluate the result on other ones. With `out_dir`
+    the run writes checkpoint.npz, metrics.csv, config.yaml, run.json and model.spinn (with
+    `metadata`). With `resume` a checkpoint there is continued; the result is bit-identical to that
+    of an uninterrupted run. On the first Ctrl-C the current step is completed, a checkpoint is
+    written and KeyboardInterrupt is raised.
 
     Raises:
         UserError: the starting model or all windows are not finite, or the checkpoint doesn't fit.
-        TrainingError: more bad steps than `max_recoveries`; the last good state is checkpointed.
+        TrainingError: more non-finite steps than `max_recoveries`; the last good state is saved.
     """
     return Run(config, model, windows, out_dir, validation, metadata).go(progress, resume)
 
 
 class Run:
-    """One run's state and what it does between the compiled steps (`fit`, `fit_ensemble`)."""
+    """State of one run, and its operations between the compiled steps (`fit`, `fit_ensemble`)."""
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class Run:
         self.config, self.windows, self.metadata = config, windows, metadata
         self.folder = None if out_dir is None else RunFolder(out_dir)
         params, self.static = partition(model)
-        # the step donates its inputs: never the caller's own arrays
+        # copies, as the step donates its inputs and the caller keeps its arrays
         self.state = TrainState(
             params=jax.tree.map(jnp.array, params),
             moments=first_moments(config, params),
@@ -143,7 +143,7 @@ class Run:
     # the loop
 
     def begin(self, resume: bool) -> None:
-        """Open the folder, and with `resume` take over its checkpoint."""
+        """Open the folder, and with `resume` load its checkpoint."""
         state = self.state
         if self.folder is not None:
             if resume and self.folder.checkpoint.exists():
@@ -156,7 +156,7 @@ class Run:
         self.began = time.monotonic() - state.seconds
 
     def go(self, progress: Progress | None, resume: bool) -> TrainingResult:
-        """All steps that are left."""
+        """Take all remaining steps."""
         self.begin(resume)
         devices = usable_devices(self.state.objective, self.config.batch)
         step = TrainStep(self.config, self.state.params, self.static, devices)
@@ -176,16 +176,16 @@ class Run:
         return self.finish(stopped)
 
     def finish(self, stopped: bool) -> TrainingResult:
-        """Write what is left to write; the result."""
+        """Write the last checkpoint and return the result."""
         self.checkpoint()
         return self._result(stopped)
 
     def plan(self) -> tuple[Any, ...]:
-        """What the compiled step takes for the step at hand."""
+        """Arguments of the compiled step for the current step."""
         state, config = self.state, self.config
         if state.step in self._refits():
             state.objective = state.objective.refit(self._model(state.params), self._usable())
-            state.best_value = self._score(state.best)  # of another scale than before
+            state.best_value = self._score(state.best)  # the refit changes the scale of the loss
         usable = np.setdiff1d(np.arange(len(self.windows)), state.excluded)
         size = state.objective.group_size()
         indices = step_indices(config.seed, state.step, config.batch, usable, self.labels, size)
@@ -194,7 +194,7 @@ class Run:
         return state.params, state.moments, state.objective, self.data, indices, seed, number, rate
 
     def take(self, plan: tuple[Any, ...], params: Any, moments: Any, report: Report) -> bool:
-        """Take over what a step returned; tell whether patience has run out."""
+        """Store the result of a step; return whether to stop early."""
         state = self.state
         *_, indices, _, number, rate = plan
         state.params, state.moments = params, moments
@@ -222,7 +222,7 @@ class Run:
         return stopped
 
     def _recover(self, indices: np.ndarray, number: int) -> None:
-        """Name what happened; then drop the windows at fault, or go back and shrink the rate."""
+        """Explain a non-finite step; exclude the faulty windows, or halve the rate and restore."""
         state = self.state
         self.bad_in_a_row += 1
         key = jax.random.fold_in(jax.random.key(np.uint32(self.config.seed)), np.uint32(number))
@@ -265,7 +265,7 @@ class Run:
         raise TrainingError(f"step {number}: {found.text}; {why}{kept}")
 
     def _validate(self, row: dict[str, Any]) -> bool:
-        """Keep the best parameters; tell whether patience has run out."""
+        """Keep the best parameters; return whether to stop early."""
         state, config = self.state, self.config
         due = state.step % config.validate_every == 0 or state.step == config.steps
         if self.validation is None:
@@ -311,7 +311,7 @@ class Run:
             self.unwritten = []
 
     def checkpoint(self) -> None:
-        """Write the state as it is between two steps."""
+        """Write the state between two steps."""
         self._flush()
         self.snapshot = (self.state.arrays(), self.state.plain())
         if self.folder is not None:
@@ -323,7 +323,7 @@ class Run:
         return eqx.combine(params, self.static)
 
     def _refits(self) -> tuple[int, ...]:
-        """Steps before which the objective fits its constants anew."""
+        """Steps before which the objective refits its constants."""
         return tuple(sorted({round(f * self.config.steps) for f in self.config.refit_at}))
 
     def _usable(self) -> Windows:
@@ -359,7 +359,7 @@ class Run:
 
 
 def _on_one_device(params: Any) -> Any:
-    """What was trained on several devices, as any other arrays."""
+    """Arrays that are replicated on several devices, on the first device alone."""
     return jax.device_put(params, jax.devices()[0])
 
 
@@ -379,9 +379,9 @@ def _validation_loss(
 
 @contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Note the first Ctrl-C only, so that it can't split a step; a second one interrupts.
+    """Defer the first Ctrl-C, so that it can't interrupt a step; a second one interrupts at once.
 
-    Where the caller has Ctrl-C ignored, as shells do for what runs in the background, it stays so.
+    If the caller ignores Ctrl-C, as shells do for background jobs, it stays ignored.
     """
     noted: list[int] = []
     previous = signal.getsignal(signal.SIGINT)

@@ -1,4 +1,4 @@
-"""Names for what went wrong in a step that was not finite."""
+"""Explanation of steps that are not finite."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +19,7 @@ class TrainingError(RuntimeError):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Where numbers stopped being finite: windows (by index), parameters or gradients (by name)."""
+    """Location of non-finite numbers: windows (by index), parameters or gradients (by name)."""
 
     windows: tuple[int, ...]
     data: tuple[int, ...]
@@ -53,10 +53,10 @@ def explain_non_finite(
     key: jax.Array,
     dt: float,
 ) -> Diagnosis:
-    """Find what made the step over the windows `indices` not finite.
+    """Find why the step over the windows `indices` is not finite.
 
-    Looked at in turn: parameters, the windows' data, the noise-free motion (with the time at which
-    it leaves the finite numbers), and each window's own loss and gradient.
+    Checked in turn: parameters, the windows' data, the noise-free motion (with the time at which it
+    becomes non-finite), and each window's loss and gradient.
     """
     if broken := not_finite(model):
         return Diagnosis((), (), broken, f"parameter {_list(broken)} is not finite")
@@ -84,7 +84,7 @@ def explain_non_finite(
 def _one_by_one(
     model: Dynamics, objective: Objective, windows: Windows, indices: np.ndarray, key: jax.Array
 ) -> Diagnosis:
-    """Look at each window's loss and gradient, or at each group's."""
+    """Check each window's loss and gradient, or each group's."""
 
     @eqx.filter_jit
     def value_and_gradient(model: Dynamics, one: Batch) -> Any:

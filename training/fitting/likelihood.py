@@ -1,11 +1,10 @@
-"""The most likely drift and diffusion where states are known exactly: a fit to innovations.
+"""Maximum-likelihood drift and diffusion for exactly known states: a fit to innovations.
 
 By the Markov property the likelihood of a trajectory is the product of its steps' (`innovations`).
-Least squares weighted by P⁻¹, with P and b brought up to date between passes, reaches the
-Cramér–Rao bound of the constants; squared errors of long noise-free motions do not by far, as
-noise that was seen long ago is counted again and again. With noise of measurement it is the other
-way round: single steps then tell little else. So the fit is judged by whether the innovations that
-it leaves are uncorrelated (`Fitted.white`).
+Least squares weighted by P⁻¹, with P and b updated between passes, reaches the Cramér–Rao bound of
+the constants. Squared errors of long noise-free motions are far from it, as they accumulate the
+process noise. With measurement noise the reverse holds: it dominates the one-step innovations. The
+fit is therefore accepted only if its innovations are uncorrelated (`Fitted.white`).
 """
 
 from collections.abc import Callable
@@ -27,22 +26,22 @@ from .one_step_errors import Steps, correlation, innovations, likely_diffusion, 
 
 Model = TypeVar("Model", bound=Spinn)
 
-_FEW = 4000  # steps that bring the constants near
-_CHUNK = 4096  # steps whose derivatives stay in a processor's cache
+_FEW = 4000  # steps of the first passes, enough for approximate constants
+_CHUNK = 4096  # steps whose derivatives fit into a processor's cache
 _TRIES = 8
 _GAIN = 0.1
-"""Log-likelihood that an iteration must be worth: one standard error of a number is worth 0.5."""
+"""Least gain in log-likelihood of an iteration; one standard error of a parameter is 0.5."""
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """What the fit to innovations ends with.
+    """Result of the fit to innovations.
 
     Attributes:
         values: the constants (`training.fitting.constants`), flat.
-        diffusion: b (N√s, N·m√s), most likely given them.
-        information: Fisher information of the values, the prior's included.
-        correlation: of neighbouring innovations by axis.
+        diffusion: maximum-likelihood b given them (N√s, N·m√s).
+        information: Fisher information of the values, including the prior's.
+        correlation: correlation of neighbouring innovations by axis.
     """
 
     values: Float[np.ndarray, " p"]
@@ -51,7 +50,7 @@ class Fitted:
     correlation: Float[np.ndarray, "6"]
 
     def white(self, bound: float) -> bool:
-        """Whether neighbours' correlation is known and within `bound` on every axis."""
+        """Whether the correlation is known and within ± `bound` on every axis."""
         return bool((np.abs(self.correlation) <= bound).all())
 
     def apply(self, model: Model) -> Model:
@@ -63,10 +62,10 @@ class Fitted:
 def fit_innovations(
     config: DriftConfig, model: Spinn, windows: Windows, substeps: int
 ) -> Fitted | None:
-    """The most likely constants and b, from where `model` has them, as `config.innovations` says.
+    """Maximum-likelihood constants and b, starting from `model`, subject to `config.innovations`.
 
-    None where that is `never` or leaves no iterations, where it is `auto` and innovations stay
-    correlated, or where nothing finite is found.
+    None if that is `never` or there are no iterations, if it is `auto` and the innovations are
+    correlated, or if the result is not finite.
     """
     if config.innovations == "never" or config.iterations == 0:
         return None
@@ -74,7 +73,7 @@ def fit_innovations(
     if len(every) == 0:
         return None
     fit = _Fit.of(config, model, substeps)
-    # the first pass weighs by the preset's errors; the last is over once weights are nearly right
+    # the first pass has the preset's weights; the last one needs weights that are nearly right
     first = fit.from_here(fit.start, None, few)
     found = None if first is None else fit.from_here(first.values, first.diffusion, few)
     if found is not None and len(every) > len(few) and _may_stay(config, found):
@@ -87,7 +86,7 @@ def _may_stay(config: DriftConfig, found: Fitted) -> bool:
 
 
 class _Fit(eqx.Module):
-    """What stays the same in all passes."""
+    """Constants of all passes."""
 
     small: Spinn
     start: np.ndarray
@@ -184,7 +183,7 @@ def _gram(
         J = jax.lax.map(push, jnp.eye(values.size, dtype=values.dtype))
         return J @ J.T, J @ r
 
-    # what pads the last chunk is weighted by zero
+    # the padding of the last chunk has zero weight
     H, g = jax.lax.map(part, (jax.tree.map(chunks, steps), chunks(whiten, "constant")))
     return jnp.sum(H, axis=0), jnp.sum(g, axis=0)
 
@@ -195,7 +194,7 @@ def _descend(
     values: Float[np.ndarray, " p"],
     iterations: int,
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
-    """The least cost near `values` by Levenberg and Marquardt, and the Gauss–Newton matrix there.
+    """Minimise the cost from `values` by Levenberg–Marquardt; the Gauss–Newton matrix there.
 
     Reference: Nocedal and Wright 2006, section 10.3.
     """
@@ -206,7 +205,7 @@ def _descend(
         for _ in range(_TRIES):
             move = -np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
             then = cost(values + move)
-            if then < now:  # false too where the motion runs away
+            if then < now:  # false for NaN too, if the motion diverges
                 values, gain, now = values + move, now - then, then
                 break
             damping *= 5

@@ -1,13 +1,13 @@
-"""Innovations: what a model misses from one sample to the next, and how large it should be.
+"""Innovations: one-step prediction errors of a model, and their covariance.
 
 Given the state at t_n, the twist at t_(n+1) of a diffusion is Gaussian to first order in its noise,
 
     r_n = ξ_(n+1) - m(x_n) ~ N(0, P_n),   P ← A P Aᵀ + h G diag(b²) Gᵀ,   A = I + h ∂a/∂ξ,  G = M⁻¹,
 
-over the integrator's own steps of h from P = 0, where a is the drift and m the motion without noise
+over the integrator's steps of h from P = 0, where a is the drift and m the motion without noise
 (local linearisation: Särkkä and Solin 2019, chapter 9). Innovations of different steps are
-independent if states are known exactly and the law is Markov; noise of measurement and forces with
-a memory make neighbours correlated.
+independent if states are known exactly and the law is Markov; measurement noise and forces with
+memory correlate neighbours.
 """
 
 import equinox as eqx
@@ -19,17 +19,17 @@ from jaxtyping import Array, Bool, DTypeLike, Float
 from ...models.dynamics import Dynamics
 from ..data.windows import Windows
 
-_PART = 20  # neighbours that stay together where steps are left out
+_PART = 20  # consecutive steps that are kept together when steps are left out
 
 
 class Steps(eqx.Module):
-    """N steps of one sample each, none of them twice, in the order of their runs.
+    """N distinct steps of one sample each, in the order of their runs.
 
     Attributes:
         X: poses at the start.
         V: twists at the start.
         F: wrenches.
-        V_next: twists at the end; poses there tell nothing more.
+        V_next: twists at the end; the poses there carry no further information.
         follows: whether a step's end is the next one's start.
         dt: length of each (s).
     """
@@ -43,7 +43,7 @@ class Steps(eqx.Module):
 
     @classmethod
     def of(cls, windows: Windows, most: int) -> "Steps":
-        """The finite steps of windows that may overlap; an even choice if there are many."""
+        """The finite steps of windows that may overlap, thinned evenly to about `most`."""
         pieces = windows.subdivide(1)
         time = np.round(pieces.start / pieces.dt).astype(int)
         key = np.stack([pieces.scenario, pieces.run, time])
@@ -79,7 +79,7 @@ def correlation(steps: Steps, errors: Float[np.ndarray, "6 N"]) -> Float[np.ndar
 
 
 def innovations(model: Dynamics, steps: Steps, substeps: int) -> Float[Array, "6 N"]:
-    """r: the twists at the steps' ends less those of the motion without noise."""
+    """r: the twists at the steps' ends minus those of the motion without noise."""
     return steps.V_next - _motion(model, steps, substeps)[0]
 
 
@@ -87,7 +87,7 @@ def innovations(model: Dynamics, steps: Steps, substeps: int) -> Float[Array, "6
 def whitened(
     model: Dynamics, steps: Steps, whiten: Float[Array, "6 6 N"], substeps: int
 ) -> Float[Array, "6 N"]:
-    """The innovations in units and axes in which they were independent, with `whitening`."""
+    """The innovations whitened by `whitening`."""
     return jnp.einsum("ijn,jn->in", whiten, innovations(model, steps, substeps))
 
 
@@ -95,10 +95,10 @@ def whitened(
 def whitening(
     model: Dynamics, steps: Steps, b: Float[Array, "6"], substeps: int
 ) -> tuple[Float[Array, "6 6 N"], Float[Array, "6"]]:
-    """L⁻¹ where P = L Lᵀ, and what b² is to be multiplied by on its way to the most likely one.
+    """L⁻¹ where P = L Lᵀ, and the factor on b² in a fixed-point iteration to its likeliest value.
 
-    With S_i = ∂P/∂b_i² the most likely b makes rᵀ P⁻¹ S_i P⁻¹ r as large as tr(P⁻¹ S_i), summed
-    over the steps; the factor is the ratio of the two.
+    With S_i = ∂P/∂b_i² the maximum-likelihood b makes Σ rᵀ P⁻¹ S_i P⁻¹ r over the steps equal to
+    Σ tr(P⁻¹ S_i); the factor is the ratio of the two.
     """
     r, S = _spread(model, steps, substeps)
     L = jnp.linalg.cholesky(jnp.moveaxis(jnp.tensordot(b * b, S, 1), 2, 0))
@@ -124,7 +124,7 @@ def _mass(model: Dynamics, V: Float[Array, "6"]) -> Float[Array, "6 6"]:
 def likely_diffusion(
     model: Dynamics, steps: Steps, substeps: int, b: Float[np.ndarray, "6"] | None = None
 ) -> Float[np.ndarray, "6"]:
-    """The most likely diffusion b (N√s, N·m√s) for this drift, sought from `b` if it is given."""
+    """Maximum-likelihood diffusion b (N√s, N·m√s) for this drift, starting from `b` if given."""
     if b is None:
         wrench = mass_at_rest(model, steps.V.dtype) @ np.asarray(
             innovations(model, steps, substeps)
@@ -140,7 +140,7 @@ def likely_diffusion(
 def _motion(
     model: Dynamics, steps: Steps, substeps: int
 ) -> tuple[Float[Array, "6 N"], list[tuple[Array, Array]]]:
-    """The twists at the steps' ends without noise, and the states that substeps start from."""
+    """The twists at the steps' ends without noise, and the states at the start of each substep."""
     X, V, path = steps.X, steps.V, []
     h = jnp.asarray(steps.dt / substeps, V.dtype)
     for _ in range(substeps):
@@ -152,11 +152,11 @@ def _motion(
 def _spread(
     model: Dynamics, steps: Steps, substeps: int
 ) -> tuple[Float[Array, "6 N"], Float[Array, "6 6 6 N"]]:
-    """Innovations, and the covariances S_i that noise of b_i = 1 on one axis alone would give."""
+    """Innovations, and their covariances S_i for noise of b_i = 1 on one axis alone."""
     V_end, path = _motion(model, steps, substeps)
     h = jnp.asarray(steps.dt / substeps, V_end.dtype)
     eye = jnp.broadcast_to(jnp.eye(6, dtype=V_end.dtype)[:, :, None], (6, 6, len(steps)))
-    columns: list[Array] = []  # what a unit of noise in each of the substeps so far has become
+    columns: list[Array] = []  # response to unit noise in each of the substeps so far
     for X, V in path:
         mass = model.coefficients(V).mass
         _, push = jax.linearize(lambda v, X=X: model.acceleration(X, v, steps.F), V)

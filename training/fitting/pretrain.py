@@ -1,7 +1,7 @@
-"""Pre-training: bring the coefficient networks to a preset before they see data.
+"""Pre-training: fit the coefficient networks to a preset before training on data.
 
-Coefficients of an underwater vehicle differ by orders of magnitude between axes; starting in the
-right chart is what makes training from little data possible (Palmer et al., experiments).
+Coefficients of an underwater vehicle differ by orders of magnitude between axes; starting with the
+right magnitudes makes training from little data possible (Palmer et al., experiments).
 """
 
 from typing import Any, TypeVar
@@ -28,8 +28,8 @@ def pretrain(
     """Fit M, D, D^f, b and F_V of `model` to those of `target`; returns the model and its losses.
 
     Velocities are Gaussian with `speed` (m/s, rad/s), attitudes uniform in roll and pitch. Every
-    entry is compared in units of the target's diagonal, every wrench in units of its own size. All
-    steps run inside one compiled scan; none is taken if the model starts within `tolerance`.
+    entry is scaled by the target's diagonal, every wrench by its own size. All steps run inside one
+    compiled scan; none is taken if the model starts within `tolerance`.
 
     Raises:
         ValueError: the loss is not finite.
@@ -80,9 +80,9 @@ def coefficient_error(
 ) -> Float[Array, ""]:
     """Mean squared relative differences of M, D, D^f, b and F_V at these velocities and poses.
 
-    Diagonals of the target below 1 % of what stops the vehicle in a second are raised to that, as a
-    SPINN's scales are: a positive definite drag can't be zero, and networks that are driven there
-    are spoilt on the way. A diffusion of zero is left alone.
+    Diagonals of the target are raised to at least 1 % of the drag that stops the vehicle in a
+    second, as a SPINN's scales are: a positive definite drag can't be zero, and driving networks
+    towards zero spoils them. A diffusion of zero is ignored.
     """
     mine, theirs = model.coefficients(V_WB_B), target.coefficients(V_WB_B)
     inertia = jnp.diagonal(theirs.mass.matrix())

@@ -1,4 +1,4 @@
-"""A training run on disk: checkpoint, metrics, settings; a kill at any moment spoils none."""
+"""A training run on disk: checkpoint, metrics, settings, all safe if the process is killed."""
 
 import csv
 import dataclasses
@@ -36,17 +36,17 @@ TRAINING = FolderKind(
         "report.html",
     ),
 )
-"""What `spinndrift train` writes, with what `fit` writes of it."""
+"""Files that `spinndrift train` writes, including those of `fit`."""
 _MAY_DIFFER = ("steps", "patience", "max_recoveries", "checkpoint_every")
 
 
 class CheckpointError(UserError):
-    """A checkpoint that can't be gone on from: damaged, or of other settings or other data."""
+    """A checkpoint that can't be resumed: damaged, or of other settings or data."""
 
 
 @dataclass(frozen=True)
 class _Event:
-    """What happened at a step, for the report."""
+    """A recovery at a step, for the report."""
 
     step: int
     text: str
@@ -54,7 +54,7 @@ class _Event:
 
 @dataclass
 class TrainState:
-    """All that a run changes. Trees hold arrays only; `events` tells of recoveries."""
+    """Mutable state of a run. Trees hold arrays only; `events` are the recoveries."""
 
     params: Any
     moments: Any
@@ -92,7 +92,7 @@ class TrainState:
         return values | {"best_value": values["best_value"].hex()}
 
     def fill(self, arrays: list[np.ndarray], plain: dict[str, Any]) -> None:
-        """Take over what `arrays` and `plain` of an equal state returned.
+        """Restore the results of `arrays` and `plain` of a state of equal structure.
 
         Raises:
             ValueError: number, shape or type of the arrays differ.
@@ -112,7 +112,7 @@ class TrainState:
 
 @dataclass(frozen=True)
 class _Plain:
-    """What `TrainState.plain` writes."""
+    """Schema of `TrainState.plain`."""
 
     step: int
     best_value: str
@@ -140,10 +140,10 @@ class RunFolder:
         self.model = self.path / "model.spinn"
 
     def begin(self, config: TrainingConfig, provenance: dict[str, Any]) -> None:
-        """Write what is run, before the first step.
+        """Write settings and provenance before the first step.
 
         Raises:
-            UserError: the folder holds what this package did not write.
+            UserError: the folder holds files that this package did not write.
         """
         claim(self.path, TRAINING)
         for name, text in (
@@ -154,7 +154,7 @@ class RunFolder:
                 partial.write_text(text, encoding="utf-8")
 
     def save(self, state: TrainState, config: TrainingConfig, data: str) -> None:
-        """Write the checkpoint; the former one stays until this one is whole."""
+        """Write the checkpoint atomically: the previous one stays until this one is complete."""
         header = {"state": state.plain(), "config": yaml.dump(config), "data": data}
         text = np.frombuffer(json.dumps(header).encode(), np.uint8)
         arrays: dict[str, Any] = {f"array_{i:04d}": a for i, a in enumerate(state.arrays())}
@@ -165,7 +165,7 @@ class RunFolder:
         """Fill `state` from the checkpoint of the same settings and data.
 
         Raises:
-            CheckpointError: the checkpoint is damaged, or of other settings or other data.
+            CheckpointError: the checkpoint is damaged, or of other settings or data.
         """
         try:
             header, arrays = read_archive(self.checkpoint, "checkpoint")
@@ -184,7 +184,7 @@ class RunFolder:
             ) from error
 
     def begin_metrics(self, step: int) -> None:
-        """Keep the rows before `step` (a killed run may have written more, or half a row)."""
+        """Keep the rows before `step` (a killed run may have written more, or part of a row)."""
         kept = []
         if step > 0 and self.metrics.exists():
             text = self.metrics.read_text(encoding="utf-8", errors="replace")
@@ -197,7 +197,7 @@ class RunFolder:
             csv.writer(handle, lineterminator="\n").writerows(kept)
 
     def append_metrics(self, rows: list[dict[str, Any]]) -> None:
-        """Append rows with one write; the first ever row also writes the header."""
+        """Append rows with one write; with the first row the header is written."""
         if not rows:
             return
         new = not self.metrics.exists() or self.metrics.stat().st_size == 0
@@ -213,7 +213,7 @@ class RunFolder:
                     handle.write(text.getvalue())
             except OSError:
                 if self.metrics.exists():
-                    os.truncate(self.metrics, before)  # no part of the rows stays
+                    os.truncate(self.metrics, before)  # remove partly written rows
                 raise
 
     def read_metrics(self) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""The model that training starts from: a preset, drift and diffusion brought near the data."""
+"""The starting model of training: a preset with drift and diffusion fitted to the data."""
 
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -36,14 +36,13 @@ _NORMAL_QUARTILE = 0.6744897501960817
 def estimate_diffusion(
     dynamics: Dynamics, windows: Windows, horizon_s: float = 0.5, substeps: int = 1
 ) -> Float[np.ndarray, "6"]:
-    """A first guess of b (N√s, N·m√s): how far M ξ misses its prediction after `horizon_s`.
+    """First estimate of b (N√s, N·m√s) from the prediction error of M ξ after `horizon_s`.
 
-    b is such that motions drawn from `dynamics` with it miss the noise-free motion as far as the
-    data do, by the median of absolute values on each axis; drag, which pulls back what noise has
-    moved, is thereby accounted for. b contains what the model misses by bias and the sensors'
-    noise, so it is rather too large. At least 1e-3 of what accelerates by 1 in a second. A
-    distance-aware diffusion isn't drawn from: there b_i² h = Var[(M (ξ̂ - ξ))_i], too small by
-    what drag pulls back.
+    With it motions drawn from `dynamics` deviate from the noise-free motion as far as the data do,
+    by the median absolute deviation on each axis, which accounts for the decay of deviations by
+    drag. b includes model bias and sensor noise, so it tends to be too large. It is at least 1e-3
+    of the value that accelerates by 1 in a second. No motions are drawn for a distance-aware
+    diffusion: there b_i² h = Var[(M (ξ̂ - ξ))_i], which is too small by the effect of drag.
     """
     steps = int(np.clip(round(horizon_s / windows.dt), 1, windows.steps))
     pieces = windows.thin(256).subdivide(steps).thin(1024)
@@ -84,10 +83,10 @@ def with_diffusion(model: Model, b: Float[np.ndarray, "6"]) -> Model:
 
 
 def begun_with(config: TrainingConfig, model: Dynamics | None) -> TrainingConfig:
-    """The settings with the architecture of a learned model that training goes on from.
+    """The settings with the architecture of a learned model that training continues from.
 
     Raises:
-        UserError: it is another method's kind of model.
+        UserError: the model is of a kind that the method does not train.
     """
     own = None if model is None else core(model)
     if model is None or not isinstance(own, Spinn):
@@ -114,12 +113,12 @@ def starting_model(
     given: Dynamics | None = None,
     validation: Windows | None = None,
 ) -> Dynamics:
-    """A SPINN at the vehicle's preset, its drift fitted to short pieces, b from what is then left.
+    """A SPINN at the vehicle's preset, its drift fitted to short segments, b to the residuals.
 
-    A `given` Fossen model stands in the preset's place. Effects about it stay as they are and a
-    SPINN takes the place of what they are about; a learned model is the start as it is. The windows
-    have commands then (`make_windows`). A given model may be as good as the data can tell: its
-    drift is fitted only where the fit predicts `validation` windows better.
+    A `given` Fossen model replaces the preset. Its effects are kept, with a SPINN as their base;
+    the windows then need commands (`make_windows`). A learned model is returned as it is. A given
+    model may already be as good as the data allow: the fit of the drift is kept only if it predicts
+    `validation` windows better.
 
     A function of its arguments alone, so that a resumed run starts from the same bits.
     """
@@ -137,7 +136,7 @@ def starting_model(
     spinn = pretrain(spinn, reference, config.pretrain, pretrain_key)[0]
     substeps = config.objective.substeps
     effects = given if isinstance(given, Extended) else None
-    # steps of a model with effects may remember, which a fit from sample to sample can't know
+    # effects may have memory, which a fit to one-step innovations does not model
     fitted = None if effects else fit_innovations(config.drift, spinn, windows, substeps)
     spinn = spinn if fitted is None else fitted.apply(spinn)
     model = spinn if effects is None else effects.with_base(spinn)
@@ -155,7 +154,7 @@ def starting_model(
 
 
 def _nearer(first: Model, second: Model, windows: Windows, substeps: int) -> Model:
-    """Which of two models' noise-free motion is nearer to the windows, in units of the first's."""
+    """The model whose noise-free motion is closer to the windows, in units of `first`'s errors."""
     batch = Batch.of(windows.thin(256))
     unit = SquaredError.build("typical", substeps, first, windows)
 

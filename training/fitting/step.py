@@ -1,4 +1,4 @@
-"""One training step, compiled once: gradient, clipping, Adam, and the check that all is finite."""
+"""One training step, compiled once: gradient, clipping, Adam, and the check for finite numbers."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -19,14 +19,14 @@ from ..config import TrainingConfig
 from ..losses.base import Batch, Objective
 
 QUICK_COMPILE = {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512}
-"""On a CPU: a third less time to compile at equal speed (18.1 to 12.5 s, 74 and 76 ms a step), and
-vectors as wide as the processor has them, of which XLA uses half by itself."""
+"""On a CPU: a third less time to compile at equal speed (18.1 to 12.5 s, 74 and 76 ms per step),
+and the processor's full vector width, of which XLA uses half by default."""
 
 _WINDOWS = "windows"  # the mesh's axis
 
 
 class Report(NamedTuple):
-    """What one step tells; `ok` is false where anything was not finite and nothing was changed."""
+    """Results of one step; `ok` is false if anything was not finite and nothing was changed."""
 
     ok: Bool[Array, ""]
     loss: Float[Array, ""]
@@ -41,7 +41,7 @@ def all_finite(tree: Any) -> Bool[Array, ""]:
 
 
 def optimizer(config: TrainingConfig) -> optax.GradientTransformation:
-    """Gradient clipping and Adam's direction of one vector; the rate is an argument of a step."""
+    """Gradient clipping and Adam's direction for one vector; the rate is an argument of a step."""
     clip = optax.clip_by_global_norm(config.clip) if config.clip > 0 else optax.identity()
     return optax.chain(clip, optax.scale_by_adam())
 
@@ -62,16 +62,16 @@ def learning_rate(config: TrainingConfig, step: int) -> float:
 
 
 def partition(model: Dynamics) -> tuple[Any, Any]:
-    """Split a model into what is trained and the rest.
+    """Split a model into trained arrays and the rest.
 
-    A model may say so itself (`trainable`, as `Spinn` does); else all inexact arrays are trained.
+    A model may define them (`trainable`, as `Spinn` does); else all inexact arrays are trained.
     """
     trainable = getattr(model, "trainable", None)
     return eqx.partition(model, eqx.is_inexact_array if trainable is None else trainable())
 
 
 def head_weights(params: Any) -> Any:
-    """A tree with one number a leaf: 1 for weights of networks' output layers, else 0."""
+    """A tree with one number per leaf: 1 for weights of networks' output layers, else 0."""
     paths, treedef = jax.tree_util.tree_flatten_with_path(params)
     chosen = [float("head" in (n := jax.tree_util.keystr(p)) and "weight" in n) for p, _ in paths]
     return jax.tree.unflatten(treedef, chosen)
@@ -80,9 +80,9 @@ def head_weights(params: Any) -> Any:
 class TrainStep:
     """The compiled step of one kind of model and one objective, over some of JAX's devices.
 
-    `static` is what the model holds besides its parameters; its arrays are handed to the program,
-    so that models which differ in numbers alone share a compiled one. `traces` counts how often
-    Python was traced: 1 after the first call and ever after.
+    `static` is the model without its parameters; its arrays are arguments of the program, so that
+    models which differ only in numbers share a compiled one. `traces` counts the traces of the
+    Python code: 1 from the first call on.
     """
 
     def __init__(self, config: TrainingConfig, params: Any, static: Any, devices: int = 1):
@@ -135,9 +135,9 @@ class TrainStep:
 
 
 class EnsembleStep:
-    """One step of several runs that don't know of each other (seeds of a method), in one batch.
+    """One step of several independent runs (seeds of a method), in one batch.
 
-    `statics` are as for `TrainStep`, one a run, and equal but for their arrays.
+    `statics` are as for `TrainStep`, one per run, and equal except for their arrays.
     """
 
     def __init__(self, config: TrainingConfig, params: Any, statics: Sequence[Any]):
@@ -158,7 +158,7 @@ class EnsembleStep:
         self._step = jax.jit(step, compiler_options=QUICK_COMPILE)
 
     def __call__(self, runs: list[tuple]) -> list[tuple[Any, Any, Report]]:
-        """What `TrainStep` returns, for each run's arguments to it."""
+        """The results of `TrainStep` for each run's arguments."""
         return self._step(self._frozen, [(*run[:4], *_numbers(*run[4:])) for run in runs])
 
 
@@ -174,9 +174,9 @@ def _numbers(indices: np.ndarray, seed: int, number: int, rate: float) -> tuple[
 def _update(
     config: TrainingConfig, params: Any, structure: Any, devices: int = 1
 ) -> Callable[..., tuple[Any, Any, Report]]:
-    """What a step compiles: loss, gradient, Adam, decay; nothing changes if not all is finite.
+    """The function of a step: loss, gradient, Adam, decay; no update if anything is not finite.
 
-    From the gradient on all parameters are one vector: a few operations in place of a dozen for
+    From the gradient on all parameters are one vector: a few operations instead of a dozen for
     each array of the networks.
     """
     transformation = optimizer(config)
@@ -225,10 +225,10 @@ def _update(
 
 
 def mean_over_devices(of_part: Callable[..., Any], devices: int) -> Callable[..., Any]:
-    """`of_part(batch, *whole)` of equal parts of the batch's windows, one a device, averaged.
+    """`of_part(batch, *whole)` of equal parts of the batch's windows, one per device, averaged.
 
-    Each device differentiates its own part from end to end and they meet once, at the mean. (Left
-    to the compiler, they meet at every step of the integration, which is slower than one alone.)
+    Each device differentiates its own part and they communicate once, for the mean. (The compiler's
+    own partitioning communicates at every integration step, which is slower than one device.)
     """
     if devices == 1:
         return of_part
@@ -245,9 +245,9 @@ def mean_over_devices(of_part: Callable[..., Any], devices: int) -> Callable[...
 
 
 def on_all(arrays: Any, devices: int) -> Any:
-    """A tree of arrays on each of some devices, as programs for so many return theirs.
+    """A tree of arrays replicated on `devices`, as the programs for several devices return them.
 
-    A program is compiled anew for arrays that lie elsewhere.
+    Arrays with another placement would make a program compile again.
     """
     if devices == 1:
         return arrays
@@ -259,7 +259,7 @@ def _mesh(devices: int) -> Mesh:
 
 
 def usable_devices(objective: Objective, windows: int) -> int:
-    """How many of JAX's devices can share a batch of so many windows, whole groups each."""
+    """Number of JAX's devices that can share a batch of `windows`, whole groups each."""
     if not objective.mean_of_windows:
         return 1
     groups = max(1, windows // objective.group_size())

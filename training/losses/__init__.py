@@ -1,1 +1,1 @@
-"""What training makes small: every objective of the paper and its baselines."""
+"""Training objectives of the paper and its baselines."""

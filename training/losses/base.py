@@ -1,7 +1,7 @@
-"""What a training step makes small: the interface that every method of training implements.
+"""Interface of training objectives.
 
-A method is a frozen dataclass of settings with `build(model, windows) -> Objective`; the settings'
-class stands in the union `objectives.ObjectiveConfig`, so YAML names it by its tag.
+An objective has a frozen dataclass of settings with `build(model, windows) -> Objective`; that
+class is a member of the union `kinds.ObjectiveConfig`, so that YAML names it by its tag.
 """
 
 import abc
@@ -20,9 +20,9 @@ from ..data.windows import Windows
 class Batch(NamedTuple):
     """Windows as arrays on the device: poses and twists at t_0 … t_T, wrenches of the T steps.
 
-    `place` numbers the windows: what is drawn for a window depends on its place, not on which
-    others are at hand, so a batch shared among devices sees the noise that one device would.
-    `commands` are there for models with effects, which act on single thrusters and remember.
+    `place` numbers the windows: the noise of a window depends on its place, not on the other
+    windows, so that a batch split over devices has the same noise as on one device. `commands`
+    are for models with effects, which act on single thrusters and have memory.
     """
 
     X: Float[Array, "N 7 W"]
@@ -39,14 +39,14 @@ class Batch(NamedTuple):
         return cls(X, V, F, jnp.arange(len(windows)), commands)
 
     def take(self, indices: Int[Array, " B"]) -> "Batch":
-        """The windows of some indices, in places of their own."""
+        """The windows of some indices, with new places."""
         arrays = (self.X, self.V, self.F, self.commands)
         X, V, F, commands = jax.tree.map(lambda a: a[:, :, indices], arrays)
         return Batch(X, V, F, jnp.arange(indices.size), commands)
 
 
 class Objective(eqx.Module):
-    """A loss with what it needs to know; its array fields are data (bandwidths), never trained."""
+    """A loss and its constants; its array fields are data (bandwidths) and are not trained."""
 
     name: ClassVar[str]
     mean_of_windows: ClassVar[bool] = True
@@ -58,17 +58,17 @@ class Objective(eqx.Module):
     ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
         """The mean loss over the batch and its parts by name.
 
-        All randomness comes from `key`, and what is drawn for a window from its place too.
+        All randomness comes from `key`; that of a window also depends on its place.
         """
 
     def group_size(self) -> int:
-        """How many windows of equal scenario and start stand side by side in a batch.
+        """Number of windows of equal scenario and start in each group of a batch.
 
-        Batches hold whole groups, one after the other (`training.data.groups`); 1 is any window.
+        Batches hold whole groups, one after the other (`training.data.groups`); 1 means no groups.
         """
         return 1
 
     def refit(self, model: Dynamics, windows: Windows) -> "Objective":
-        """The objective with its data-driven constants fitted anew to what `model` now misses."""
+        """The objective with its data-driven constants refitted to the errors of `model`."""
         del model, windows
         return self

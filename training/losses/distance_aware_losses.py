@@ -1,8 +1,8 @@
 """The two published objectives for distance-aware diffusion, on the Euclidean SPINN.
 
 Both train a model whose diffusion is `models.distance_aware.DistanceAware`; names and numbers of
-the public code are given with each. Their penalties on parameters are left to `head_decay`, and
-Adam's rate falls by a cosine instead of linearly.
+the public code are given with each. `head_decay` replaces their penalties on parameters, and
+Adam's rate follows a cosine instead of a line.
 """
 
 from collections.abc import Iterable
@@ -31,20 +31,20 @@ class DistanceAware:
     """Squared error of particles at random times, with penalties on the distance network.
 
     Djeumou, Neary, Topcu (2023), the loss of section 2.3; numbers of wuwushrek/sde4mbrl at f4f34bf
-    for a hexacopter (`optimizer_sde.yaml`), whose motion is a rigid body's too:
+    for a hexacopter (`optimizer_sde.yaml`), which is a rigid body too:
 
         mean Σ_t Σ_i ((y_i - x_i) / w_i)² + λ (g mean|∇ρ|² + h mean ΣΣ lack + m / mean μ).
     """
 
     horizon_s: float = 1.0
-    """Of the beginning of each window: 20 steps of 0.05 s."""
+    """Duration (s) used of each window, from its start: 20 steps of 0.05 s."""
     times: int = 5
     """Random times of the horizon at which each window's particle is compared."""
     particles: int = 1
     gradient_weight: float = 1.0
     """g (`pen_grad_density`)."""
     convexity_weight: float = 1.0
-    """h (`pen_density_scvex`); the lack is summed over the ball and the horizon."""
+    """h (`pen_density_scvex`); the `lack` is summed over the ball and the horizon."""
     mu_weight: float = 100.0
     """m (`pen_mu_coeff`, of type `lin_inv`)."""
     penalty_scale: float = 0.01
@@ -59,7 +59,7 @@ class DistanceAware:
         require(self.horizon_s > 0, self, "horizon_s", "give a time above 0 s")
 
     def build(self, model: Dynamics, windows: Windows) -> "DistanceAwareObjective":
-        """The objective with w, the largest size of each component in the data (`obs_weights`).
+        """The objective with w, the largest absolute value of each component (`obs_weights`).
 
         Raises:
             UserError: the model has no such diffusion, or is on the group.
@@ -112,25 +112,25 @@ class DistanceAwareObjective(Objective):
 
 @dataclass(frozen=True)
 class Unconstrained:
-    """Gaussian negative log-likelihood with the diffusion as deviation, and penalties apart.
+    """Gaussian negative log-likelihood with the diffusion as deviation, and separate penalties.
 
     Koprulu, Djeumou, Topcu (2025); cevahir-koprulu/sde4mbrltatu, branch iclr2025 at e8bdbd7
     (`nll_type: gauss_approx`, `losses_diffusion`). In units of the data's standard deviation,
 
         mean Σ_n γⁿ Σ_i ((y_i - x_i)² / σ_i² + log σ_i²) + v Σ|w|,
 
-    σ² the diagonal of M⁻¹ b b M⁻ᵀ at the particle's state before the step, as the code has it (a
+    σ² the diagonal of M⁻¹ b b M⁻ᵀ at the particle's state before the step, as in the code (a
     diffusion in place of a deviation: no factor √dt). Position and angles have no diffusion here
-    and take σ = 1. The likelihood does not train the distance network; only
+    and use σ = 1. The likelihood does not train the distance network; only
 
         a mean ρ + o mean (ρ(ball) - 1)² + g mean|∇ρ|² + mean Σ lack + 1/μ²
         - 1000 log(mean|∇ρ|²) where that mean is below 1e-6
 
-    does, at each window's first state. One optimiser trains both; the code has two.
+    does, at each window's initial state. One optimiser trains both; the code has two.
     """
 
     horizon: int = 2
-    """Steps of the data from each window's start."""
+    """Number of steps used of each window, from its start."""
     discount: float = 0.9
     particles: int = 1
     width_weight: float = 1e-3

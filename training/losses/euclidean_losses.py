@@ -1,9 +1,9 @@
-"""Objectives in R¹² for the Euclidean SPINN, as published methods have them.
+"""Objectives in R¹² for the Euclidean SPINN, as in published methods.
 
-Predictions keep position, Euler angles and twist as plain numbers (`EuclideanSpinn.rollout`); the
-observed angles are those of atan2 and asin. Differences are subtractions: where the data's angles
-jump by a turn, or near the vertical, errors and kernels see it (Palmer et al., Euclidean
-baselines).
+Predictions keep position, Euler angles and twist as vectors (`EuclideanSpinn.rollout`); the
+observed angles are those of atan2 and asin. Differences are subtractions: errors and kernels
+include the data's angle jumps by a full turn and the singularity near the vertical (Palmer et al.,
+Euclidean baselines).
 """
 
 from dataclasses import dataclass
@@ -27,14 +27,14 @@ from .kernels import VelocityKernel, bandwidths_from_differences
 from .moments import Moments, MomentsObjective, Unit, compare, pooled, units, vector_moments
 from .scores import kernel_score, time_pairs
 
-_CHUNK = 128  # windows whose errors are looked at to choose scales
+_CHUNK = 128  # windows whose errors determine the scales
 
 
 def euclidean(model: Dynamics) -> EuclideanSpinn:
-    """The model, if it has coordinates.
+    """The model, checked to be a Euclidean one.
 
     Raises:
-        UserError: it is on the group.
+        UserError: the model is on the group.
     """
     if not isinstance(model, EuclideanSpinn):
         raise UserError(
@@ -84,7 +84,7 @@ def typical_coordinates(
     """Errors of coordinates and twists of the noise-free motion in up to 128 windows.
 
     Raises:
-        UserError: it runs away in half of the windows or more.
+        UserError: the motion diverges in half of the windows or more.
     """
     finite = np.isfinite(windows.X).all((0, 1)) & np.isfinite(windows.V).all((0, 1))
     finite &= np.isfinite(windows.F).all((0, 1))
@@ -118,7 +118,7 @@ class CoordinateError(eqx.Module):
     def build(
         cls, unit: Unit, substeps: int, model: Dynamics, windows: Windows
     ) -> "CoordinateError":
-        """Units are 1 (SI), or root mean square errors of `model` by axis and time (typical)."""
+        """Units are 1 (SI), or RMS errors of `model` by axis and time (typical)."""
         found = [np.ones((6, windows.steps))] * 2
         if unit == "typical":
             errors = typical_coordinates(model, windows, substeps)
@@ -165,7 +165,7 @@ class EuclideanFdm:
             require(getattr(self, name) >= 0, self, name, "give zero or more")
 
     def build(self, model: Dynamics, windows: Windows) -> "EuclideanFdmObjective":
-        """The objective with units and bandwidths from how far `model` now misses the windows."""
+        """The objective with units and bandwidths from the errors of `model` on the windows."""
         steps, dtype = windows.steps, windows.X.dtype
         lags = (int(np.clip(round(lag / windows.dt), 1, steps - 1)) for lag in self.lags_s)
         unit = self.mse_unit if self.mse_weight > 0 else "SI"

@@ -1,4 +1,4 @@
-"""The logarithm of relative poses, arranged for millions of pairs.
+"""The logarithm of relative poses, optimised for millions of pairs.
 
 For a unit quaternion with w = cos φ ≥ 0 (φ half the angle) log has two coefficients,
 
@@ -6,8 +6,8 @@ For a unit quaternion with w = cos φ ≥ 0 (φ half the angle) log has two coef
     v = p - ½ ω × p + d(w) ω × (ω × p),   d = (1 - φ cot φ) / (4 φ²),
 
 both analytic in w on (-1, 1], so polynomials in w give them on [0, 1] to rounding: no square root,
-no arc tangent, no branch, and no quotient that vanishes where two poses coincide or at the cut
-locus (Trefethen 2013, chapter 8: the nearest singularity w = -1 makes the error fall as 5.8⁻ⁿ).
+no arc tangent, no branch, and no 0/0 where two poses coincide or at the cut locus (Trefethen 2013,
+chapter 8: with the nearest singularity at w = -1 the error falls as 5.8⁻ⁿ).
 `models.se3.log` is the same function for single poses.
 """
 
@@ -63,7 +63,7 @@ def _cross(a: list[Array], b: list[Array]) -> list[Array]:
 def relative_log(X_WA: Float[Array, "7 *a"], X_WB: Float[Array, "7 *b"]) -> list[Array]:
     """The six components of log(X_WA⁻¹ X_WB), unit quaternions; the two broadcast.
 
-    Both of a pair of equal rank, as everywhere in this project.
+    Both must have the same rank.
     """
     w, x, y, z, *p = jnp.unstack(X_WA)
     s, i, j, k, *r = jnp.unstack(X_WB)

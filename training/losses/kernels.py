@@ -2,13 +2,13 @@
 
 Each kernel is k(z, z') = exp(-½ (d₁² + d₂²)), d_k² the squared distance of the two states at time
 t_k in axes scaled by the bandwidths γ_k (Palmer et al., velocity, chordal and geodesic kernel).
-With several `scales` s it is the mean of exp(-½ (d₁² + d₂²) / s²), which is characteristic where
-each one is, and keeps a gradient when the laws are still far apart.
+With several `scales` s it is the mean of exp(-½ (d₁² + d₂²) / s²), which is characteristic if each
+one is, and has a useful gradient while the laws are still far apart.
 
 With the profile `energy` it is -√(d₁² + d₂²) instead, whose kernel score is the energy score
-(Székely and Rizzo 2013; Gneiting and Raftery 2007, eq. 22): no scale to choose but the axes'
-relative ones, and proper for twists and chordal poses. The geodesic distance of rotations is not of
-negative type, so that there it is proper for laws within about a radian alone.
+(Székely and Rizzo 2013; Gneiting and Raftery 2007, eq. 22): it needs no scale except the axes'
+relative ones, and is proper for twists and chordal poses. The geodesic distance of rotations is not
+of negative type, so with it the score is proper only for laws within about a radian.
 """
 
 import abc
@@ -32,13 +32,13 @@ def _subtract(a: Array, b: Array) -> list[Array]:
 
 
 class Kernel(eqx.Module):
-    """A product kernel over two times; `bandwidths` (components, N) has one column a time index."""
+    """A product kernel over two times; `bandwidths` (components, N) has one column per time."""
 
     bandwidths: Float[Array, "C N"]
     scales: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
     profile: Profile = eqx.field(static=True, default="gaussian")
     floors: ClassVar[tuple[float, ...]]
-    """Least bandwidth of each axis: what no sensor resolves (m, rad, m/s, rad/s, or 1)."""
+    """Least bandwidth of each axis: below sensor resolution (m, rad, m/s, rad/s, or 1)."""
 
     @staticmethod
     @abc.abstractmethod
@@ -87,7 +87,7 @@ class ChordalKernel(Kernel):
 
 
 class GeodesicKernel(Kernel):
-    """Gaussian of log(g⁻¹ g') with one bandwidth an axis; locally characteristic where sharp."""
+    """Gaussian of log(g⁻¹ g') with one bandwidth per axis; locally characteristic if narrow."""
 
     floors: ClassVar[tuple[float, ...]] = (2e-3,) * 6
 
@@ -116,10 +116,10 @@ def bandwidths_from_differences(
 
     1. Axis and time: s_i(t) = the `quantile` of |displacement_i(t)| over all M, divided by 0.6745
        (so that the median of a Gaussian gives its standard deviation), at least the axis' floor.
-    2. Both times together: γ_i(t) = factor · c(t) s_i(t), where c² is the median over M and over
+    2. Both times together: γ_i(t) = factor · c s_i(t), where c² is the median over M and over
        neighbouring times of Σ_k Σ_i (displacement_i(t_k) / s_i(t_k))², t_1 = t, t_2 = t + lag: a
        typical pair then has d₁² + d₂² = 1 whatever the number of axes (Garreau et al. 2017, for
-       the median rule). It is one number c for all times.
+       the median rule). c is the same for all times.
     """
     e = np.abs(np.asarray(differences, np.float64))
     floor = np.asarray(kernel.floors)[None, :]

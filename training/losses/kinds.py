@@ -1,4 +1,4 @@
-"""Every objective's settings in one union, which YAML tells apart by their tags."""
+"""Settings of every objective in one union; YAML selects one by its tag."""
 
 from .distance_aware_losses import DistanceAware, Unconstrained
 from .euclidean_losses import EuclideanFdm, EuclideanMoments
@@ -8,4 +8,4 @@ from .moments import Moments
 ObjectiveConfig = (
     Fdm | Mse | Moments | EuclideanFdm | EuclideanMoments | DistanceAware | Unconstrained
 )
-"""Settings of every objective; YAML picks one by its tag."""
+"""Settings of every objective; YAML selects one by its tag."""

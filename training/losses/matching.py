@@ -28,7 +28,7 @@ from .kernels import (
 )
 from .scores import kernel_score, time_pairs
 
-_CHUNK = 128  # windows whose errors are looked at to choose scales
+_CHUNK = 128  # windows whose errors determine the scales
 
 
 @dataclass(frozen=True)
@@ -37,17 +37,17 @@ class Fdm:
 
     pose_kernel: Literal["geodesic", "chordal"] = "geodesic"
     samples: int = 16
-    """P, predicted motions of each window."""
+    """P, number of predicted motions of each window."""
     lags_s: tuple[float, ...] = (0.25, 1.0)
-    """Separations of the two times (s), taken in turn."""
+    """Lags between the two times (s), used in turn."""
     time_pairs: int = 16
-    """Pairs of times a step, drawn anew each step."""
+    """Pairs of times per step, redrawn in each step."""
     pair_shifts: int | None = None
-    """Cyclic shifts that pair predicted samples; null takes all pairs."""
+    """Number of cyclic shifts that pair predicted samples; null uses all pairs."""
     scales: tuple[float, ...] = (1.0, 0.35)
     """Multiples of the bandwidths whose kernels are averaged."""
     profile: Profile = "gaussian"
-    """`energy` puts the energy score in place of the Gaussian kernels'
+    """`energy` replaces the Gaussian kernels' score by the energy score
     (`training.losses.kernels`)."""
     bandwidth_quantile: float = 0.5
     bandwidth_factor: float = 1.0
@@ -56,13 +56,13 @@ class Fdm:
     mse_weight: float = 0.1
     mse_of: Literal["drift", "samples"] = "drift"
     """Squared error of the noise-free motion, or of every sample as in the paper (which also
-    pulls the diffusion towards zero)."""
+    drives the diffusion towards zero)."""
     mse_unit: Literal["typical", "SI"] = "typical"
-    """Errors counted in the starting model's own, or in metres and radians as in the paper."""
+    """Errors in units of the starting model's errors, or in metres and radians as in the paper."""
     mass_weight: float = 0.0
     """Weight of the regulariser that keeps M constant in velocity."""
     substeps: int = 2
-    """Integration steps a sample: a small vehicle's rates settle within 0.1 s."""
+    """Integration steps per sample: a small vehicle's rates settle within 0.1 s."""
 
     def __post_init__(self) -> None:
         check_numbers(self)
@@ -79,7 +79,7 @@ class Fdm:
             require(getattr(self, name) >= 0, self, name, "give zero or more")
 
     def build(self, model: Dynamics, windows: Windows) -> "FdmObjective":
-        """The objective with units and bandwidths from how far `model` now misses the windows."""
+        """The objective with units and bandwidths from the errors of `model` on the windows."""
         steps, dtype = windows.steps, windows.X.dtype
         lags = (int(np.clip(round(lag / windows.dt), 1, steps - 1)) for lag in self.lags_s)
         kernel = KERNELS[self.pose_kernel]
@@ -109,7 +109,7 @@ class Mse:
         require(self.mass_weight >= 0, self, "mass_weight", "give zero or more")
 
     def build(self, model: Dynamics, windows: Windows) -> "MseObjective":
-        """The objective with units from how far `model` now misses the windows."""
+        """The objective with units from the errors of `model` on the windows."""
         return MseObjective(self, SquaredError.build(self.unit, self.substeps, model, windows))
 
 
@@ -125,7 +125,7 @@ class SquaredError(eqx.Module):
     def build(
         cls, unit: Literal["typical", "SI"], substeps: int, model: Dynamics, windows: Windows
     ) -> "SquaredError":
-        """Units are 1 (SI), or root mean square errors of `model` by axis and time (typical)."""
+        """Units are 1 (SI), or RMS errors of `model` by axis and time (typical)."""
         ones = np.ones((6, windows.steps))
         units = [ones, ones]
         if unit == "typical":
@@ -148,7 +148,7 @@ class SquaredError(eqx.Module):
     def by_axis(
         self, X: Float[Array, "T 7 P W"], V: Float[Array, "T 6 P W"], batch: Batch
     ) -> tuple[Float[Array, "6 T P W"], Float[Array, "6 T P W"]]:
-        """The errors of pose and twist themselves, in their units."""
+        """The errors of pose and twist, in their units."""
         X, V, X_hat, V_hat = (
             jnp.moveaxis(a, 1, 0) for a in (X, V, batch.X[1:, :, None], batch.V[1:, :, None])
         )
@@ -243,7 +243,7 @@ class MseObjective(Objective):
 
 
 def _mass_variation(model: Dynamics, batch: Batch, key: Array) -> Array:
-    """The model's own measure of how M depends on velocity, at velocities of the batch."""
+    """The dependence of M on velocity (`Spinn.mass_variation`), at velocities of the batch."""
     own = core(model)
     if not isinstance(own, Spinn):
         return jnp.zeros((), batch.V.dtype)
@@ -259,7 +259,7 @@ def typical_motion(
     """Noise-free and observed motion of up to 128 windows: poses (7, T, W), then twists (6, T, W).
 
     Raises:
-        UserError: the noise-free motion of the model runs away in half of the windows or more.
+        UserError: the noise-free motion of the model diverges in half of the windows or more.
     """
     finite = np.isfinite(windows.X).all((0, 1)) & np.isfinite(windows.V).all((0, 1))
     finite &= np.isfinite(windows.F).all((0, 1))

@@ -27,7 +27,7 @@ from .kernels import GeodesicKernel, VelocityKernel
 from .matching import SquaredError
 
 Unit = Literal["typical", "SI"]
-_GROUPS = 32  # looked at to choose units
+_GROUPS = 32  # groups that determine the units
 
 
 def displacements(
@@ -38,10 +38,10 @@ def displacements(
 
 
 def group_mean(X: Float[Array, "7 *batch S"], iterations: int = 8) -> Float[Array, "7 *batch"]:
-    """The mean pose: where the mean of log(μ⁻¹ g_s) over the samples vanishes.
+    """The mean pose μ: the mean of log(μ⁻¹ g_s) over the samples is zero.
 
-    Found by μ ← μ exp(mean log(μ⁻¹ g_s)) from the mean of positions and quaternions (Ackerman,
-    Wolfe, Chirikjian 2013, eq. 4), which shrinks the error by the square of the samples' spread
+    Iterates μ ← μ exp(mean log(μ⁻¹ g_s)) from the mean of positions and quaternions (Ackerman,
+    Wolfe, Chirikjian 2013, eq. 4), which reduces the error by the square of the samples' spread
     (rad) each time. These steps carry no gradient; one Newton step follows, whose derivative is
     that of the mean itself by the implicit function theorem,
 
@@ -78,7 +78,7 @@ def _inverse_left_jacobian(xi: Float[Array, "6 *batch"]) -> Float[Array, "6 6 *b
 
 
 def covariance(e: Float[Array, "C *batch S"]) -> Float[Array, "C C *batch"]:
-    """The mean over the samples of e eᵀ, as the paper has it (divided by their number)."""
+    """The mean over the samples of e eᵀ, as in the paper (divided by their number)."""
     return jnp.einsum("i...s,j...s->ij...", e, e) / e.shape[-1]
 
 
@@ -87,19 +87,19 @@ class Moments:
     """Moment matching: mean and covariance of poses and velocities of groups of windows."""
 
     runs: int = 16
-    """Observed motions of a group at most: windows of one scenario with equal start."""
+    """Largest number of observed motions in a group: windows of one scenario with equal start."""
     samples: int = 4
     """Predicted motions from each of the group's starts."""
     mean_weight: float = 1.0
     covariance_weight: float = 1.0
     unit: Unit = "typical"
-    """Axes counted in the data's own spread about their mean, or in SI units as in the paper."""
+    """Axes in units of the data's standard deviation, or in SI units as in the paper."""
     mse_weight: float = 0.0
     mse_of: Literal["drift", "samples"] = "drift"
     mse_unit: Unit = "typical"
     """The three as in `Fdm`."""
     iterations: int = 8
-    """Steps towards the group mean before the last one (`group_mean`)."""
+    """Iterations of the group mean before the Newton step (`group_mean`)."""
     substeps: int = 2
 
     def __post_init__(self) -> None:
@@ -136,7 +136,7 @@ class MomentsObjective(Objective):
     config: Moments = eqx.field(static=True)
     size: int = eqx.field(static=True)
     error: Any
-    """Squared error with `dt`: `SquaredError`, or its twin for what `motions` gives."""
+    """Squared error with `dt`: `SquaredError`, or its equivalent for the output of `motions`."""
     pose_unit: Float[Array, "6 T"]
     velocity_unit: Float[Array, "6 T"]
 
@@ -179,7 +179,7 @@ class MomentsObjective(Objective):
         )
 
     def pose_parts(self, X: Float[Array, "T C P W"], batch: Batch) -> dict[str, Array]:
-        """What the moments of the configurations add to the loss."""
+        """Parts of the loss from the moments of the configurations."""
         moments = [
             pose_moments(pooled(a, self.size), self.config.iterations) for a in (X, batch.X[1:])
         ]
@@ -189,7 +189,7 @@ class MomentsObjective(Objective):
 
 
 def pooled(a: Float[Array, "T C *P W"], size: int) -> Float[Array, "C T G S"]:
-    """The samples of each of the groups of `size` windows side by side, in one last axis."""
+    """The samples of each group of `size` windows, in one last axis."""
     a = jnp.moveaxis(a, 1, 0)
     if a.ndim == 3:
         a = a[:, :, None]
@@ -231,7 +231,7 @@ def compare(
 
 
 def weighted(parts: dict[str, Array], mean: float, covariance: float) -> Array:
-    """The sum of the parts, those of means and of covariances each with its weight."""
+    """The weighted sum of the parts of means and of covariances."""
     means = parts["pose_mean"] + parts["velocity_mean"]
     return mean * means + covariance * (parts["pose_covariance"] + parts["velocity_covariance"])
 

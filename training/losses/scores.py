@@ -5,9 +5,9 @@ For a kernel k, predicted samples z_1 … z_P at the times (t_n, t_{n+ℓ}) and 
     S = ½ mean_{p ≠ q} k(z_p, z_q) - mean_p k(z_p, y),
 
 the negative of the kernel score (Gneiting and Raftery 2007, section 5; Zhang et al. 2025 for two
-times): its expectation is least where the predicted law is the observed one, and differs from half
-the squared maximum mean discrepancy by a constant. Pairs p = q are left out, so the estimate is
-unbiased (a U-statistic; Gretton et al. 2012, eq. 3).
+times). Its expectation is minimal where the predicted law equals the observed one, and differs from
+half the squared maximum mean discrepancy by a constant. Pairs p = q are left out, so the estimate
+is unbiased (a U-statistic; Gretton et al. 2012, eq. 3).
 """
 
 import jax
@@ -37,8 +37,8 @@ def shifts(samples: int, count: int | None = None) -> list[tuple[int, float]]:
 def partners(samples: Float[Array, "C L P W"], pair_shifts: int | None) -> Array:
     """The samples' partners under each cyclic shift, (C, L, S, P, W), without gather.
 
-    The samples repeated and laid in rows of P + 1: row s begins s places further round. (Shifts
-    sliced one by one are as many operations, which take long to compile.)
+    The samples are repeated and reshaped to rows of P + 1: row s starts s samples later. (Slicing
+    each shift takes one operation per shift, which is slow to compile.)
     """
     *lead, P, W = samples.shape
     rows = len(shifts(P, pair_shifts)) + 1
@@ -54,8 +54,8 @@ def time_pairs(
 ) -> tuple[Int[Array, " L"], Int[Array, " L"]]:
     """Pairs (n, n + ℓ) with 0 ≤ n and n + ℓ < `steps`, each equally likely given its lag ℓ.
 
-    Index n stands for the n-th predicted state. Lags take turns. The n of one lag are drawn
-    systematically (one uniform start, equal spacing), which keeps every n equally likely and
+    Index n is the n-th predicted state. Lags are used in turn. The n of one lag are drawn by
+    systematic sampling (one uniform start, equal spacing), which keeps every n equally likely and
     spreads the draws over the window (Cochran 1977, chapter 8).
 
     Raises:
@@ -85,7 +85,7 @@ def kernel_score(
 ) -> Float[Array, " W"]:
     """The score S of each window's law, averaged over the time pairs (`first`, `second`).
 
-    `predicted` holds P samples of each of W conditional laws, `observed` one draw of each; the
+    `predicted` holds P samples of each of W conditional laws, `observed` one sample of each; the
     kernel's bandwidths have the same time index. Half of the pairs are evaluated, as contiguous
     slices: no gather over samples.
     """

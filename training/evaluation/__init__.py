@@ -1,1 +1,1 @@
-"""Models judged on data and laws that they have not seen."""
+"""Evaluation of models on held-out data and on laws."""

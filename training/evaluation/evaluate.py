@@ -1,4 +1,4 @@
-"""Judging models on windows they have not seen: errors, coverage and scores against the horizon."""
+"""Evaluation of models on held-out windows: errors, coverage and scores over the horizon."""
 
 import json
 from collections.abc import Mapping
@@ -30,19 +30,19 @@ class Evaluation:
 
     Variables (`norm`: position m, rotation rad, linear_velocity m/s, angular_velocity rad/s,
     geodesic, velocity):
-        rmse (model, norm, horizon): of the noise-free motion.
-        rmse_samples (model, norm, horizon): root mean square over windows and samples.
-        rmse_mean (model, norm, horizon): over windows, of the samples' mean displacement.
-        rmse_axis (model, axis, horizon): of the noise-free motion, by axis.
+        rmse (model, norm, horizon): RMSE of the noise-free motion.
+        rmse_samples (model, norm, horizon): RMSE over windows and samples.
+        rmse_mean (model, norm, horizon): RMSE over windows of the samples' mean displacement.
+        rmse_axis (model, axis, horizon): RMSE of the noise-free motion, by axis.
         coverage (model, band, axis, horizon): share of windows inside the central band.
         energy_score (model, law, horizon): of poses and of velocities.
-        finite (model): share of windows whose predictions stayed finite (the others are left out).
+        finite (model): share of windows with finite predictions (the others are left out).
     """
 
     dataset: xr.Dataset
 
     def overall(self) -> dict[str, dict[str, float]]:
-        """One number a model and quantity: means over horizons (of squares for errors) and axes."""
+        """One number per model and quantity: mean (errors: root mean square) over horizons, axes."""
         table = {}
         for model in self.dataset["model"].to_numpy():
             d = self.dataset.sel(model=model)
@@ -83,7 +83,7 @@ class Evaluation:
         return rows
 
     def save(self, path: str | Path) -> None:
-        """Write the tidy table (`.csv`), the overall numbers (`.json`) or all (`.nc`), by suffix.
+        """Write the tidy table (`.csv`), the overall numbers (`.json`) or everything (`.nc`).
 
         Raises:
             ValueError: another suffix.
@@ -104,7 +104,7 @@ class Evaluation:
                 partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     def summary(self) -> str:
-        """A few lines for a person: errors and coverage of each model over all horizons."""
+        """A short text table: errors and coverage of each model over all horizons."""
         lines = [
             f"{'model':<12}{'position':>10}{'rotation':>10}{'velocity':>10}{'rate':>10}"
             f"{'in 50 %':>9}{'in 90 %':>9}{'energy':>9}",
@@ -123,7 +123,7 @@ class Evaluation:
 
 
 def is_evaluation(path: Path) -> bool:
-    """Whether a file is what `Evaluation.save` writes."""
+    """Whether a file was written by `Evaluation.save`."""
     try:
         if path.suffix == ".nc":
             return {"rmse", "coverage", "energy_score"} <= set(load_netcdf(path).data_vars)
@@ -144,10 +144,10 @@ def evaluate(
     substeps: int = 1,
     seed: int = 0,
 ) -> Evaluation:
-    """Predict every window by every model, each with the same noise, and compare with what was.
+    """Predict every window by every model with the same noise, and compare with the observation.
 
     `samples` must be one less than a multiple of 20, so that the bands of 50 and 90 % are exact.
-    A model without diffusion has bands of no width.
+    A model without diffusion has bands of zero width.
     """
     parts = [
         _evaluate_one(model, windows, samples, substeps, seed).expand_dims(model=[name])
@@ -169,7 +169,7 @@ def _evaluate_one(
     rows: dict[str, list[np.ndarray]] = {}
     finite = 0
     for first in range(0, len(windows), _CHUNK):
-        # the last chunk is filled up so that one compiled function serves all
+        # the last chunk is padded so that one compiled function serves all
         wanted = np.arange(first, min(first + _CHUNK, len(windows)))
         chunk = windows.take(np.resize(wanted, min(_CHUNK, len(windows))))
         key = jax.random.fold_in(jax.random.key(seed), first)

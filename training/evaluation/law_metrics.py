@@ -1,18 +1,18 @@
-"""How close samples of a predicted law are to samples of the true one, beside what is attainable.
+"""Distances between samples of a predicted law and of the true one, and their sampling floor.
 
-Two finite sets of samples of one law differ too. That difference is the *floor*: each number is
+Two finite sets of samples of one law differ too. That difference is the *floor*: each metric is
 computed twice, for the predicted samples and for other samples of the truth, against the same
-samples of the truth; their ratio says how far the law is from as good as can be told.
+samples of the truth; a ratio of 1 is the best that can be measured.
 
 At each time, with true samples x_i, predicted x̂_j, d the `GroundMetric`'s distance and means over
 all pairs:
 
     w2            (min over couplings π of Σ π_ij d²(x_i, x̂_j))^½, solved exactly (Villani 2009,
-                  definition 6.1; network simplex of Bonneel et al. 2011 as POT has it)
+                  definition 6.1; network simplex of Bonneel et al. 2011 in POT)
     w2_debiased   (W₂²(x, x̂) - ½ W₂²(x, x') - ½ W₂²(x̂, x̂'))^½ with other samples x', x̂' of either
-                  law (in the manner of Feydy et al. 2019, eq. 3, without entropy). In twelve
-                  dimensions W₂ of some hundred samples is mostly sampling error, and a law that is
-                  too narrow can come out *below* the floor; this difference tells it apart.
+                  law (as Feydy et al. 2019, eq. 3, without entropy). In twelve dimensions W₂ of
+                  some hundred samples is mostly sampling error, and a law that is too narrow can
+                  come out *below* the floor; this difference detects it.
     energy_score  mean d(x̂_j, x_i) - ½ mean over j ≠ j' of d(x̂_j, x̂_j'), smaller is better
                   (Gneiting and Raftery 2007, eq. 22, sign turned)
     rmse_mean     ‖log(μ⁻¹ μ̂)‖ and ‖V̄ - V̂̄‖: the error of the mean path, μ the group mean
@@ -20,8 +20,8 @@ all pairs:
                   √2 of the spread for the truth itself and *smaller* for its mean path alone, so a
                   deterministic law may lie below the floor.
     coverage      share of the x_i in the predicted law's central band, by axis
-    spread        (mean ‖log(μ̂⁻¹ x̂_j)‖²)^½, likewise for V: how wide the law itself is; its floor
-                  is the true law's
+    spread        (mean ‖log(μ̂⁻¹ x̂_j)‖²)^½, likewise for V: the width of the law; its floor is the
+                  true law's
 """
 
 import dataclasses
@@ -45,10 +45,10 @@ _NEWTON_STEPS = 20
 
 @dataclass(frozen=True)
 class GroundMetric:
-    """Weights of d² = ‖log(g⁻¹ g')‖² + ‖ξ - ξ'‖²: what one metre counts as, and so on.
+    """Weights of the parts of d² = ‖log(g⁻¹ g')‖² + ‖ξ - ξ'‖², per m, rad, m/s and rad/s.
 
-    With the defaults a metre, a radian, a metre a second and a radian a second weigh the same, as
-    in the paper's squared error.
+    With the defaults 1 m, 1 rad, 1 m/s and 1 rad/s have equal weight, as in the paper's squared
+    error.
     """
 
     position: float = 1.0
@@ -68,9 +68,9 @@ class GroundMetric:
 
 @dataclass(frozen=True)
 class LawSamples:
-    """S motions from one law at equal times: poses X and twists V. S = 1 tells a deterministic law.
+    """S motions from one law at equal times: poses X and twists V. S = 1 is a deterministic law.
 
-    Samples with a number that is not finite are left out of every metric and counted in `finite`.
+    Samples that are not finite are left out of every metric and counted in `finite`.
     """
 
     X: Float[np.ndarray, "T 7 S"]
@@ -80,19 +80,19 @@ class LawSamples:
         return self.X.shape[2]
 
     def finite(self) -> "LawSamples":
-        """The samples that stay finite."""
+        """The finite samples."""
         good = np.isfinite(self.X).all((0, 1)) & np.isfinite(self.V).all((0, 1))
         return LawSamples(self.X[:, :, good], self.V[:, :, good])
 
     def at(self, times: np.ndarray) -> "LawSamples":
-        """The samples at these indices of time."""
+        """The samples at these time indices."""
         return LawSamples(self.X[times], self.V[times])
 
 
 def group_mean(X: Float[Array, "T 7 S"]) -> Float[Array, "T 7"]:
-    """Mean pose at each time: where the mean of log(μ⁻¹ g) vanishes (Ackerman et al. 2013, eq. 4).
+    """Mean pose μ at each time: the mean of log(μ⁻¹ g) is zero (Ackerman et al. 2013, eq. 4).
 
-    Found by μ ← μ exp(mean log(μ⁻¹ g)), from the first sample; it is the mean pose if all samples
+    Iterates μ ← μ exp(mean log(μ⁻¹ g)) from the first sample; it is the mean pose if all samples
     lie within a half turn of it.
     """
 
@@ -105,8 +105,8 @@ def group_mean(X: Float[Array, "T 7 S"]) -> Float[Array, "T 7"]:
 
 
 def wasserstein2(squared: Float[np.ndarray, "S R"]) -> float:
-    """W₂ of two sets of equally likely samples whose squared distances these are."""
-    import ot  # a second, and more where it finds torch: for those who ask for W₂ alone
+    """W₂ of two sets of equally likely samples with these squared distances."""
+    import ot  # takes a second, more if torch is installed, so it is imported only for W₂
 
     S, R = squared.shape
     if min(S, R) == 1:  # one coupling alone
@@ -181,7 +181,7 @@ def compare_laws(
 def overall(compared: xr.Dataset) -> dict[str, dict[str, float]]:
     """Averages over the whole horizon and any further dimension, such as scenarios.
 
-    For each quantity `value`, `floor` and `ratio` of the two. RMSE and spread are roots of mean
+    For each quantity `value`, `floor` and their `ratio`. RMSE and spread are roots of mean
     squares; the rest are means.
     """
     numbers: dict[str, list[float]] = {}
@@ -299,7 +299,7 @@ def _coverage(
     drawn = np.sort(drawn[:, :, :count], axis=2)
     shares = []
     for band in BANDS:
-        # a deterministic law has bands of no width
+        # a deterministic law has bands of zero width
         low, high = order_statistics(count, band) if count > 1 else (0, 0)
         inside = (drawn[:, :, low, None] <= seen) & (seen <= drawn[:, :, high, None])
         shares.append(inside.mean(axis=2))

@@ -1,4 +1,4 @@
-"""Numbers that say how well samples of a predicted law and an observation agree.
+"""Metrics of the agreement between samples of a predicted law and an observation.
 
 All take predicted samples (T, C, P, W) and observations (T, C, W) of W windows at T times.
 """
@@ -21,7 +21,7 @@ GROUPS: dict[str, slice] = {
     "geodesic": slice(0, 6),
     "velocity": slice(6, 12),
 }
-"""Norms that sum up errors; `geodesic` is ‖log(g⁻¹ĝ)‖ with m and rad alike, as the paper has it."""
+"""Components of each norm of the error; `geodesic` is ‖log(g⁻¹ĝ)‖, m and rad alike (paper)."""
 BANDS = (0.5, 0.9)
 
 
@@ -71,7 +71,7 @@ def coverage(
     """Whether each observed component lies in the central band of the samples (1) or not (0).
 
     Components are displacements from a reference motion, such as the noise-free one. For a true
-    law the mean is the band's probability exactly, whatever P.
+    law the mean is exactly the band's probability for any P.
     """
     e = np.sort(np.asarray(displacement(X, V, X_ref, V_ref)), axis=2)
     y = np.asarray(displacement(X_seen[:, :, None], V_seen[:, :, None], X_ref, V_ref))[:, :, 0]

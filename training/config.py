@@ -55,9 +55,9 @@ class DriftConfig:
     iterations: int = 12
     """Largest number of solver steps in each of two passes; 0 skips the fit."""
     length_s: float = 1.0
-    """Duration (s) of the segments whose noise-free motion is compared."""
+    """Duration (s) of the pieces whose noise-free motion is compared."""
     pieces: int = 256
-    """Number of segments used, out of all."""
+    """Largest number of pieces that are fitted."""
     prior: float = 1e-4
     """Weight of the squared change of a raw bias (a change of 1 about doubles a coefficient) and of
     the relative change of the potential's bound and net buoyancy, relative to the mean squared

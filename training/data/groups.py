@@ -70,7 +70,7 @@ def step_indices(
 ) -> Int[np.ndarray, " B"]:
     """Windows of one step, about `batch` of them: whole groups one after the other if `size` > 1.
 
-    Groups take turns as windows do; from a larger group `size` windows are drawn anew each time.
+    Groups are shuffled as windows are; from a larger group `size` windows are drawn each time.
     The number of indices depends on `batch` and `size` alone. Empty if no group is large enough.
     """
     if size == 1:

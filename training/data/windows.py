@@ -1,4 +1,4 @@
-"""Windows of recordings: short segments of equal length for training and evaluation.
+"""Windows of recordings: short pieces of equal length for training and evaluation.
 
 Every window is one sample of a conditional law: that of the motion given the initial state and the
 commands. Arrays are time-major, component-first, windows last (`models.se3`).

@@ -42,7 +42,7 @@ class Evaluation:
     dataset: xr.Dataset
 
     def overall(self) -> dict[str, dict[str, float]]:
-        """One number per model and quantity: mean (errors: root mean square) over horizons, axes."""
+        """One number per model and quantity: mean over horizons and axes; RMS for errors."""
         table = {}
         for model in self.dataset["model"].to_numpy():
             d = self.dataset.sel(model=model)

@@ -3,7 +3,7 @@
 A preset may be wrong by factors: kernels are then insensitive, and the gradients with respect to
 masses and drags differ by orders of magnitude. With its networks' weights fixed a SPINN is a
 vehicle with constant M, D and D^f: some 70 numbers, which a trust region method (Moré 1978,
-SciPy's) fits in a few steps to the noise-free motion over short segments. What the data do not
+SciPy's) fits in a few steps to the noise-free motion over short pieces. What the data do not
 excite (an axis that never moves) is kept near the preset by a weak prior. The fit is meant for
 measured states; for exact ones `likelihood` is much more efficient.
 """
@@ -40,10 +40,10 @@ def fit_drift(
     substeps: int,
     progress: Progress | None = None,
 ) -> Model:
-    """The model with the biases that fit the motion of short segments best.
+    """The model with the biases that fit the motion of short pieces best.
 
     Raises:
-        UserError: the model's motion diverges in most of the segments.
+        UserError: the model's motion diverges in most of the pieces.
     """
     if config.iterations == 0:
         return model
@@ -101,7 +101,7 @@ def _telling(pieces: Windows, model: Dynamics, count: int, substeps: int) -> Win
 
     A change of velocity separates masses from drags, and a recording may have few of them. The
     largest predicted changes on each axis are chosen: they depend on states and commands, not on
-    the noise within the segment, so that the choice does not bias the fit.
+    the noise within the piece, so that the choice does not bias the fit.
     """
     if len(pieces) <= count:
         return pieces

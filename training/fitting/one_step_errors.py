@@ -95,7 +95,7 @@ def whitened(
 def whitening(
     model: Dynamics, steps: Steps, b: Float[Array, "6"], substeps: int
 ) -> tuple[Float[Array, "6 6 N"], Float[Array, "6"]]:
-    """L⁻¹ where P = L Lᵀ, and the factor on b² in a fixed-point iteration to its likeliest value.
+    """L⁻¹ where P = L Lᵀ, and the factor on b² of a fixed-point iteration to maximum likelihood.
 
     With S_i = ∂P/∂b_i² the maximum-likelihood b makes Σ rᵀ P⁻¹ S_i P⁻¹ r over the steps equal to
     Σ tr(P⁻¹ S_i); the factor is the ratio of the two.

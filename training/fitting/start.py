@@ -113,7 +113,7 @@ def starting_model(
     given: Dynamics | None = None,
     validation: Windows | None = None,
 ) -> Dynamics:
-    """A SPINN at the vehicle's preset, its drift fitted to short segments, b to the residuals.
+    """A SPINN at the vehicle's preset, its drift fitted to short pieces, b to the residuals.
 
     A `given` Fossen model replaces the preset. Its effects are kept, with a SPINN as their base;
     the windows then need commands (`make_windows`). A learned model is returned as it is. A given

@@ -118,7 +118,7 @@ def bandwidths_from_differences(
        (so that the median of a Gaussian gives its standard deviation), at least the axis' floor.
     2. Both times together: γ_i(t) = factor · c s_i(t), where c² is the median over M and over
        neighbouring times of Σ_k Σ_i (displacement_i(t_k) / s_i(t_k))², t_1 = t, t_2 = t + lag: a
-       typical pair then has d₁² + d₂² = 1 whatever the number of axes (Garreau et al. 2017, for
+       typical pair then has d₁² + d₂² = 1 for any number of axes (Garreau et al. 2017, for
        the median rule). c is the same for all times.
     """
     e = np.abs(np.asarray(differences, np.float64))

@@ -88,7 +88,7 @@ class ClockOffset(Effect):
     """The time stamps of one channel are late by δ: the record at t holds the value at t - δ.
 
     `linear` and `angular` delay these velocities, `twist` both. `pose` records X exp(-Ω), with Ω
-    the integral of the twist over δ (first term of Magnus 1954). δ is against the command's clock.
+    the integral of the twist over δ (Magnus 1954, first term). δ is relative to the command clock.
     """
 
     name: ClassVar[str] = "clock_offset"

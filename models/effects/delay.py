@@ -32,7 +32,7 @@ class ActuationDelay(Effect):
 
     @property
     def memory_size(self) -> int:
-        """The last commands, newest first, then the times that they were held."""
+        """The last commands, newest first, then their hold times."""
         return (self.thrusters + 1) * self.steps
 
     @property

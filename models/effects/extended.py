@@ -77,7 +77,7 @@ class Extended(Dynamics):
         """Whether any effect makes the recorded state differ from the true one."""
         return self._any("measure")
 
-    # ------------------------------------------------------------- what every `Dynamics` has
+    # ------------------------------------------------------------------ interface of `Dynamics`
 
     @property
     def rigid_inertia(self) -> Float[Array, "6 6"]:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -130,7 +130,7 @@ KNOTS = (1.0, 2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0)
 class ThrustTable(Effect):
     """f = u + c(u), c = c_k F_k at the knots ± F_k, linear between, proportional to u beyond.
 
-    It fits what exponent, dead zone and reverse gain leave of a different curve.
+    It fits the errors of the curve that exponent, dead zone and reverse gain do not.
     """
 
     name: ClassVar[str] = "thrust_table"

@@ -1,4 +1,4 @@
-"""What the vehicle measures of itself: pure functions and their noise-free forms."""
+"""Sensors of the vehicle: pure measurement functions and their noise-free forms."""
 
 from .base import Sensor as Sensor
 from .compass import Compass as Compass

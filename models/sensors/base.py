@@ -1,4 +1,4 @@
-"""What every sensor offers to a simulation, and where it sits on the vehicle."""
+"""Interface of sensors, and their mounting on the vehicle."""
 
 import abc
 from dataclasses import dataclass
@@ -16,10 +16,10 @@ class Sensor(abc.ABC):
     """A frozen configuration whose methods are pure functions of arrays.
 
     `measure` is called every 1/`rate` seconds and returns a new state `(state_size, *batch)`: the
-    slow errors and the last readings. `reading` shows what the sensor says at a time t. So a Drake
-    system holds the state, updates it periodically and evaluates its output from it. Randomness
-    enters through `w` alone, independent unit Gaussians. Each kind also has a noise-free
-    `expected`, the measurement function of an estimator.
+    slow errors and the last readings. `reading` is the output at a time t. A Drake system holds the
+    state, updates it periodically and evaluates its output from it. Randomness enters through `w`
+    alone, independent unit Gaussians. Each kind also has a noise-free `expected`, the measurement
+    function of an estimator.
 
     Attributes:
         rate: measurements per second (Hz).
@@ -48,22 +48,22 @@ class Sensor(abc.ABC):
     @property
     @abc.abstractmethod
     def state_size(self) -> int:
-        """Components of the state."""
+        """Length of the state."""
 
     @property
     @abc.abstractmethod
     def noise_size(self) -> int:
-        """Unit Gaussians that one measurement takes."""
+        """Number of unit Gaussians that one measurement takes."""
 
     @property
     @abc.abstractmethod
     def initial_noise_size(self) -> int:
-        """Unit Gaussians that the initial state takes."""
+        """Number of unit Gaussians that the initial state takes."""
 
     @property
     @abc.abstractmethod
     def reading_size(self) -> int:
-        """Components of the reading."""
+        """Length of the reading."""
 
     @abc.abstractmethod
     def initial(self, w: Float[Array, "w *batch"]) -> Float[Array, "s *batch"]:
@@ -82,7 +82,7 @@ class Sensor(abc.ABC):
         """Take a measurement of the true motion; dV_WB_B is the rate of V_WB_B's components."""
 
     def reading(self, state: Float[Array, "s *batch"], t: Scalar) -> Float[Array, "r *batch"]:
-        """Return what the sensor says at time t; it stands at the end of the state."""
+        """Return the sensor's output at time t; it is the end of the state."""
         del t
         return state[self.state_size - self.reading_size :]
 

@@ -17,9 +17,9 @@ class Compass(Sensor):
     """A tilt-compensated compass with white noise and a slow first-order Gauss–Markov error.
 
     Reading (1): yaw (rad), counter-clockwise from W's x axis, in [−π, π). State: the slow error,
-    then the reading. Mount and position do not matter.
+    then the reading. Mount and position have no effect.
 
-    The slow error stands for steel and thruster currents nearby; 5 to 10° over 30 to 120 s are
+    The slow error models steel and thruster currents nearby; 5 to 10° over 30 to 120 s are
     estimates for a harbour's pylons, the default is for open water.
 
     Attributes:
@@ -46,7 +46,7 @@ class Compass(Sensor):
 
     @property
     def noise_size(self) -> int:
-        """White noise and the slow error's."""
+        """White noise and the slow error's noise."""
         return 2
 
     @property
@@ -76,7 +76,7 @@ class Compass(Sensor):
         t: Scalar,
         w: Float[Array, "2 *batch"],
     ) -> Float[Array, "2 *batch"]:
-        """Measure, then let the slow error wander on."""
+        """Measure, then advance the slow error."""
         del V_WB_B, dV_WB_B, t
         error = state[:1]
         yaw = wrap(self.expected(X_WB) + error + self.noise * w[:1])

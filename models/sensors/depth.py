@@ -13,10 +13,10 @@ from .base import Sensor
 
 @dataclass(frozen=True)
 class DepthSensor(Sensor):
-    """A pressure gauge that divides by a density it assumes.
+    """A pressure sensor that converts pressure to depth with an assumed density.
 
-    Reading (1): depth of the gauge, positive down (m), of the still water above it (the pressure
-    of waves is left out). The gauge sits away from Bo, so tilting the vehicle changes its depth.
+    Reading (1): depth of the sensor, positive down (m), in still water (wave pressure is
+    neglected). The sensor is mounted away from Bo, so tilting the vehicle changes its depth.
     State: the offset left by zeroing at the surface, then the reading.
 
     The noise is that of a Bar30's log at 10 Hz (2.8 to 3.0 mm).
@@ -24,9 +24,9 @@ class DepthSensor(Sensor):
     Attributes:
         noise: standard deviation of one measurement (m).
         offset_std: standard deviation of the offset, constant during a run (m).
-        water_density: of the water (kg/m³).
-        assumed_density: that the reading is computed with (kg/m³); fresh water's 1000 in sea
-            water overstates depth by 2.5 %.
+        water_density: density of the water (kg/m³).
+        assumed_density: density that the reading is computed with (kg/m³); fresh water's 1000 in
+            sea water overstates depth by 2.5 %.
     """
 
     rate: float = 10.0
@@ -64,7 +64,7 @@ class DepthSensor(Sensor):
         return 1
 
     def expected(self, X_WB: Float[Array, "7 *batch"]) -> Float[Array, "1 *batch"]:
-        """Noise-free reading: −z of the gauge times the ratio of the densities."""
+        """Noise-free reading: −z of the sensor times the ratio of the densities."""
         z = se3.act(X_WB, column(self.position, X_WB))[2:]
         return -(self.water_density / self.assumed_density) * z
 

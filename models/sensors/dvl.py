@@ -1,4 +1,4 @@
-"""Doppler velocity log: velocity over the bed, late and not always."""
+"""Doppler velocity log: velocity over the bed, with latency and drop-outs."""
 
 from dataclasses import dataclass
 
@@ -16,17 +16,17 @@ class Dvl(Sensor):
     """Velocity of the transducer over the bed, in the transducer's axes.
 
     Reading (7): velocity (m/s), 1 if valid else 0, altitude above the bed (m), figure of merit
-    (m/s), time of validity (s). A reading appears `latency` after its time of validity, so a new
-    one is known by a new time of validity. Velocity is zero while invalid: out of range of the
-    bed, too fast, or in a drop-out. Drop-outs come in bursts (Gilbert 1960: a two-state Markov
-    chain). Outliers keep the valid mark; an estimator's gate has to find them.
+    (m/s), time of validity (s). A reading appears `latency` after its time of validity; a new
+    reading has a new time of validity. Velocity is zero while invalid: bed out of range, speed too
+    high, or in a drop-out. Drop-outs come in bursts (Gilbert 1960: a two-state Markov chain).
+    Outliers are marked valid; an estimator's gate has to reject them.
 
     State: in a drop-out (0 or 1), scale error, time the newest reading appears, the newest
     reading (7) and the one before (7).
 
-    Defaults follow the A50's manual in its standard grade (1 % of v, 5 Hz, 0.1 to 0.2 s late,
-    altitude 0.05 to 50 m, 3.75 m/s) and 1 cm/s noise as public simulators take; rates of drop-outs
-    and outliers are estimates.
+    Defaults follow the manual of the A50 in its standard grade (1 % of v, 5 Hz, latency 0.1 to
+    0.2 s, altitude 0.05 to 50 m, 3.75 m/s), with 1 cm/s noise as in public simulators; rates of
+    drop-outs and outliers are estimates.
 
     Attributes:
         rpy: mount; zero gives forward, left, up axes, (π, 0, 0) forward, right, down.
@@ -34,14 +34,14 @@ class Dvl(Sensor):
         scale_std: standard deviation of the scale error, constant during a run (1).
         earliest_latency: lower end of the latency's range (s).
         latest_latency: upper end (s), at most 1/rate; the latency is uniform between the two.
-        dropout_share: share of measurements that are in drop-outs (1); at most L / (1 + L) with
-            L = dropout_length · rate, when a single measurement parts one drop-out from the next.
+        dropout_share: share of measurements in drop-outs (1); at most L / (1 + L) with
+            L = dropout_length · rate, when a single measurement separates successive drop-outs.
         dropout_length: mean length of a drop-out (s), at least 1/rate.
         outlier_share: share of the measurements that are outliers (1).
         outlier_std: standard deviation of an outlier's error (m/s).
-        lowest_altitude: bed nearer than this is not seen (m).
-        highest_altitude: bed farther than this is not seen (m).
-        highest_speed: faster motion gives no velocity (m/s).
+        lowest_altitude: least altitude with bottom lock (m).
+        highest_altitude: largest altitude with bottom lock (m).
+        highest_speed: largest speed with a valid velocity (m/s).
         water_depth: the bed lies at z = −water_depth (m).
     """
 
@@ -121,7 +121,7 @@ class Dvl(Sensor):
         return se3.act(X_WB, column(self.position, X_WB))[2:] + self.water_depth
 
     def initial(self, w: Float[Array, "2 *batch"]) -> Float[Array, "17 *batch"]:
-        """Draw the drop-out's stationary law and the scale error; no reading is valid yet."""
+        """Draw the scale error, and the drop-out's stationary law; no reading is valid yet."""
         dropped = bernoulli(w[:1], self.dropout_share).astype(w.dtype)
         rest = jnp.zeros((15, *w.shape[1:]), w.dtype)
         return jnp.concatenate([dropped, self.scale_std * w[1:], rest])
@@ -135,7 +135,7 @@ class Dvl(Sensor):
         t: Scalar,
         w: Float[Array, "9 *batch"],
     ) -> Float[Array, "17 *batch"]:
-        """Ping at time t; the newest reading moves back to make room."""
+        """Ping at time t; the newest reading becomes the one before."""
         del dV_WB_B
         dropped, scale, newest = state[:1], state[1:2], state[3:10]
         leave = 1 / (self.dropout_length * self.rate)

@@ -1,7 +1,7 @@
-"""What can go wrong between a sensor and those who read it, by name and time.
+"""Faults of a sensor's output, by name and time.
 
-A fault acts on what a sensor shows: its reading, the valid mark and the stamp. Truth, the sensor's
-own errors and its saturation come before it. `docs/sensor-faults.md` lists all of them.
+A fault acts on a sensor's output: its reading, the valid mark and the time stamp. The sensor's own
+errors and its saturation come before it. `docs/sensor-faults.md` lists all of them.
 """
 
 import math
@@ -40,25 +40,25 @@ FaultName = Literal[
 VALUES: Mapping[str, int] = {"imu": 6, "dvl": 3, "depth": 1, "compass": 1}
 """Values in a reading: specific force and angular rate, velocity, depth, yaw."""
 
-_LONGEST = 10.0  # s of latency: that many readings are kept
-_SLACK = 1e-6  # of a reading's number: times are whole periods but for rounding
+_LONGEST = 10.0  # longest latency (s); it bounds the number of stored readings
+_SLACK = 1e-6  # rounding of a reading's number: times are whole periods
 
 
 @dataclass(frozen=True)
 class SensorFault:
     """One fault: `{sensor: dvl, fault: frozen, start: 5, duration: 20, components: [0]}`.
 
-    It hits the readings measured from `start` on and before `start + duration`. Several faults of
-    one sensor act one after the other, in their order.
+    It affects the readings measured from `start` on and before `start + duration`. Several faults
+    of one sensor act one after the other, in their order.
 
     Attributes:
-        sensor: whose readings.
-        fault: what happens to them.
-        start: of the fault (s).
-        duration: of the fault (s); until the end if left out, a single reading if zero.
-        components: of the values, from 0; all if empty.
-        size: how much, in the fault's unit (`docs/sensor-faults.md`); some have none.
-        share: probability that a reading in this time is hit (1), each for itself.
+        sensor: the affected sensor.
+        fault: kind of the fault.
+        start: start of the fault (s).
+        duration: duration of the fault (s); until the end if left out, a single reading if zero.
+        components: affected components of the values, from 0; all if empty.
+        size: size in the fault's unit (`docs/sensor-faults.md`); some have none.
+        share: probability that a reading in this time is affected (1), independently of others.
     """
 
     sensor: SensorName
@@ -113,7 +113,7 @@ class SensorFault:
         require(low <= (self.size or 0.0) <= high, self, "size", f"give {kind.size}")
 
     def readings(self, rate: float) -> tuple[float, float]:
-        """Numbers of the first reading in the fault's time and of the first after it."""
+        """Number of the first affected reading, and of the first one after the fault."""
         first = math.ceil(self.start * rate - _SLACK)
         if self.duration is None:
             return float(first), math.inf
@@ -121,12 +121,12 @@ class SensorFault:
         return float(first), float(max(first + 1, end))
 
     def kept(self, rate: float) -> int:
-        """Readings that are remembered."""
+        """Number of stored readings."""
         return _KINDS[self.fault].kept(self.size or 0.0, rate)
 
     @property
     def noise_size(self) -> int:
-        """Unit Gaussians that one reading takes."""
+        """Number of unit Gaussians that one reading takes."""
         noise = VALUES[self.sensor] if self.fault == "noise" else 0
         return noise + (0 < self.share < 1)
 
@@ -138,10 +138,10 @@ class SensorFault:
         t: Float[Array, "*batch"],
         w: Float[Array, "w *batch"],
     ) -> tuple[Float[Array, "m *batch"], Float[Array, "r *batch"]]:
-        """The memory after a reading [values, valid, stamp] measured at t, and what is shown of it.
+        """The memory after a reading [values, valid, stamp] measured at t, and the faulty reading.
 
-        The memory, if there is any, is a mark that it holds something and the newest `kept`
-        readings, all zero before the first.
+        The memory, if there is any, is a flag that it is filled and the newest `kept` readings, all
+        zero before the first.
         """
         n, batch = VALUES[self.sensor], reading.shape[1:]
         first, end = self.readings(sensor.rate)
@@ -161,13 +161,13 @@ class SensorFault:
         return memory, jnp.where(hit, faulty, reading)
 
     def _remember(self, memory: Array, reading: Array, hit: Array) -> tuple[Array, Array]:
-        """The memory with this reading in it, and the readings in it, the newest first."""
+        """The memory with this reading added, and its readings, the newest first."""
         if not len(memory):
             return memory, reading[:0]
         n, batch = VALUES[self.sensor], reading.shape[1:]
         old = memory[1:].reshape(-1, n + 2, *batch)
         new = jnp.where(memory[0] > 0, jnp.concatenate([reading[None], old[:-1]]), reading[None])
-        # What is late are all readings; what stays frozen is the last good one.
+        # Latency delays all readings; a frozen sensor repeats the last good one.
         good = (~hit & (reading[n] > 0)) | (old[0, n] <= 0)
         ring = new if self.fault == "latency" else jnp.where(good, new, old)
         return jnp.concatenate([jnp.ones_like(memory[:1]), ring.reshape(-1, *batch)]), ring
@@ -178,8 +178,8 @@ class FaultySensor:
     """The faults of one sensor as one function of its readings.
 
     Attributes:
-        sensor: as it is without them.
-        faults: in the order in which they act, all of this sensor.
+        sensor: the sensor without faults.
+        faults: faults of this sensor, in the order in which they act.
     """
 
     sensor: Sensor
@@ -187,7 +187,7 @@ class FaultySensor:
 
     @property
     def memory_size(self) -> int:
-        """Numbers that the faults remember; all zero before the first reading."""
+        """Length of the faults' memory; all zero before the first reading."""
         return sum(self._memory_sizes)
 
     @property
@@ -198,7 +198,7 @@ class FaultySensor:
 
     @property
     def noise_size(self) -> int:
-        """Unit Gaussians that one reading takes."""
+        """Number of unit Gaussians that one reading takes."""
         return sum(fault.noise_size for fault in self.faults)
 
     def show(
@@ -208,7 +208,7 @@ class FaultySensor:
         t: Float[Array, "*batch"],
         w: Float[Array, "w *batch"],
     ) -> tuple[Float[Array, "m *batch"], Float[Array, "r *batch"]]:
-        """As `SensorFault.show`, of all faults."""
+        """As `SensorFault.show`, for all faults."""
         kept, shown = [], reading
         places = pairwise(np.cumsum([0, *self._memory_sizes]))
         noises = pairwise(np.cumsum([0, *(fault.noise_size for fault in self.faults)]))
@@ -218,23 +218,23 @@ class FaultySensor:
         return jnp.concatenate(kept), shown
 
 
-# --------------------------------------------------------------------------------- what they do
+# ------------------------------------------------------------------------------------- the kinds
 
 
 class _Look(NamedTuple):
-    """All that a fault may look at."""
+    """Inputs of a fault."""
 
     fault: SensorFault
     sensor: Sensor
     reading: Float[Array, "r *batch"]
     """[values, valid, stamp]."""
     ring: Float[Array, "k r *batch"]
-    """What is remembered, the newest first."""
+    """Stored readings, the newest first."""
     elapsed: Float[Array, "*batch"]
-    """Since the start (s)."""
+    """Time since the fault's start (s)."""
     w: Float[Array, "w *batch"]
     whole: bool
-    """Whether all values are concerned."""
+    """Whether all values are affected."""
 
     @property
     def size(self) -> float:
@@ -250,7 +250,7 @@ _Parts = tuple[Array, Array, Array]
 
 
 def _valued(change: Callable[[Array, _Look], Array]) -> Callable[[_Look], _Parts]:
-    """What changes the values alone."""
+    """A fault that changes the values alone."""
 
     def act(look: _Look) -> _Parts:
         values, valid, stamp = look.parts
@@ -265,7 +265,7 @@ def _constant(look: _Look) -> _Parts:
 
 
 def _noisy(values: Array, look: _Look) -> Array:
-    """White noise that comes to the sensor's own, so that both together are `size` times it."""
+    """Additional white noise: together with the sensor's own its std is `size` times that."""
     std = column(_noise_std(look.sensor), values) * math.sqrt(look.size**2 - 1)
     return values + std * look.w[: len(values)]
 
@@ -282,7 +282,7 @@ def _dropout(look: _Look) -> _Parts:
 
 
 def _late(look: _Look) -> _Parts:
-    """Linear between the two readings about the time that was `size` ago."""
+    """Linear interpolation between the two readings around the time `size` (s) ago."""
     _, valid, stamp = look.parts
     whole, part = _periods(look.size, look.sensor.rate)
     older = look.ring[whole]
@@ -305,7 +305,7 @@ def _stamp_offset(look: _Look) -> _Parts:
 
 
 def _periods(time: float, rate: float) -> tuple[int, float]:
-    """A time in whole periods and what is left of it, nothing if that is rounding."""
+    """A time in whole periods, and the remaining fraction (zero if it is rounding)."""
     whole = math.floor(time * rate + _SLACK)
     part = time * rate - whole
     return whole, part if part > _SLACK else 0.0
@@ -326,22 +326,22 @@ def _noise_std(sensor: Sensor) -> tuple[float, ...]:
 
 
 def _in_range(yaw: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """An angle brought to [−π, π); one that is there, or not finite, keeps its bits."""
+    """An angle wrapped to [−π, π); one in the range, or not finite, is returned unchanged."""
     outside: Bool[Array, "*shape"] = jnp.isfinite(yaw) & ((yaw < -math.pi) | (yaw >= math.pi))
     return jnp.where(outside, wrap(yaw), yaw)
 
 
 class _Kind(NamedTuple):
-    """What makes a fault."""
+    """Definition of a kind of fault."""
 
     act: Callable[[_Look], _Parts]
     size: str | None = None
-    """In words, for a remedy."""
+    """Description of the size, for error messages."""
     limits: tuple[float, float] = (-math.inf, math.inf)
     marks: bool = False
-    """Whether it concerns valid mark or stamp."""
+    """Whether it affects the valid mark or the stamp."""
     kept: Callable[[float, float], int] = lambda size, rate: 0
-    """Readings that it remembers, for its size and the sensor's rate."""
+    """Number of readings that it stores, given its size and the sensor's rate."""
 
 
 _UNIT = "in the unit of the values (m/s² and rad/s, m/s, m, rad)"

@@ -16,22 +16,22 @@ _DEGREE = math.pi / 180
 
 @dataclass(frozen=True)
 class Imu(Sensor):
-    """Accelerometers and gyroscopes with white noise, wandering biases and saturation.
+    """Accelerometers and gyroscopes with white noise, bias random walk and saturation.
 
     Reading: specific force (m/s²), then angular rate (rad/s), in the sensor's axes. A strapdown
-    unit integrates at some kHz between the samples that it gives out (Savage 1998, eq. 1 and 2), so
-    with `integrating` a reading is the mean since the reading before: the rate whose exponential
-    is the turn, the specific force whose integral is the change of velocity, in the axes at the
-    interval's end. Without it the rate is that of the sampling time and the force the one that
-    belongs to the given rate of change of the twist: what happens between samples is not seen.
+    unit integrates at some kHz between its output samples (Savage 1998, eq. 1 and 2), so with
+    `integrating` a reading is the mean since the previous reading: the rate whose exponential is
+    the rotation, and the specific force whose integral is the change of velocity, in the axes at
+    the interval's end. Otherwise it is the instantaneous rate, and the specific force for the given
+    derivative of the twist: motion between samples is not measured.
 
-    White noise of one measurement has the deviation density · √(rate / 2), the biases walk by
+    White noise of one measurement has the deviation density · √(rate / 2); the biases change by
     walk · √(1 / rate). State: six biases in the reading's order, attitude (4) and velocity in W (3)
-    of the sensor at the measurement before, 1 once there was one, then the reading.
+    of the sensor at the previous measurement, 1 once there was one, then the reading.
 
     Defaults are those of the ICM-20602 on a Navigator board (data sheet: 100 µg/√Hz, 4 mdps/√Hz;
-    bench logs agree within a factor of two); the initial biases are what is left after a
-    calibration at rest, an estimate.
+    bench logs agree within a factor of two); the initial biases are an estimate of the residual
+    after a calibration at rest.
 
     Attributes:
         accelerometer_density: noise density (m/s²/√Hz).
@@ -43,7 +43,7 @@ class Imu(Sensor):
         accelerometer_range: readings saturate at ± this (m/s²).
         gyroscope_range: readings saturate at ± this (rad/s).
         gravity: (m/s²).
-        integrating: whether a reading is the mean since the one before.
+        integrating: whether a reading is the mean since the previous one.
     """
 
     rate: float = 100.0
@@ -72,7 +72,7 @@ class Imu(Sensor):
 
     @property
     def noise_size(self) -> int:
-        """White noise and the walk of the biases."""
+        """White noise and the random walk of the biases."""
         return 12
 
     @property
@@ -139,12 +139,12 @@ class Imu(Sensor):
         t: Scalar,
         w: Float[Array, "12 *batch"],
     ) -> Float[Array, "20 *batch"]:
-        """Measure, then let the biases walk on."""
+        """Measure, then advance the biases."""
         del t
         bias, before, started = state[:6], state[6:13], state[13:14]
         true = self.expected(X_WB, V_WB_B, dV_WB_B)
         if self.integrating:
-            # a quaternion of zeros is no attitude: before the first measurement any will do
+            # before the first measurement the stored quaternion is zero, which is no attitude
             before = jnp.where(started > 0, before, self._carried(X_WB, V_WB_B))
             true = jnp.where(started > 0, self.mean(before, X_WB, V_WB_B), true)
         z = true + bias + _six(*self.noise_std(), state) * w[:6]

@@ -1,1 +1,1 @@
-"""Typed YAML and the checks that configurations make of themselves."""
+"""Typed YAML and checks of configurations."""

@@ -1,4 +1,4 @@
-"""Checks that configuration dataclasses make of themselves when they are constructed."""
+"""Checks of configuration dataclasses at construction."""
 
 import dataclasses
 import sys
@@ -15,9 +15,9 @@ Vector6 = tuple[float, float, float, float, float, float]
 
 @dataclass(frozen=True)
 class Within:
-    """The range of an option's numbers, ends included; without `low` itself if `above`.
+    """The range of an option's numbers, ends included; `low` is excluded if `above`.
 
-    It stands in the annotation of the field: `rate: Annotated[float, Within(1, 400)] = 20.0`.
+    It is part of the field's annotation: `rate: Annotated[float, Within(1, 400)] = 20.0`.
     """
 
     low: float | int
@@ -29,7 +29,7 @@ class Within:
         return (self.low < value if self.above else self.low <= value) and value <= self.high
 
     def __str__(self) -> str:
-        """What to give."""
+        """The range in words, for a remedy."""
         if self.above:
             return f"above {self.low:g}, at most {self.high:.10g}"
         return f"from {self.low:g} to {self.high:.10g}"
@@ -42,7 +42,7 @@ RATE_OF_ALARMS = Within(0.0, 0.499, above=True)
 SECONDS = Within(0.0, 86400.0, above=True)
 WATER_DENSITY = Within(900.0, 1100.0)
 LARGEST = 1e12
-"""No quantity of a vehicle or its water comes near; what is computed of it stays finite."""
+"""Far above any quantity of a vehicle or its water; results computed from it stay finite."""
 
 
 def require(condition: bool, config: Any, field: str, remedy: str) -> None:
@@ -53,13 +53,13 @@ def require(condition: bool, config: Any, field: str, remedy: str) -> None:
 
 
 def require_rate(value: float, named: str) -> None:
-    """Raise `UserError`, by the name that a user knows, unless it is a rate of false alarms."""
+    """Raise `UserError` with the option's name unless `value` is a false alarm rate in (0, 0.5)."""
     if not 0 < value < 0.5:
         raise UserError(f"{named} {value:g}: give a rate above 0 and below 0.5")
 
 
 def check_numbers(config: Any) -> None:
-    """Check the numbers of a dataclass: finite, within what their annotations state, and in number.
+    """Check the numbers of a dataclass: finite, within their annotated ranges, right in count.
 
     Raises:
         UserError: naming kind, field, value and remedy.
@@ -87,7 +87,7 @@ def check_numbers(config: Any) -> None:
 
 
 def require_double(who: str, before: str) -> None:
-    """Refuse to go on in single precision: `who` needs more, `before` what it must be set.
+    """Refuse single precision: `who` needs double, to be enabled before `before`.
 
     Raises:
         ValueError: if JAX runs in single precision.
@@ -100,7 +100,7 @@ def require_double(who: str, before: str) -> None:
 
 
 def range_of(hint: Any) -> Within | None:
-    """The range that stands in an annotation, at any depth."""
+    """The range in an annotation, at any depth."""
     if get_origin(hint) is Annotated:
         found = next((part for part in hint.__metadata__ if isinstance(part, Within)), None)
         return found or range_of(get_args(hint)[0])

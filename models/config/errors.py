@@ -1,4 +1,4 @@
-"""The one exception that means: the input is at fault and this sentence says how to mend it."""
+"""The exception for bad input; its message names the fault and the remedy."""
 
 
 class UserError(ValueError):

@@ -1,18 +1,18 @@
 """Typed YAML: the one loader for vehicles, training settings, scenarios and data folders.
 
 A configuration is a dataclass: its annotations are the schema, its defaults the defaults.
-Understood are dataclasses within one another, bool, int, float, str, Path, Literal, Optional, list,
-tuple, dict, NumPy arrays (`Float[np.ndarray, "3"]` also checks the shape), unions, and Any for what
-YAML itself knows: numbers, text, lists and mappings. Where one of
-several dataclasses may stand, the file names it by a tag, as Drake's typed YAML does:
+Supported are nested dataclasses, bool, int, float, str, Path, Literal, Optional, list, tuple, dict,
+NumPy arrays (`Float[np.ndarray, "3"]` also checks the shape), unions, and Any for YAML's own types:
+numbers, text, lists and mappings. In a union of dataclasses the file names the class by a tag, as
+in Drake's typed YAML:
 
     disturbances:
       - !OrnsteinUhlenbeckWrench {time_constant: 3.0}
 
 Unknown, missing and duplicate keys are refused, every float must be finite and no larger than
-`checks.LARGEST`, and an int may stand for a float but not the reverse. What one field's type can't
-express belongs in the dataclass' `__post_init__` as a ValueError; the loader adds file, line and
-field to its message.
+`checks.LARGEST`, and an int is accepted for a float but not the reverse. Conditions that a field's
+type can't express are checked in the dataclass' `__post_init__`, which raises a ValueError; the
+loader adds file, line and field to its message.
 """
 
 import dataclasses
@@ -46,17 +46,17 @@ from .yaml_text import Tagged, emit, line_of, parse
 
 T = TypeVar("T")
 _LARGEST_INT = 2**53
-"""Whole numbers up to here are the same in floating point."""
+"""Integers up to this one are exact in floating point."""
 _SHOWN = 60
-"""Characters of what was found that a sentence shows."""
+"""Number of characters of a found value that a message shows."""
 FieldPath = tuple[str | int, ...]
 
 
 def load(cls: type[T], path: str | PathLike[str], base: T | None = None) -> T:
-    """Read a `cls` from a YAML file; what it leaves out is as in `base`, or as the class has it.
+    """Read a `cls` from a YAML file; missing fields are taken from `base`, or are the defaults.
 
     Raises:
-        UserError: the file can't be read, or its text is no `cls` (see `loads`).
+        UserError: the file can't be read, or its text is not a `cls` (see `loads`).
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
@@ -68,13 +68,13 @@ def load(cls: type[T], path: str | PathLike[str], base: T | None = None) -> T:
 
 
 def loads(cls: type[T], text: str, source: str = "text", base: T | None = None) -> T:
-    """Read a `cls` from YAML text; `source` is how messages call the text.
+    """Read a `cls` from YAML text; `source` names the text in messages.
 
-    Mappings are laid over those of `base` key by key, also where only `base` has a tag; lists and
+    Mappings are merged into those of `base` key by key, also where only `base` has a tag; lists and
     values of another tag replace it.
 
     Raises:
-        UserError: one line a fault, each `source:line: field: what was found; what to write`.
+        UserError: one line per fault, each `source:line: field: what was found; what to write`.
     """
     data, node = parse(text, source)
     if data is None:
@@ -87,10 +87,10 @@ def loads(cls: type[T], text: str, source: str = "text", base: T | None = None) 
 
 
 def structured(cls: type[T], data: Any, source: str, node: Any = None) -> T:
-    """Make a `cls` of plain values; `node` is the tree of the text they come from, for its lines.
+    """Make a `cls` from plain values; `node` is the node tree of their text, for line numbers.
 
     Raises:
-        UserError: as of `loads`.
+        UserError: as in `loads`.
     """
     try:
         return _CONVERTER.structure(data, cls)
@@ -114,7 +114,7 @@ def _overlaid(base: Any, data: Any) -> Any:
 
 
 def dump(obj: Any) -> str:
-    """YAML text of a configuration, defaults written out; `loads(type(obj), …)` returns its equal.
+    """YAML text of a configuration including defaults; `loads(type(obj), …)` returns an equal one.
 
     Raises:
         ValueError: a float is not finite.
@@ -147,7 +147,7 @@ def _show(value: Any) -> str:
 
 
 def _short(text: str) -> str:
-    """As much of a text as a sentence bears."""
+    """The text, shortened to what a message shows."""
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
@@ -370,11 +370,11 @@ def _converter() -> Converter:
 _CONVERTER = _converter()
 
 
-# ------------------------------------------------------------------------------- faults in words
+# -------------------------------------------------------------------------------- error messages
 
 
 def _faults(error: BaseException, path: FieldPath, cls: Any) -> list[tuple[FieldPath, str]]:
-    """Every leaf of the exception tree as (path of the field, sentence)."""
+    """Every leaf of the exception tree as (path of the field, message)."""
     names = [
         note.name if isinstance(note, AttributeValidationNote) else note.index
         for note in getattr(error, "__notes__", ())
@@ -404,7 +404,7 @@ def _needed(cls: Any) -> list[str]:
 
 
 def _wanted(cls: Any) -> str:
-    """What stands for a value of a type, in words."""
+    """Description of the values of a type, for messages."""
     plain = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
     if cls in plain:
         return plain[cls]

@@ -1,7 +1,7 @@
-"""YAML text to plain Python values and back, by the core schema of YAML 1.2 and with `!Tags` kept.
+"""YAML text to plain Python values and back, with the core schema of YAML 1.2 and `!Tags` kept.
 
-PyYAML reads words by YAML 1.1, where `no` is false, `1e-3` is text, `1:30` is 90 and `010` is 8.
-Here (YAML 1.2.2, 2021, ch. 10.3.2) they are text, 0.001, text and 10. Duplicate keys are errors.
+PyYAML follows YAML 1.1, where `no` is false, `1e-3` is text, `1:30` is 90 and `010` is 8. Here
+(YAML 1.2.2, 2021, ch. 10.3.2) they are text, 0.001, text and 10. Duplicate keys are errors.
 """
 
 import math
@@ -30,12 +30,12 @@ _CORE = (
 
 
 _DIGITS = 4000
-"""Many more than the largest number in double precision has, and as many as Python reads."""
+"""Largest number of digits: more than any double needs, within Python's own limit."""
 
 
 @dataclass(frozen=True)
 class Tagged:
-    """A value with a local tag: `!Kind {…}`; a tag that stands alone has the value {}."""
+    """A value with a local tag: `!Kind {…}`; a tag without a value has the value {}."""
 
     tag: str
     value: Any
@@ -79,7 +79,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes a string that either YAML 1.1 or 1.2 would take for something else."""
+    """Quotes a string that either YAML 1.1 or 1.2 would read as another type."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -95,7 +95,7 @@ class _Dumper(yaml.SafeDumper):
         return self.represent_float(value)
 
 
-_Loader.yaml_implicit_resolvers = {}  # none of YAML 1.1
+_Loader.yaml_implicit_resolvers = {}  # drop those of YAML 1.1
 for _name, _pattern, _first in _CORE:
     for _cls in (_Loader, _Dumper):
         _cls.add_implicit_resolver(
@@ -111,8 +111,8 @@ def parse(text: str, source: str) -> tuple[Any, yaml.Node | None]:
     """Plain value of one YAML document and its node tree (for line numbers).
 
     Raises:
-        UserError: the text is not YAML, has duplicate keys or more than one document; `source`
-            and the line are named.
+        UserError: the text is not YAML, has duplicate keys or more than one document; the message
+            names `source` and the line.
     """
     try:
         loader = _Loader(text)
@@ -130,7 +130,7 @@ def parse(text: str, source: str) -> tuple[Any, yaml.Node | None]:
 
 
 def line_of(node: yaml.Node | None, path: tuple[str | int, ...]) -> int | None:
-    """Line (from 1) of the deepest part of `path` that stands in the text."""
+    """Line (from 1) of the deepest part of `path` that is in the text."""
     if node is None:
         return None
     line = node.start_mark.line + 1

@@ -1,1 +1,1 @@
-"""Files on disk: whole or absent, owned, locked, checked."""
+"""Files on disk: atomic writes, ownership, locks, checks."""

@@ -1,4 +1,4 @@
-"""Archives of arrays with a JSON header, read without trust in a byte of them."""
+"""Archives of arrays with a JSON header, read as untrusted input."""
 
 import json
 import zipfile
@@ -11,17 +11,17 @@ import numpy as np
 from ..config.errors import UserError
 
 _DENSEST = 2000
-"""Bytes of arrays from one of a file, at most: deflate makes up to 1032 of one."""
+"""Largest ratio of array bytes to file bytes; deflate compresses by at most 1032."""
 _SMALL = 1 << 24
 
 
 def read_archive(path: str | PathLike[str], called: str) -> tuple[dict[str, Any], list[np.ndarray]]:
     """The header, and `array_0000`, `array_0001`, … of an archive that `np.savez` wrote.
 
-    `called` is what the file should be, for messages.
+    `called` is the expected kind of file, for messages.
 
     Raises:
-        UserError: the file is missing, or is no whole archive of this kind.
+        UserError: the file is missing, or is not a complete archive of this kind.
     """
     path = Path(path)
     try:
@@ -48,7 +48,7 @@ def read_archive(path: str | PathLike[str], called: str) -> tuple[dict[str, Any]
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """One array of plain numbers, as large as its file in the archive says."""
+    """One array of plain numbers, whose size must match its file in the archive."""
     form = np.lib.format
     with archive.open(name) as file:
         version = form.read_magic(file)

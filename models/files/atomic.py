@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic writing of files and folders."""
 
 import errno
 import os
@@ -14,12 +14,12 @@ from ..config.errors import UserError
 
 _PARTIAL = ".partial-"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
-"""What the operating system says of a disk that takes no more, rather than of a mistake."""
+"""Error numbers of a full, failing or read-only disk."""
 
 
 @contextmanager
 def disk_errors_told(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn what a full or failing disk raises while `path` is written into one sentence.
+    """Turn the error of a full or failing disk while `path` is written into a `UserError`.
 
     Raises:
         UserError: the block raised an `OSError` of `DISK_ERRORS`.
@@ -38,16 +38,15 @@ def disk_errors_told(path: str | os.PathLike[str]) -> Iterator[None]:
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary sibling of `path`, of its suffix, that replaces it when the block ends.
+    """Yield a temporary sibling of `path` with its suffix that replaces it when the block ends.
 
-    The parent folder is made if missing; a link is followed, and the file it names is replaced.
-    On an error or an interrupt nothing is left of the temporary file, and whatever stood at
-    `path` before stays as it was. A killed process may leave a `.partial-*` file beside it.
+    The parent folder is made if missing; a link is followed, and its target is replaced. On an
+    error or an interrupt the temporary file is removed and an existing file at `path` is unchanged.
+    A killed process may leave a `.partial-*` file in the folder.
 
     Raises:
-        UserError: `path` is a folder or a device, a file stands where its folder should be, or
-            the disk is full.
-        FileNotFoundError: the block ended without writing the file that it was given.
+        UserError: `path` is a folder or a device, its parent is a file, or the disk is full.
+        FileNotFoundError: the block ended without writing the temporary file.
     """
     final = Path(os.path.realpath(path))
     if final.exists() and not final.is_file():
@@ -70,18 +69,18 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
             with partial.open("rb") as handle:
                 os.fsync(handle.fileno())
             os.replace(partial, final)
-        finally:  # some writers add a suffix of their own or make a folder
+        finally:  # some writers add their own suffix or make a folder
             for litter in final.parent.glob(f"{prefix}*"):
                 remove(litter)
 
 
 def partial_name() -> str:
-    """How the name of a file or folder begins that is being written, different each time."""
+    """A new name prefix for a temporary file or folder."""
     return f"{_PARTIAL}{secrets.token_hex(8)}"
 
 
 def remove(path: Path) -> None:
-    """Remove a file, a link or a folder with all in it."""
+    """Remove a file, a link or a folder with its content."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -91,11 +90,11 @@ def remove(path: Path) -> None:
 def check_writable(path: str | os.PathLike[str], called: str = "") -> None:
     """Refuse a file or folder that can't be made or replaced, before anything is computed for it.
 
-    A folder is made and removed again where the nearest folder of `path` is; `called` is what the
-    sentence begins with, such as an option's name.
+    A trial folder is made and removed in the nearest existing parent of `path`; `called` begins the
+    message, such as an option's name.
 
     Raises:
-        UserError: a file stands where a folder should be, or nothing can be written there.
+        UserError: a parent of `path` is a file, or nothing can be written there.
     """
     about = f"{called} {path}".strip()
     at = Path(os.path.realpath(path))
@@ -117,10 +116,10 @@ def check_writable(path: str | os.PathLike[str], called: str = "") -> None:
 
 @contextmanager
 def made_folder(folder: Path, about: str) -> Iterator[None]:
-    """Make a folder and those above it; those that are still empty when the block ends go again.
+    """Make a folder and its parents; new ones that are still empty at the block's end are removed.
 
     Raises:
-        UserError: it can't be made.
+        UserError: a folder can't be made.
     """
     missing = []
     while not folder.exists():
@@ -133,7 +132,7 @@ def made_folder(folder: Path, about: str) -> Iterator[None]:
                 one.mkdir()
                 made.append(one)
             except FileExistsError:
-                continue  # another process was as fast
+                continue  # another process made it in the meantime
             except OSError as error:
                 raise UserError(f"{about}: can't make this folder ({error.strerror})") from error
         yield
@@ -144,20 +143,19 @@ def made_folder(folder: Path, about: str) -> Iterator[None]:
             except FileNotFoundError:
                 continue
             except OSError:
-                break  # something is in it
+                break  # not empty
 
 
 @contextmanager
 def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary folder whose files take their places in `folder` when the block ends.
+    """Yield a temporary folder whose files are moved into `folder` when the block ends.
 
-    Each file replaces its namesake, all without a pause and with Ctrl-C held back until they have;
-    other files stay. On an error or an interrupt before that nothing is left of the temporary
-    folder, and `folder` is as it was.
+    Each file replaces one of the same name, in one go with Ctrl-C deferred; other files stay. On an
+    error or an interrupt before that the temporary folder is removed and `folder` is unchanged.
 
     Raises:
-        UserError: the folder can't be made, the disk is full, or what stands in the folder isn't
-            what is to be replaced.
+        UserError: the folder can't be made, the disk is full, or a path to be replaced is not a
+            regular file.
     """
     final = Path(os.path.realpath(folder))
     partial = final / partial_name()
@@ -188,9 +186,9 @@ def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Let Ctrl-C wait until the block ends; it reaches the main thread alone.
+    """Defer Ctrl-C until the block ends, in the main thread.
 
-    Where the caller has Ctrl-C ignored, as shells do for what runs in the background, it stays so.
+    If the caller ignores Ctrl-C, as shells do for background jobs, it stays ignored.
     """
     before = signal.getsignal(signal.SIGINT)
     main = threading.current_thread() is threading.main_thread()

@@ -1,7 +1,7 @@
 """Models in one file: a JSON header and the arrays in an npz archive, without pickle.
 
-The header names format, version, kind of `Dynamics`, its configuration and free metadata; a kind is
-loadable if it is registered here (`register`), so that reading a file never runs what it says.
+The header names format, version, kind of `Dynamics`, its configuration and free metadata. Only
+registered kinds (`register`) can be loaded, so that reading a file never runs code from it.
 """
 
 import dataclasses
@@ -32,11 +32,11 @@ FORMAT = "spinndrift model"
 VERSION = 1
 _MOST_THRUSTERS = 64
 _LARGEST = 1e6
-"""Of an effect's options, which are counts, times, lengths and numbers of terms."""
+"""Upper bound of an effect's options, which are counts, times, lengths and numbers of terms."""
 
 
 class Kind(NamedTuple):
-    """How one class of `Dynamics` is described in JSON and made again, its numbers left open."""
+    """JSON description of the structure of one class of `Dynamics`, and its reconstruction."""
 
     cls: type[Dynamics]
     describe: Callable[[Any], dict[str, Any]]
@@ -57,7 +57,7 @@ def register(
 
 
 def describe(dynamics: Dynamics) -> dict[str, Any]:
-    """The structure of a model: its kind and configuration (for kinds that wrap another model too).
+    """The structure of a model: its kind and configuration (also for kinds that wrap a model).
 
     Raises:
         ValueError: the class is not registered.
@@ -69,10 +69,10 @@ def describe(dynamics: Dynamics) -> dict[str, Any]:
 
 
 def template(description: Any) -> Dynamics:
-    """A model of the structure that `describe` told, with arbitrary numbers.
+    """A model of the structure that `describe` returned, with arbitrary numbers.
 
     Raises:
-        UserError: it is no mapping, the kind is unknown, or there is no configuration.
+        UserError: it is not a mapping, the kind is unknown, or there is no configuration.
         ValueError: the configuration is wrong (LookupError and TypeError likewise).
     """
     if not isinstance(description, dict):
@@ -88,7 +88,7 @@ def template(description: Any) -> Dynamics:
 def save_model(
     path: str | PathLike[str], dynamics: Dynamics, metadata: dict[str, Any] | None = None
 ) -> None:
-    """Write a model and JSON-like metadata; the file appears whole or not at all.
+    """Write a model and JSON-like metadata atomically.
 
     Raises:
         ValueError: the class is not registered, or the metadata is not JSON.
@@ -117,8 +117,8 @@ def load_model(
     """Read a model and its metadata; `dtype` converts its numbers, None keeps them as stored.
 
     Raises:
-        UserError: the file is missing, foreign, cut short, damaged or of a later version, or holds
-            float64 while JAX runs in float32 and no `dtype` is given.
+        UserError: the file is missing, of another kind, truncated, damaged or of a later version,
+            or holds float64 while JAX runs in float32 and no `dtype` is given.
     """
     header, leaves = _read(path)
     try:
@@ -204,7 +204,7 @@ def _describe_extended(model: Extended) -> dict[str, Any]:
 
 
 def _neutral(name: str, options: dict[str, Any]) -> Effect:
-    """An effect of that name, its options of the types of their defaults."""
+    """An effect by name; its options must have the types of their defaults."""
     cls = kind(name)
     usual = {field.name: field.default for field in dataclasses.fields(cls)}
     if not isinstance(options, dict):

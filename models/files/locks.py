@@ -1,4 +1,4 @@
-"""Locks between processes that go with the process that took them, killed or not."""
+"""Locks between processes, released when the process ends, even if it is killed."""
 
 import errno
 import fcntl
@@ -16,7 +16,7 @@ _log = logging.getLogger(__name__)
 
 
 class BusyError(UserError):
-    """Another process has a lock."""
+    """Another process holds the lock."""
 
 
 @contextmanager
@@ -24,22 +24,22 @@ def locked(path: Path, called: str | None) -> Iterator[None]:
     """Hold the lock of the file `path`, which is made if missing and removed when the block ends.
 
     The operating system keeps the lock (flock; on NFS with its server, so between machines too)
-    and gives it back when the process ends, so a file that a killed process left holds nobody up.
-    On a file system without locks the block runs without, and a warning says so.
+    and releases it when the process ends, so a file left by a killed process does not block.
+    On a file system without locks the block runs without one, and a warning is logged.
 
     Args:
-        path: a file that holds nothing, in a folder that exists.
-        called: what the sentence begins with if another process has the lock; None waits for it.
+        path: an empty lock file, in an existing folder.
+        called: beginning of the message if another process holds the lock; None waits for it.
 
     Raises:
-        BusyError: another process has the lock.
+        BusyError: another process holds the lock.
     """
     handle = _open(path, called)
     try:
         yield
     finally:
         with suppress(OSError):
-            path.unlink()  # while it is held: whoever opened it before finds that it is gone
+            path.unlink()  # while it is held: a process that opened it before finds it removed
         os.close(handle)
 
 

@@ -1,4 +1,4 @@
-"""NetCDF-4 files: whole or not at all, and damage told."""
+"""NetCDF-4 files: atomic writing, and detection of damage."""
 
 import io
 import mmap
@@ -18,10 +18,10 @@ from ..config.errors import UserError
 from .atomic import atomic_path
 
 _DENSEST = 2000
-"""Bytes of data from one of a file, at most: deflate makes up to 1032 of one."""
+"""Largest ratio of data bytes to file bytes; deflate compresses by at most 1032."""
 _SMALL = 1 << 24
 _HEAP = b"GCOL\x01\0\0\0"
-"""How a global heap of HDF5 begins."""
+"""Signature of a global heap of HDF5."""
 _HEADER = 16
 """Bytes of the header of a global heap, and of each object in it."""
 
@@ -33,8 +33,8 @@ def save_netcdf(
 ) -> None:
     """Write a dataset as NetCDF-4, with checksums over data and structure.
 
-    It is made in memory first: HDF5 that can't write to its file ends the process. The structures
-    of HDF5 1.10 have checksums, without which HDF5 may read a damaged file for ever.
+    It is made in memory first, as HDF5 ends the process if it can't write to its file. The
+    structures of HDF5 1.10 have checksums, without which reading a damaged file may not terminate.
 
     Raises:
         UserError: the file can't be written.
@@ -55,13 +55,13 @@ def load_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:
     """Read a dataset into memory.
 
     Raises:
-        UserError: the file is missing, no NetCDF-4, damaged, or promises more than fits into it.
+        UserError: the file is missing, not NetCDF-4, damaged, or declares more than it can hold.
     """
     path = Path(path)
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a recording (.nc)")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of xarray, about attributes that it can't decode
+        warnings.simplefilter("ignore")  # xarray warns of attributes that it can't decode
         try:
             _check_heaps(path)
             with h5py.File(path, "r") as raw:
@@ -82,15 +82,15 @@ def load_netcdf(path: str | os.PathLike[str]) -> xr.Dataset:
 
 
 def _check_heaps(path: Path) -> None:
-    """Refuse a file in whose global heaps a step from one object to the next leads nowhere.
+    """Refuse a file whose global heaps have objects of invalid size.
 
-    They hold text and the links between dimensions, and no checksums: HDF5 would walk on the spot
-    for ever. Layout: HDF5 file format specification 3.0, section III.E.
+    Global heaps hold text and the links between dimensions, and have no checksums: an object of
+    size zero makes HDF5 loop endlessly. Layout: HDF5 file format specification 3.0, section III.E.
 
     Raises:
         UserError: a heap is damaged.
     """
-    if path.stat().st_size == 0:  # nothing that could be mapped
+    if path.stat().st_size == 0:  # an empty file can't be mapped
         return
     with path.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as data:
         begin = data.find(_HEAP)
@@ -101,16 +101,16 @@ def _check_heaps(path: Path) -> None:
 
 
 def _walks(data: mmap.mmap, begin: int) -> bool:
-    """Whether the objects of the heap at `begin` follow each other to its end."""
+    """Whether the objects of the heap at `begin` are contiguous up to its end."""
     if begin + _HEADER > len(data):
         return False
     at = begin + _HEADER
     end = begin + struct.unpack_from("<Q", data, begin + 8)[0]
     if not at <= end <= len(data):
         return False
-    while end - at >= _HEADER:  # less is left over
+    while end - at >= _HEADER:  # a shorter rest is unused
         index, size = struct.unpack_from("<H6xQ", data, at)
-        step = size if index == 0 else _HEADER + (size + 7) // 8 * 8  # 0 is what is free
+        step = size if index == 0 else _HEADER + (size + 7) // 8 * 8  # index 0 is free space
         if not _HEADER <= step <= end - at:
             return False
         at += step
@@ -118,7 +118,7 @@ def _walks(data: mmap.mmap, begin: int) -> bool:
 
 
 def _promised(file: h5py.File) -> int:
-    """Bytes of all datasets, as they would lie in memory."""
+    """Size of all datasets in memory (bytes), as the file declares it."""
     sizes = [0]
 
     def add(name: str, item: Any) -> None:
@@ -130,6 +130,6 @@ def _promised(file: h5py.File) -> int:
 
 
 def _first_line(error: Exception) -> str:
-    """What a foreign parser says, as far as it is one short sentence for anyone."""
+    """The first line of a library's error message, if it is short and readable."""
     text = str(error).strip().split("\n")[0]
     return text if isinstance(error, OSError) and 0 < len(text) < 200 else "its structure is broken"

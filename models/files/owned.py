@@ -1,8 +1,8 @@
-"""What commands write: marked as this package's, held by one process, nothing foreign lost.
+"""Ownership of output: marked as this package's, locked by one process, other files are kept.
 
 Every folder that a command writes has a marker, `spinndrift.json`, with its kind, the version that
-wrote it and the files in it; a folder without one that is not empty is left alone, and so is a file
-that the marker doesn't know or that was changed since. docs/files.md tells it to users.
+wrote it and its files. A non-empty folder without a marker is not touched, nor is a file that is
+not in the marker or that was changed since. docs/files.md is the user's page.
 """
 
 import hashlib
@@ -28,18 +28,18 @@ _SHOWN = 3  # names in a sentence
 
 
 class ForeignError(UserError):
-    """Something that this package did not write is in the way."""
+    """The output path holds something that this package did not write."""
 
 
 @dataclass(frozen=True)
 class FolderKind:
-    """A kind of folder, and what belongs into it.
+    """A kind of folder, and its files.
 
     Attributes:
-        name: of the kind, in the marker and in sentences.
-        files: paths of all files that may be written in it; folders in it that have a marker of
-            their own are none of them.
-        edited: those of `files` in which people may write, because their writer keeps it.
+        name: name of the kind, in the marker and in messages.
+        files: paths of all files that may be written in it, without those of subfolders that have
+            their own marker.
+        edited: those of `files` that users may edit, because their writer keeps the edits.
     """
 
     name: str
@@ -49,12 +49,12 @@ class FolderKind:
 
 @dataclass(frozen=True)
 class Marker:
-    """What a folder's marker says.
+    """Content of a folder's marker.
 
     Attributes:
         kind: name of the folder's kind.
-        finished: whether the command that wrote it came to its end.
-        files: the files that are this package's, with digests of those that are finished.
+        finished: whether the command that wrote it has finished.
+        files: the files of this package, with digests of those that are finished.
     """
 
     kind: str
@@ -66,27 +66,27 @@ class Marker:
 def run_folder(
     path: str | os.PathLike[str], kind: FolderKind, called: str = "--out", *, new: bool = False
 ) -> Iterator[Path]:
-    """Hold a folder for one command, from before its work until all is written.
+    """Lock a folder for one command, from before its work until all is written.
 
-    The folder is made and marked at once, so that nobody else takes it; it goes again if the block
-    ends by an error before anything was written there. Folders of this kind are taken again: the
-    files in them that are this package's may be replaced, all others stay.
+    The folder is made and marked at once, so that no other command uses it; it is removed if the
+    block fails before anything was written there. A folder of this kind may be reused: this
+    package's files in it may be replaced, all others stay.
 
     Args:
-        path: of the folder.
-        kind: what it is to hold.
-        called: what sentences begin with: the option that named it.
-        new: refuse a finished one.
+        path: path of the folder.
+        kind: kind of the folder.
+        called: beginning of messages: the option that named it.
+        new: refuse a finished folder.
 
     Raises:
-        UserError: before the block: something foreign is or would be in the way, another process
-            is at work there, nothing can be written there. After it: the disk is full.
+        UserError: before the block: the path holds or would replace something foreign, another
+            process writes there, or it is not writable. After it: the disk is full.
     """
     about = f"{called} {path}".strip()
     folder = Path(os.path.realpath(path))
     _checked(path, kind, called, new)
     with made_folder(folder, about), locked(folder / _LOCK, about):
-        before = _checked(path, kind, called, new)  # again: now nobody else writes
+        before = _checked(path, kind, called, new)  # again, as the lock now excludes other writers
         _begin(folder, kind, before)
         sweep(folder)
         try:
@@ -108,7 +108,7 @@ def check_folder(path: str | os.PathLike[str], kind: FolderKind, called: str = "
 
 
 def claim(path: str | os.PathLike[str], kind: FolderKind) -> None:
-    """Make and mark a folder that something else keeps other processes off.
+    """Make and mark a folder that is already protected from other processes.
 
     Raises:
         UserError: as `run_folder`.
@@ -122,7 +122,7 @@ def claim(path: str | os.PathLike[str], kind: FolderKind) -> None:
 
 
 def sweep(folder: Path) -> None:
-    """Remove what a killed process was writing, in a folder of ours that nobody else is at."""
+    """Remove partial files of a killed process from a folder of this package that is locked."""
     if (folder / MARKER).exists():
         for litter in folder.iterdir():
             if _PARTIAL.fullmatch(litter.name):
@@ -130,7 +130,7 @@ def sweep(folder: Path) -> None:
 
 
 def finish(folder: str | os.PathLike[str], kind: FolderKind) -> None:
-    """Write into the marker which files there are, and their digests."""
+    """Write the existing files and their digests into the marker."""
     files = {
         name: None if name in kind.edited else _digest(Path(folder) / name)
         for name in kind.files
@@ -143,17 +143,17 @@ def finish(folder: str | os.PathLike[str], kind: FolderKind) -> None:
 def output_file(
     path: str | os.PathLike[str], own: Callable[[Path], bool], what: str, called: str = "--out"
 ) -> Iterator[Path]:
-    """Hold the place of a single file, from before the work until it is written.
+    """Lock the path of a single file, from before the work until it is written.
 
     Args:
-        path: of the file.
-        own: whether a file that is there is one of those that the command writes.
-        what: such a file in words, such as `recording of spinndrift`.
-        called: what sentences begin with: the option that named it.
+        path: path of the file.
+        own: whether an existing file is of the kind that the command writes.
+        what: description of that kind, such as `recording of spinndrift`.
+        called: beginning of messages: the option that named it.
 
     Raises:
-        UserError: another file is there, it belongs to a folder of this package, another process
-            is at work there, or nothing can be written there.
+        UserError: another file exists, it belongs to a folder of this package, another process
+            writes there, or the path is not writable.
     """
     about = f"{called} {path}".strip()
     final = Path(os.path.realpath(path))
@@ -187,7 +187,7 @@ def check_file(
 
 
 def read_marker(folder: Path) -> Marker | None:
-    """What a folder's marker says; None if there is none.
+    """Content of a folder's marker; None if there is none.
 
     Raises:
         UserError: it can't be read, or a later version wrote it.
@@ -240,7 +240,7 @@ def _checked(
 
 
 def _check_own(folder: Path, name: str, marker: Marker, about: str) -> None:
-    """Refuse what stands where a file of this name is to be written, unless it is our own."""
+    """Refuse an existing file of this name unless this package wrote it."""
     at = folder / name
     for above in at.relative_to(folder).parents:
         if (folder / above).exists() and not (folder / above).is_dir():
@@ -267,7 +267,7 @@ def _begin(folder: Path, kind: FolderKind, before: Marker | None) -> None:
 
 
 def _undo(folder: Path, kind: FolderKind, before: Marker | None) -> None:
-    """Mark the folder as it was before, if it is as it was before."""
+    """Restore the previous marker, if the folder's content has not changed."""
     if before is None:
         if all(_passing(name) or name == MARKER for name in os.listdir(folder)):
             (folder / MARKER).unlink()
@@ -295,12 +295,12 @@ def _write(folder: Path, marker: Marker) -> None:
 def _version() -> str:
     try:
         return metadata.version("spinndrift")
-    except metadata.PackageNotFoundError:  # sources that were not installed
+    except metadata.PackageNotFoundError:  # run from sources without installation
         return ""
 
 
 def _passing(name: str) -> bool:
-    """Whether a name is that of a lock, or of a file that was being written."""
+    """Whether a name is that of a lock or of a partial file."""
     return bool(_PARTIAL.fullmatch(name) or _LOCKS.fullmatch(name))
 
 

@@ -1,1 +1,1 @@
-"""What vehicle and water are: pure JAX."""
+"""Models of vehicle, water and sensors: pure JAX."""

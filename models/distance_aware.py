@@ -2,7 +2,7 @@
 
 A scalar network η of the scaled body velocity z is a learned distance from the training data;
 ρ(z) = σ(η(z) - 7), with the logistic function σ, is nearly zero near the data and one far away. It
-multiplies a prior diffusion, the largest that is believed:
+multiplies a prior diffusion, the upper bound:
 
 - `distance-aware` (Djeumou, Neary, Topcu 2023, "How to learn and generalize from three minutes of
   data", section 2.2, and the public code wuwushrek/sde4mbrl at f4f34bf): b / prior =
@@ -10,10 +10,10 @@ multiplies a prior diffusion, the largest that is believed:
   convexity coefficient μ(z) = 10 exp(network(z)).
 - `unconstrained` (Koprulu, Djeumou, Topcu 2025, "Neural stochastic differential equations for
   uncertainty-aware offline RL", and cevahir-koprulu/sde4mbrltatu, branch iclr2025 at e8bdbd7):
-  b / prior = exp(c + |w| tanh(A z + a₀)) + σ((1 + eᵃ) η - 7 + eˢ), the first term for what is
-  random near the data too, and one learned number μ that starts at 100.
+  b / prior = exp(c + |w| tanh(A z + a₀)) + σ((1 + eᵃ) η - 7 + eˢ), the first term for the noise
+  near the data, and one learned number μ that starts at 100.
 
-Activations are LipSwish, which is swish up to a factor that the next layer's weights take up.
+Activations are LipSwish, which is swish up to a factor that the next layer's weights absorb.
 """
 
 from typing import Any, Literal
@@ -32,7 +32,7 @@ _SWISH = 1.1  # swish = 1.1 LipSwish
 
 
 class Scalar(eqx.Module):
-    """A perceptron with one output, its weights uniform in ±`bound` and its biases zero."""
+    """A perceptron with one output, initial weights uniform in ±`bound` and biases zero."""
 
     hidden: MlpStack
     output: Heads
@@ -75,7 +75,7 @@ class Aleatoric(eqx.Module):
 
 
 class DistanceAware(eqx.Module):
-    """The factor of the prior diffusion, and the coefficient μ of the penalties on ρ."""
+    """The factor on the prior diffusion, and the coefficient μ of the penalties on ρ."""
 
     distance: Scalar
     scaler: Float[Array, "2 6"]
@@ -85,10 +85,10 @@ class DistanceAware(eqx.Module):
 
     @classmethod
     def create(cls, kind: DiffusionKind, key: Array, dtype: Any) -> "DistanceAware":
-        """Networks of the sizes and starting values of the public code.
+        """Networks with the sizes and initial values of the public code.
 
         Raises:
-            ValueError: the kind is none of the two.
+            ValueError: the kind is neither of the two.
         """
         η, s, μ, c, a = jax.random.split(key, 5)
         if kind == "distance-aware":
@@ -123,7 +123,7 @@ class DistanceAware(eqx.Module):
         return jax.nn.sigmoid(self.distance(z) - _OFFSET)
 
     def mu(self, z: Float[Array, "6 *batch"]) -> Float[Array, "*batch"]:
-        """The local strong convexity that ρ shall have at the data."""
+        """The required local strong convexity of ρ at the data."""
         if isinstance(self.convexity, Scalar):
             return 10 * jnp.exp(self.convexity(z))
         return jnp.broadcast_to(100 * jnp.abs(self.convexity), z.shape[1:])

@@ -6,7 +6,7 @@ Kinematics dg = g ξ dt and momentum balance in B (Palmer et al., eqs. 9-11; Fos
 
 with ξ = `V_WB_B`, F the commanded wrench, F_V the left-trivialised derivative of -V(g), D and D^f
 the viscous and the fluid drag matrix and b the diagonal diffusion (N√s, N·m√s); a model may
-correlate the axes of dW. A subclass says what M, D, D^f, b and V are: constants for a Fossen model,
+correlate the axes of dW. Subclasses define M, D, D^f, b and V: constants for a Fossen model,
 networks for a SPINN.
 """
 
@@ -21,11 +21,11 @@ from . import se3
 from .spd import Operator, Spd
 
 Memory = tuple[Array, ...]
-"""What a model remembers of earlier commands and motion: arrays (m, *batch)."""
+"""Memory of earlier commands and motion: arrays (m, *batch)."""
 
 
 class Coefficients(NamedTuple):
-    """All that depends on the body velocity, evaluated together in one pass."""
+    """The coefficients that depend on the body velocity, evaluated in one pass."""
 
     mass: Spd
     linear_drag: Operator
@@ -41,7 +41,7 @@ class Flow(NamedTuple):
 
 
 class Dynamics(eqx.Module):
-    """Drift and diffusion of a vehicle; arrays and frames as `models.se3` states them.
+    """Drift and diffusion of a vehicle; arrays and frames as in `models.se3`.
 
     `rigid_inertia` is the dry vehicle's spatial inertia about Bo and `displaced_mass` = ρ∇: moving
     water acts through M - `rigid_inertia` (added mass) and through ρ∇ (Froude–Krylov) only.
@@ -53,31 +53,31 @@ class Dynamics(eqx.Module):
 
     @property
     def stochastic(self) -> bool:
-        """Whether b may differ from zero; integrators skip the noise of a model that says no."""
+        """Whether b may differ from zero; if not, integrators skip the noise."""
         return True
 
     @property
     def brownian_size(self) -> int:
-        """Brownian motions that a rollout takes: 6, and 6 more if pushes of the model last."""
+        """Number of Brownian motions of a rollout: 6, and 6 more for coloured noise."""
         return 6
 
     def lasting_push(
         self, w: Float[Array, "T 6 *batch"], dt: float | Float[Array, ""]
     ) -> Float[Array, "T 6 *batch"]:
-        """The wrench on the body of the 6 more, from unit Gaussians at T steps of `dt` (s).
+        """The wrench of the coloured noise, from unit Gaussians at T steps of `dt` (s).
 
         Raises:
-            ValueError: the model has none.
+            ValueError: the model has no coloured noise.
         """
         raise ValueError(f"{type(self).__name__} has no pushes that last: give it noise of 6 axes")
 
     @property
     def remembers(self) -> bool:
-        """Whether earlier commands or motion act later, so that rollouts carry a memory."""
+        """Whether earlier commands or motion have later effects: rollouts then carry a memory."""
         return False
 
     def commanded(self, F_Bo_B: Float[Array, "6 *batch"]) -> Memory:
-        """The memory of a vehicle that has been commanded a wrench for ever."""
+        """Steady-state memory under a constant commanded wrench."""
         del F_Bo_B
         return ()
 
@@ -89,7 +89,7 @@ class Dynamics(eqx.Module):
         dt: Any,
         substeps: int,
     ) -> tuple[Memory, Float[Array, "6 *batch S"]]:
-        """Memory after a wrench is commanded for `dt` s, and what acts over its S substeps."""
+        """Memory after a wrench is commanded for `dt` s, and the actual wrench in S substeps."""
         del V_WB_B, dt
         return memory, jnp.broadcast_to(F_Bo_B[..., None], (*F_Bo_B.shape, substeps))
 
@@ -151,11 +151,11 @@ class Dynamics(eqx.Module):
         flow: Flow | None = None,
         coefficients: Coefficients | None = None,
     ) -> tuple[Spd, Float[Array, "6 *#batch"]]:
-        """M and the wrench M dξ/dt of all forces and of the turning frame, without noise.
+        """M and the wrench M dξ/dt of all forces and of the rotating frame, without noise.
 
-        In moving water drag and added mass act through ξ_r = ξ - ξ_c and its rate, and the water's
-        own pressure gradient through ρ∇ a_c at the centre of buoyancy (Fossen 2011, eq. 8.3;
-        Maxey and Riley 1983 for the pressure-gradient term).
+        In moving water drag and added mass depend on ξ_r = ξ - ξ_c and its rate, and the pressure
+        gradient of the undisturbed flow gives ρ∇ a_c at the centre of buoyancy (Fossen 2011,
+        eq. 8.3; Maxey and Riley 1983 for the pressure-gradient term).
         """
         V = V_WB_B
         if flow is None:

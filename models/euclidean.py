@@ -5,8 +5,8 @@ The state is position, Euler angles Θ = (roll, pitch, yaw) about z-y'-x'' and b
     dp/dt = R(Θ) v,   dΘ/dt = T(Θ) ω   (Fossen 2011, eqs. 2.18 and 2.28),
 
 integrated by a plain Euler–Heun step in R¹². Nothing is wrapped or projected: the angles of data
-jump at ±π, T is singular at pitch ±π/2, and both are left as they are, since this is what the
-group's structure is compared with (Palmer et al., simulation experiments).
+jump at ±π and T is singular at pitch ±π/2, as this is the baseline that the group's structure is
+compared with (Palmer et al., simulation experiments).
 """
 
 from typing import Any
@@ -29,7 +29,7 @@ def coordinates(X_WB: Float[Array, "7 *batch"]) -> Float[Array, "6 *batch"]:
 
 
 def pose(q: Float[Array, "6 *batch"]) -> Float[Array, "7 *batch"]:
-    """The pose of coordinates; angles a full turn apart give the same one."""
+    """The pose of coordinates; angles that differ by a full turn give the same pose."""
     return se3.from_position_rpy(q[:3], q[3:])
 
 
@@ -71,7 +71,7 @@ class EulerPotential(Potential):
 
     With `pose` V = λ tanh(MLP(p / length, Θ) + s·u + s_z z), else (`gravity`) V =
     λ tanh(MLP(roll, pitch) + s·u) - f_b z; s·u with u = Rᵀ e_z is the reference's restoring energy,
-    at which V starts. The wrench is -[Rᵀ ∂V/∂p, Tᵀ ∂V/∂Θ].
+    the initial V. The wrench is -[Rᵀ ∂V/∂p, Tᵀ ∂V/∂Θ].
     """
 
     hidden: MlpStack
@@ -87,7 +87,7 @@ class EulerPotential(Potential):
     def create(
         cls, config: SpinnConfig, reference: FossenDynamics, key: Array, dtype: Any
     ) -> "EulerPotential":
-        """V near the reference's restoring energy."""
+        """V that approximates the reference's restoring energy."""
         slope, heave, bound = restoring(config, reference)
         whole = config.potential == "pose"
         buoyancy = float(reference.buoyancy) - float(reference.weight)
@@ -105,7 +105,7 @@ class EulerPotential(Potential):
         )
 
     def energy_at(self, q: Float[Array, "6 *batch"]) -> Float[Array, "*batch"]:
-        """V in J at coordinates that need not be in any range."""
+        """V in J at coordinates with angles of any size."""
         p, angles = jnp.split(q, 2)
         up = jnp.stack(rotation(q)[2])
         raw = jnp.tensordot(self.skip, up, 1)
@@ -117,7 +117,7 @@ class EulerPotential(Potential):
         return self.bound * jnp.tanh(raw)
 
     def wrench_at(self, q: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
-        """The wrench at coordinates that need not be in any range."""
+        """The wrench at coordinates with angles of any size."""
         dp, dangles = jnp.split(jax.grad(lambda q: jnp.sum(self.energy_at(q)))(q), 2)
         force = _transposed_times(rotation(q), dp)
         return -jnp.concatenate([force, _transposed_times(angle_rates(q), dangles)])
@@ -130,10 +130,10 @@ class EulerPotential(Potential):
 
 
 class EuclideanSpinn(Spinn):
-    """A SPINN whose pose moves by an Euler step in position and Euler angles.
+    """A SPINN whose pose is integrated by an Euler step in position and Euler angles.
 
-    As a `Dynamics` it takes and returns poses, so that angles are back in their ranges after each
-    step; `rollout` keeps them as they come, as training in R¹² does.
+    As a `Dynamics` it takes and returns poses, which brings angles back into their ranges after
+    each step; `rollout` does not wrap them, as training in R¹² requires.
     """
 
     @staticmethod
@@ -143,7 +143,7 @@ class EuclideanSpinn(Spinn):
         return EulerPotential.create(config, reference, key, dtype)
 
     def trainable(self) -> "Spinn":
-        """As of `Spinn`; what the chosen potential does not use is not trained."""
+        """As in `Spinn`; parameters that the chosen potential does not use are not trained."""
         spec = super().trainable()
         whole = self._potential.whole_pose
         names = ("length", "net_buoyancy") if whole else ("length", "height")
@@ -207,6 +207,6 @@ def create_spinn(
     key: Array,
     dtype: jnp.dtype | type | None = None,
 ) -> Spinn:
-    """A model in the coordinates that `config` names, starting at `reference`."""
+    """A model in the coordinates of `config`, starting at `reference`."""
     cls = EuclideanSpinn if config.coordinates == "euler" else Spinn
     return cls.create(config, reference, key, dtype)

@@ -1,4 +1,4 @@
-"""North-east-down and forward-right-down to this project's frames and back; NumPy, component first.
+"""Conversion between NED/FRD and this project's ENU/FLU frames; NumPy, component first.
 
 W is east, north, up and B is forward, left, up (`models/se3.py`). Every swap is its own inverse.
 """

@@ -66,12 +66,12 @@ def rollout(
 ) -> tuple[Float[Array, "T 7 *#batch"], Float[Array, "T 6 *#batch"]]:
     """States at dt, 2 dt, …, T dt (the start is left out) under zero-order-held wrenches.
 
-    `dW` holds the Brownian increments of S substeps of length dt / S each and must then have
-    variance dt / S; without it `substeps` deterministic ones are taken. They are 6 a substep, or
-    `Dynamics.brownian_size` for a model with pushes that last, which start in their stationary law:
-    with 6 those pushes are left out. A model whose actuation remembers (lag, delay) has been
-    commanded its first wrench for ever. `remat` recomputes each step in the backward pass: memory
-    then grows with the states alone, not with the networks' activations.
+    `dW` holds the Brownian increments of S substeps of length dt / S, with variance dt / S; without
+    it `substeps` deterministic ones are taken. There are 6 increments per substep, or
+    `Dynamics.brownian_size` for a model with coloured noise, which starts from its stationary law;
+    with 6 the coloured noise is left out. Actuation with memory (lag, delay) starts in the steady
+    state of the first wrench. `remat` recomputes each step in the backward pass, so that memory
+    grows with the states only, not with the networks' activations.
     """
     count = substeps if dW is None else dW.shape[1]
     h = dt / count
@@ -126,7 +126,7 @@ class DriftTerm(diffrax.AbstractTerm):
 
 
 class NoiseTerm(diffrax.AbstractTerm):
-    """M⁻¹ b C dW; it moves the velocity only (the diffusion is hypoelliptic)."""
+    """M⁻¹ b C dW; it acts on the velocity only (the diffusion is hypoelliptic)."""
 
     dynamics: Dynamics
     brownian: diffrax.AbstractBrownianPath
@@ -142,7 +142,7 @@ class NoiseTerm(diffrax.AbstractTerm):
 
 
 def _unwrapped(term: Any) -> DriftTerm:
-    """The term itself, whatever Diffrax has wrapped around it."""
+    """The term itself, without Diffrax's wrappers."""
     while not isinstance(term, DriftTerm):
         term = term.term
     return term

@@ -1,4 +1,4 @@
-"""A mean-reverting disturbance inside a model: pushes that last, which white noise can't tell."""
+"""A mean-reverting disturbance of a model: coloured noise, in addition to the white noise."""
 
 import equinox as eqx
 import jax
@@ -12,8 +12,8 @@ from .randomness import gauss_markov
 class MeanReverting(eqx.Module):
     """An Ornstein–Uhlenbeck wrench on the body, dF = −F/τ dt + σ √(2/τ) dW (axes of B).
 
-    It is a state that nobody measures: where nothing is known of it, it has its stationary law,
-    mean 0 and standard deviation σ (Uhlenbeck and Ornstein 1930).
+    It is a latent state: without further information it has its stationary law, with mean 0 and
+    standard deviation σ (Uhlenbeck and Ornstein 1930).
     """
 
     log_ratio: Float[Array, "6"]
@@ -23,7 +23,7 @@ class MeanReverting(eqx.Module):
 
     @classmethod
     def create(cls, dtype: jnp.dtype | type) -> "MeanReverting":
-        """Half as strong as the white noise over long times, and of 1 s."""
+        """Half the white noise's intensity over long times, and a time constant of 1 s."""
         return cls(jnp.log(jnp.full(6, 0.5, dtype)), jnp.zeros(6, dtype))
 
     @property
@@ -36,13 +36,13 @@ class MeanReverting(eqx.Module):
         return self.white(jax.lax.stop_gradient(scale)) / jnp.sqrt(2 * self.time_constant)
 
     def white(self, scale: Float[Array, "6"]) -> Float[Array, "6"]:
-        """σ √(2τ): the b of the white noise that moves as far over times much longer than τ."""
+        """σ √(2τ): the b of the white noise with equal effect over times much longer than τ."""
         return scale * jnp.exp(self.log_ratio)
 
     def path(
         self, scale: Float[Array, "6"], w: Float[Array, "T 6 *batch"], dt: float | Float[Array, ""]
     ) -> Float[Array, "T 6 *batch"]:
-        """The wrench over T steps of `dt` (s) from unit Gaussians, the first of which starts it."""
+        """The wrench over T steps of `dt` (s) from unit Gaussians; the first one sets its start."""
         std, time = expand(self.std(scale), w.ndim - 1), expand(self.time_constant, w.ndim - 1)
 
         def advance(force: Array, w: Array) -> tuple[Array, Array]:

@@ -82,7 +82,7 @@ class MlpStack(eqx.Module):
         return cls(tuple(weights), tuple(biases), activation)
 
     def __call__(self, x: Float[Array, "in *batch"], count: int) -> Float[Array, "n out *batch"]:
-        """The features of the first `count` networks, all of which see the same input."""
+        """The features of the first `count` networks, which have the same input."""
         h = jnp.tensordot(self.weights[0][:count], x, 1)
         h = activate(h + expand(self.biases[0][:count], h.ndim), self.activation)
         for w, b in zip(self.weights[1:], self.biases[1:], strict=True):
@@ -99,7 +99,7 @@ class Heads(eqx.Module):
 
     @classmethod
     def constant(cls, bias: Float[Array, "n out"], width: int) -> "Heads":
-        """Heads with weights zero: the networks start as the constants `bias`."""
+        """Heads with zero weights: the networks start as the constants `bias`."""
         return cls(jnp.zeros((*bias.shape, width), bias.dtype), bias)
 
     def __call__(self, h: Float[Array, "k in *batch"], count: int) -> Float[Array, "k out *batch"]:

@@ -17,7 +17,7 @@ PotentialKind = Literal["gravity", "pose"]
 class BoundedScalar(eqx.Module):
     """λ tanh(MLP(x) + s·x) with a learned bound λ (Palmer et al., footnote on V; Kidger 2021).
 
-    The skip s lets V start at the reference's restoring energy, where the MLP starts at zero.
+    With the skip s V starts at the reference's restoring energy; the MLP starts at zero.
     """
 
     hidden: MlpStack
@@ -63,10 +63,10 @@ class Potential(eqx.Module):
 
 
 class GravityPotential(Potential):
-    """V = λ tanh(MLP(Rᵀ e_z)) - f_b z: what weight and buoyancy can be, by symmetry.
+    """V = λ tanh(MLP(Rᵀ e_z)) - f_b z: the symmetry of weight and buoyancy.
 
-    Invariant to x, y and yaw and affine in height, so that it holds over a whole dive; f_b is the
-    net buoyancy (N). Its wrench is [f_b u, u × ∇_u λ tanh(MLP(u))] with u = Rᵀ e_z.
+    It is invariant to x, y and yaw and affine in height, so it holds over a whole dive; f_b is the
+    net buoyancy (N). The wrench is [f_b u, u × ∇_u λ tanh(MLP(u))] with u = Rᵀ e_z.
     """
 
     restoring: BoundedScalar
@@ -84,7 +84,7 @@ class GravityPotential(Potential):
 class PosePotential(Potential):
     """V = λ tanh(MLP(R, p / length)) of the chordal embedding, as in Palmer et al.
 
-    It depends on the whole pose, so data must share one origin: windows that start at the identity.
+    It depends on the whole pose, so all windows must share one origin: they start at the identity.
     """
 
     scalar: BoundedScalar

@@ -1,4 +1,4 @@
-"""Shapes of randomness made from unit Gaussians, the only noise that enters from outside."""
+"""Random variables and processes from unit Gaussians, the only external source of noise."""
 
 import jax.numpy as jnp
 import numpy as np

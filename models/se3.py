@@ -1,4 +1,4 @@
-"""The special Euclidean group SE(3), and the conventions every other module keeps.
+"""The special Euclidean group SE(3), and the conventions of all modules.
 
 Frames
     World W: x east, y north, z up. Body B: x forward, y left, z up, origin Bo.
@@ -15,9 +15,9 @@ Twist `V_WB_B`
 Wrench `F_Bo_B`
     `(6, *batch)`: force (N), then moment about Bo (N·m), expressed in B.
 
-Every coefficient that is a quotient at the identity is a function of the squared angle with its
-Taylor series below one radian, so values and derivatives of `exp` and `log` are right to rounding
-from the identity up to the cut locus at π (Solà et al. 2018, "A micro Lie theory", eqs. 172-182).
+Every coefficient that is 0/0 at the identity is a function of the squared angle with its Taylor
+series below one radian, so values and derivatives of `exp` and `log` are accurate to rounding from
+the identity up to the cut locus at π (Solà et al. 2018, "A micro Lie theory", eqs. 172-182).
 """
 
 from fractions import Fraction
@@ -58,8 +58,8 @@ def _polynomial(coefficients: list[float], x: Array) -> Array:
     return result
 
 
-# Components are taken apart by `unstack` and `split`, whose transposes join in one operation; an
-# index or slice would leave the backward pass a padded array of every component to add up.
+# Components are separated by `unstack` and `split`, whose transposes are one operation each; the
+# transpose of an index or slice is a padded array per component, and the backward pass adds them.
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -151,7 +151,7 @@ def exp(xi: Float[Array, "6 *batch"]) -> Float[Array, "7 *batch"]:
     """The pose reached by flowing for unit time with the constant twist xi = [v, ω]."""
     v, omega = jnp.split(xi, 2)
     t2 = _dot(omega, omega)
-    # A step of an integrator turns by far less than a radian: then no sine is evaluated at all.
+    # Steps of an integrator rotate by far less than a radian: then no sine is evaluated.
     small = jnp.all(t2 < _SERIES_BELOW)
     w, half, b, c = jnp.unstack(jax.lax.cond(small, _exp_series, _exp_coefficients, t2))
     wxv = cross(omega, v)
@@ -166,7 +166,7 @@ def _exp_series(t2: Array) -> Array:
 
 
 def _exp_coefficients(t2: Array) -> Array:
-    """The same from any θ²."""
+    """The same for any θ²."""
     series = t2 < _SERIES_BELOW
     large = jnp.where(series, 1, t2)
     theta = jnp.sqrt(large)
@@ -200,12 +200,12 @@ def log(X: Float[Array, "7 *batch"]) -> Float[Array, "6 *batch"]:
 
 
 def local(X_WA: Float[Array, "7 *a"], X_WB: Float[Array, "7 *b"]) -> Float[Array, "6 *c"]:
-    """log(X_WA⁻¹ X_WB): the displacement from A to B seen in A."""
+    """log(X_WA⁻¹ X_WB): the displacement from A to B expressed in A."""
     return log(compose(inverse(X_WA), X_WB))
 
 
 def retract(X: Float[Array, "7 *a"], xi: Float[Array, "6 *b"]) -> Float[Array, "7 *c"]:
-    """X exp(xi), with the quaternion brought back to unit length."""
+    """X exp(xi), with the quaternion normalised."""
     return normalize(compose(X, exp(xi)))
 
 
@@ -241,7 +241,7 @@ def _blocks(a: Array, b: Array, c: Array, d: Array) -> Array:
 
 
 def adjoint(X_AB: Float[Array, "7 *batch"]) -> Float[Array, "6 6 *batch"]:
-    """Ad_X, which moves twists: ξ_A = Ad_X ξ_B, [[R, p̂R], [0, R]] for the order [v, ω]."""
+    """Ad_X, which transforms twists: ξ_A = Ad_X ξ_B, [[R, p̂R], [0, R]] for the order [v, ω]."""
     R = rotation_matrix(X_AB)
     p = X_AB[4:]
     pR = jnp.stack([cross(p, R[:, j]) for j in range(3)], axis=1)
@@ -267,7 +267,7 @@ def ad_apply(
 def coad_apply(
     xi: Float[Array, "6 *#batch"], mu: Float[Array, "6 *#batch"]
 ) -> Float[Array, "6 *#batch"]:
-    """ad*_ξ μ = ad_ξᵀ μ: how a constant spatial momentum μ = [p, π] seems to change in B.
+    """ad*_ξ μ = ad_ξᵀ μ: the rate in B of a constant spatial momentum μ = [p, π].
 
     Linear part p × ω, angular part π × ω + p × v (Marsden and Ratiu 1994, section 14.2).
     """

@@ -17,16 +17,16 @@ from . import symmetric
 
 N = 6
 PACKED = N * (N + 1) // 2
-"""Numbers of a packed symmetric or triangular matrix: the diagonal, then below it by rows."""
+"""Entries of a packed symmetric or triangular matrix: the diagonal, then below it by rows."""
 
 
 def packed_index(i: int, j: int) -> int:
-    """Where entry (i, j), i ≥ j, of a packed matrix stands."""
+    """Index of entry (i, j), i ≥ j, in a packed matrix."""
     return i if i == j else N + i * (i - 1) // 2 + j
 
 
 def pack(matrix: Float[Array, "6 6 *batch"]) -> Float[Array, "21 *batch"]:
-    """The lower triangle of a matrix: the diagonal, then what is below it by rows."""
+    """The lower triangle of a matrix: the diagonal, then the entries below it by rows."""
     rows = [*range(N), *(i for i in range(N) for _ in range(i))]
     columns = [*range(N), *(j for i in range(N) for j in range(i))]
     return matrix[jnp.asarray(rows), jnp.asarray(columns)]
@@ -56,7 +56,7 @@ class Operator(eqx.Module):
 class Spd(Operator):
     """A symmetric positive definite operator, which can be inverted.
 
-    Several vectors for each batch entry stand on an axis ahead of the batch: (6, k, *batch).
+    Several vectors for each batch entry have an axis ahead of the batch: (6, k, *batch).
     """
 
     @abc.abstractmethod
@@ -65,7 +65,7 @@ class Spd(Operator):
 
 
 class ConstantOperator(Operator):
-    """One matrix for all batch entries, which need not be invertible."""
+    """One matrix for all batch entries; it need not be invertible."""
 
     dense: Float[Array, "6 6"]
 
@@ -77,7 +77,7 @@ class ConstantOperator(Operator):
 
 
 class ConstantSpd(Spd):
-    """One matrix for all batch entries, held with its inverse."""
+    """One matrix for all batch entries, stored with its inverse."""
 
     dense: Float[Array, "6 6"]
     inverse: Float[Array, "6 6"]
@@ -99,8 +99,8 @@ class ConstantSpd(Spd):
 class ScaledSpd(Spd):
     """A = S B(raw) Sᵀ with a fixed S that gives the magnitudes and B of order one.
 
-    The products with S are matrix products over the whole batch. They also part what the compiler
-    would otherwise fuse, and with it compute again for each of the six components.
+    The products with S are matrix products over the whole batch. They also prevent a fusion by the
+    compiler that would recompute its inputs for each of the six components.
     """
 
     scale: eqx.AbstractVar[Float[Array, "6 6"]]

@@ -40,28 +40,28 @@ class SpinnConfig:
     depth: int = 3
     activation: Activation = "tanh"
     spd: SpdKind = "cholesky"
-    """How M, D and D^f are made positive definite: Cholesky factors, or positive eigenvalues."""
+    """Parametrisation of M, D and D^f: Cholesky factors, or positive eigenvalues."""
     potential: PotentialKind = "gravity"
     """`gravity` keeps the symmetry in x, y, yaw (whole dives); `pose` is the paper's."""
     constant_mass: bool = False
-    """M does not depend on velocity, as physics has it."""
+    """M does not depend on velocity, as in physics."""
     stochastic: bool = True
     """Without it b = 0 (a geometric PINN)."""
     diffusion: DiffusionKind = "network"
-    """b by a network of its own, or one that grows with the distance from the data."""
+    """b from its own network, or growing with the distance from the data."""
     correlated: bool = False
-    """The noise's axes are correlated: b C(ξ) dW, C a lower triangle with rows of length one."""
+    """The noise's axes are correlated: b C(ξ) dW, C lower triangular with rows of length one."""
     mean_reverting: bool = False
     """A second, Ornstein–Uhlenbeck disturbance, whose time constants are learned."""
     coordinates: Literal["group", "euler"] = "group"
-    """State on SE(3), or position and Euler angles in R¹² as baselines have it (`EuclideanSpinn`).
+    """State on SE(3), or position and Euler angles in R¹² as in baselines (`EuclideanSpinn`).
     """
     start: Literal["reference", "scale"] = "reference"
     """Networks start at the reference's matrices, or at the diagonal matrices of their scales."""
     velocity_scale: Vector6 = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-    """m/s and rad/s that count as one at the networks' input."""
+    """Scale of the networks' velocity input (m/s, rad/s)."""
     length_scale: float = 1.0
-    """Metres that count as one at the input of a `pose` potential."""
+    """Scale of the position input of a `pose` potential (m)."""
 
     def __post_init__(self) -> None:
         check_numbers(self)
@@ -97,8 +97,8 @@ class Scales(eqx.Module):
 class Spinn(Dynamics):
     """Learned drift and diffusion; make one with `Spinn.create`.
 
-    The networks stand in the order (b, M, D, D^f), less b if not `stochastic` or if b is
-    `distance_aware`, and less M if `constant_mass`: the second stage of a Heun step evaluates a
+    The order of the networks is (b, M, D, D^f), without b if not `stochastic` or if b is
+    `distance_aware`, and without M if `constant_mass`: the second stage of a Heun step evaluates a
     prefix of them.
     """
 
@@ -123,11 +123,11 @@ class Spinn(Dynamics):
         key: Array,
         dtype: jnp.dtype | type | None = None,
     ) -> "Spinn":
-        """A model that starts at `reference`: its matrices, and V to a few percent.
+        """A model that starts at `reference`: its matrices exactly, V to a few percent.
 
         Diffusion that is zero in the reference starts at 5 % of the drag at `velocity_scale`, and a
-        drag of zero at 1 % of what stops the vehicle in a second. A distance-aware diffusion has
-        that as its prior.
+        drag of zero at 1 % of the drag that stops the vehicle in a second. That diffusion is the
+        prior of a distance-aware one.
         """
         dtype = reference.rigid_inertia.dtype if dtype is None else dtype
         v = np.asarray(config.velocity_scale)
@@ -186,7 +186,7 @@ class Spinn(Dynamics):
     def starting_potential(
         config: SpinnConfig, reference: FossenDynamics, key: Array, dtype: Any
     ) -> Potential:
-        """V near the reference's restoring energy."""
+        """V that approximates the reference's restoring energy."""
         return _potential(config, reference, key, dtype)
 
     @property
@@ -205,10 +205,10 @@ class Spinn(Dynamics):
         return self.lasting.path(self.scales.diffusion, w, dt)
 
     def whitened(self) -> "Spinn":
-        """The model with white noise alone that strays as far, for those who hold no latent state.
+        """The equivalent model with white noise only, for users without a latent state.
 
-        Over times much longer than τ a mean-reverting wrench strays like white noise with
-        b = σ √(2τ), which is added to the model's own in squares at the scale of its diffusion.
+        Over times much longer than τ a mean-reverting wrench acts like white noise with
+        b = σ √(2τ); its square is added to that of the model's diffusion scale.
         """
         if self.lasting is None:
             return self
@@ -251,7 +251,7 @@ class Spinn(Dynamics):
         return jnp.mean(jnp.sum(change**2, axis=0))
 
     def scaled_velocity(self, V_WB_B: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
-        """What the networks see: ξ in units of `velocity_scale`."""
+        """Input of the networks: ξ in units of `velocity_scale`."""
         return V_WB_B / expand(jax.lax.stop_gradient(self.scales.velocity), V_WB_B.ndim)
 
     def _features(self, V_WB_B: Array, count: int) -> Array:
@@ -282,7 +282,7 @@ class Spinn(Dynamics):
         """C(ξ), lower triangular with rows of length one: b C is the factor of a full diffusion.
 
         Row i holds free numbers left of the diagonal and 1 on it, divided by the row's length: b
-        stays the noise's size on each axis, and C Cᵀ, its correlation matrix, takes any value.
+        remains the noise's size on each axis, and C Cᵀ is any correlation matrix.
 
         Raises:
             ValueError: the model's noise is not correlated.
@@ -333,7 +333,7 @@ class Spinn(Dynamics):
 
 
 def _floored(a: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """The symmetric part of `a`, shifted until no scaled eigenvalue is below that of `floor`."""
+    """The symmetric part of `a`, its eigenvalues relative to diag(`floor`) raised to at least 1."""
     s = np.sqrt(floor)
     w, Q = np.linalg.eigh((a + a.T) / 2 / np.outer(s, s))
     return np.outer(s, s) * ((Q * np.maximum(w, 1.0)) @ Q.T)
@@ -342,7 +342,7 @@ def _floored(a: np.ndarray, floor: np.ndarray) -> np.ndarray:
 def restoring(
     config: SpinnConfig, reference: FossenDynamics
 ) -> tuple[Float[np.ndarray, "3"], float, float]:
-    """What a bounded potential starts from: slope on R_WBᵀ e_z, heave energy (J), bound λ (J)."""
+    """Initial bounded potential: slope on R_WBᵀ e_z, heave energy (J), bound λ (J)."""
     buoyancy, weight = float(reference.buoyancy), float(reference.weight)
     lever = buoyancy * np.asarray(reference.p_BoCb_B) - weight * np.asarray(reference.p_BoBcm_B)
     moment = max(float(np.linalg.norm(lever)), 1e-3 * weight * config.length_scale)

@@ -1,9 +1,9 @@
 """Eigenvalues and positive functions of symmetric 6 x 6 matrices, batched, samples last.
 
 Cyclic Jacobi in elementwise arithmetic: each of a sweep's five rounds rotates three disjoint pairs
-of indices at once, so that a sweep meets all fifteen (Golub and Van Loan 2013, section 8.5; Brent
+of indices at once, so that a sweep covers all fifteen (Golub and Van Loan 2013, section 8.5; Brent
 and Luk 1985 for the order). The derivative of a matrix function is Daleckii and Krein's (1965)
-formula, finite where eigenvalues meet; that of single eigenvectors is not.
+formula, which is finite at equal eigenvalues; that of single eigenvectors is not.
 """
 
 import functools
@@ -15,15 +15,15 @@ from jaxtyping import Array, Float
 
 _N = 6
 _NEXT = (0, 3, 1, 5, 2, 4)
-"""The round-robin move of the indices after a round; five of them are the identity."""
+"""Round-robin permutation of the indices after a round; its fifth power is the identity."""
 
 
 def jacobi(
     A: Float[Array, "6 6 *batch"], sweeps: int | None = None
 ) -> tuple[Float[Array, "6 *batch"], Float[Array, "6 6 *batch"]]:
-    """Eigenvalues w (in no order) and orthonormal eigenvectors, the columns of Q: A = Q diag(w) Qᵀ.
+    """Eigenvalues w (unordered) and orthonormal eigenvectors, the columns of Q: A = Q diag(w) Qᵀ.
 
-    Convergence is quadratic; 5 sweeps reach float32's rounding and 6 float64's.
+    Convergence is quadratic; 5 sweeps reach float32 precision and 6 float64 precision.
     """
     sweeps = (6 if A.dtype == jnp.float64 else 5) if sweeps is None else sweeps
     eye = jnp.eye(_N, dtype=A.dtype).reshape((_N, _N) + (1,) * (A.ndim - 2))
@@ -39,7 +39,7 @@ def jacobi(
 
 
 def _rotations(A: Array) -> tuple[Array, Array]:
-    """Cosines and sines (3, *batch) that annul entries (0, 1), (2, 3) and (4, 5)."""
+    """Cosines and sines (3, *batch) that zero entries (0, 1), (2, 3) and (4, 5)."""
     p, q = (0, 2, 4), (1, 3, 5)
     gap = jnp.stack([A[j, j] - A[i, i] for i, j in zip(p, q, strict=True)])
     off = 2 * jnp.stack([A[i, j] for i, j in zip(p, q, strict=True)])
@@ -75,8 +75,8 @@ def positive(
 ) -> tuple[Float[Array, "6 6 *batch"], Float[Array, "6 6 *batch"]]:
     """f(A) and f(A)⁻¹ for f(w) = (w + √(w² + 4)) / 2, which maps eigenvalues to positive ones.
 
-    f(0) = 1 and 1 / f(w) = f(-w). First derivatives are exact for every A; for second ones the
-    Cholesky form is the one to use.
+    f(0) = 1 and 1 / f(w) = f(-w). First derivatives are exact for every A; for second derivatives
+    use the Cholesky form.
     """
     return _positive(A)[0]
 

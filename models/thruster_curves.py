@@ -1,8 +1,8 @@
-"""Steady force of one thruster as a function of PWM and supply voltage, and back.
+"""Steady force of one thruster as a function of PWM and supply voltage, and its inverse.
 
-Every function works element by element on arrays of one rank (scalars stand for any shape), so a
-curve knows nothing of how many thrusters there are. Forces are in N along the thruster's own axis,
-PWM in µs (1500 stopped, above it forward), voltages in V, currents in A.
+Every function is elementwise on arrays of one rank (scalars broadcast), so a curve does not depend
+on the number of thrusters. Forces are in N along the thruster's axis, PWM in µs (1500 stopped,
+above it forward), voltages in V, currents in A.
 """
 
 import abc
@@ -17,14 +17,14 @@ from jaxtyping import Array, Float
 from .rigid_body import GRAVITY
 
 NEUTRAL = 1500.0
-"""PWM at which a thruster rests, µs."""
+"""PWM of a stopped thruster, µs."""
 RESTING = 1e-6
-"""Force (N) up to which a thruster rests. Within a dead band the force grows up to it in proportion
-to the pulse, so that forces tell what was commanded where another curve has the thruster turn."""
+"""Force (N) up to which a thruster counts as stopped. Within a dead band the force is proportional
+to the pulse up to this value, so that it encodes the command for a curve with a narrower band."""
 
 
 class ThrusterCurve(eqx.Module):
-    """Force against PWM and voltage: strictly increasing, around 1500 µs by `RESTING` at most."""
+    """Force over PWM and voltage: strictly increasing, in the dead band by at most `RESTING`."""
 
     @abc.abstractmethod
     def force(
@@ -36,7 +36,7 @@ class ThrusterCurve(eqx.Module):
     def pwm(
         self, force: Float[Array, "*shape"], voltage: Float[Array, "*#shape"]
     ) -> Float[Array, "*shape"]:
-        """PWM in µs that gives `force`; beyond the curve's end the limit, 1500 for no force."""
+        """PWM in µs that gives `force`, clipped at the ends of the curve; 1500 for no force."""
 
     @abc.abstractmethod
     def limits(
@@ -78,7 +78,7 @@ def _t200_table() -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
 
 
 def _over(table: Array, x: Array) -> Array:
-    """`table` with axes of length 1 at its end, so that it broadcasts in front of `x`."""
+    """`table` with trailing axes of length 1, so that its axes precede those of `x`."""
     return table.reshape(table.shape + (1,) * x.ndim)
 
 
@@ -87,9 +87,9 @@ def _same_rank(voltage: Array, x: Array) -> Array:
 
 
 def _interpolate(x: Float[Array, "*shape"], knots: Array, values: Array) -> Float[Array, "*shape"]:
-    """Piecewise linear and held at the ends, as a sum of clipped ramps: no gathers.
+    """Piecewise linear and constant beyond the ends, as a sum of clipped ramps: no gathers.
 
-    `values` (knots, …) broadcasts against x behind its first axis.
+    `values` (knots, …) broadcasts against x after its first axis.
     """
     start, width = _over(knots[:-1], x), _over(jnp.diff(knots), x)
     parts = jnp.clip((x[None] - start) / width, 0, 1)
@@ -97,12 +97,12 @@ def _interpolate(x: Float[Array, "*shape"], knots: Array, values: Array) -> Floa
 
 
 class T200Curve(ThrusterCurve):
-    """Blue Robotics T200, bilinear in PWM and voltage between the maker's bollard figures.
+    """Blue Robotics T200, bilinear in PWM and voltage between the maker's bollard data.
 
-    Source: Blue Robotics, T200 public performance data, September 2019 (R1 unit, Basic ESC), the
-    rounded figures of `vehicles/t200.csv`. Forward thrust exceeds reverse thrust by a quarter to a
-    third; the dead band, in which it rests, narrows from 1460–1540 µs at 10 V to 1476–1528 µs at
-    20 V. PWM is clamped to 1100–1900 µs and voltage to 10–20 V (12–20 V for the current).
+    Source: Blue Robotics, T200 public performance data, September 2019 (R1 unit, Basic ESC),
+    rounded in `vehicles/t200.csv`. Forward thrust exceeds reverse thrust by a quarter to a third;
+    the dead band narrows from 1460–1540 µs at 10 V to 1476–1528 µs at 20 V. PWM is clamped to
+    1100–1900 µs and voltage to 10–20 V (12–20 V for the current).
     """
 
     voltages: Float[Array, "V"]
@@ -120,7 +120,7 @@ class T200Curve(ThrusterCurve):
         )
 
     def _column(self, voltage: Float[Array, "*shape"]) -> Float[Array, "K *shape"]:
-        """Forces at the knots for a voltage."""
+        """Forces at the PWM knots for a voltage."""
         start = _over(self.voltages[:-1], voltage)
         parts = jnp.clip((voltage[None] - start) / _over(jnp.diff(self.voltages), voltage), 0, 1)
         rises = jnp.tensordot(jnp.diff(self.forces, axis=0).T, parts, 1)
@@ -157,7 +157,7 @@ class T200Curve(ThrusterCurve):
         return column[0], column[-1]
 
     def _currents(self, pwm: Float[Array, "*shape"]) -> Float[Array, "U *shape"]:
-        """Currents at the voltages for which they are tabulated."""
+        """Currents at the tabulated voltages."""
         table = [_interpolate(pwm, self.current_knots, _over(row, pwm)) for row in self.currents]
         return jnp.stack(table)
 
@@ -186,12 +186,12 @@ class T200Curve(ThrusterCurve):
 
 
 class QuadraticCurve(ThrusterCurve):
-    """ArduSub's simulated thruster: F = F_max u|u| with u = (PWM - 1500)/400, whatever the voltage.
+    """ArduSub's simulated thruster: F = F_max u|u| with u = (PWM - 1500)/400 at any voltage.
 
-    It rests within `dead_band` µs of 1500 (edges included), so the force jumps at the edge, and has
-    none at or beyond 1000 and 2000 µs, which are no valid pulses (ArduPilot, SIM_Submarine.cpp).
-    The inverse answers forces smaller than the jump, larger than `RESTING`, with the nearer of 1500
-    and the dead band's edge, and stays within 1100–1900 µs.
+    It is stopped within `dead_band` µs of 1500 (edges included), so the force jumps at the edge,
+    and at or beyond 1000 and 2000 µs, which are invalid pulses (ArduPilot, SIM_Submarine.cpp). For
+    forces between `RESTING` and the jump the inverse is the nearer of 1500 and the dead band's
+    edge; it stays within 1100–1900 µs.
     """
 
     full_force: Float[Array, ""]
@@ -245,5 +245,5 @@ class QuadraticCurve(ThrusterCurve):
         open_circuit: Float[Array, "*#batch"],
         resistance: Float[Array, ""],
     ) -> Float[Array, "*batch"]:
-        """The open-circuit voltage: this thruster draws nothing."""
+        """The open-circuit voltage: this thruster draws no current."""
         return open_circuit + jnp.zeros_like(pwm[0])

@@ -1,4 +1,4 @@
-"""The eight thrusters: geometry, PWM to force and back, allocation of a wrench, and lag.
+"""The eight thrusters: geometry, conversion of PWM and force, allocation of a wrench, and lag.
 
 Order and signs are ArduSub's (frame VECTORED_6DOF): thrusters 1–4 horizontal, front right, front
 left, rear right, rear left; 5–8 vertical in the same order. `directions` is the force in B
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from .thruster_curves import NEUTRAL, ThrusterCurve
 
 REST = 0.1
-"""Below this force, N, a thruster counts as standing still for the start delay."""
+"""Below this force (N) a thruster counts as stopped for the start delay."""
 
 
 def allocation_matrix(
@@ -31,8 +31,8 @@ class Thrusters(eqx.Module):
     """Thrusters fixed to the body, all of one kind.
 
     `motor_directions` are ArduSub's MOT_n_DIRECTION: -1 where PWM above 1500 turns the propeller
-    backwards, so that the thruster gives its reverse thrust; the autopilot's mixer mirrors its
-    output about 1500 there and `pwm` does so too.
+    backwards, so that the thruster gives its reverse thrust; there the autopilot's mixer mirrors
+    its output about 1500, and so does `pwm`.
     """
 
     positions: Float[Array, "3 n"]
@@ -64,11 +64,11 @@ class Thrusters(eqx.Module):
     ):
         """Positions in m from Bo; times in s; battery's open-circuit voltage in V, resistance in Ω.
 
-        `effort` (positive) weighs the squares of the forces that `allocate` keeps small.
+        `effort` (positive) weights the squared forces that `allocate` minimises.
 
         Raises:
-            ValueError: an array has the wrong size, the allocation has not rank 6, or a value is
-                out of range.
+            ValueError: an array has the wrong size, the rank of the allocation is not 6, or a value
+                is out of range.
         """
         p, d = np.asarray(positions, float), np.asarray(directions, float)
         n = p.shape[-1]
@@ -120,7 +120,7 @@ class Thrusters(eqx.Module):
     # ------------------------------------------------------------------------------ PWM and force
 
     def _voltage(self, voltage: ArrayLike | None, rank: int) -> Array:
-        """The nominal voltage for None; a batch gets the thrusters' axis in front."""
+        """The nominal voltage for None; a batch gets a leading axis for the thrusters."""
         if voltage is None:
             return self.nominal_voltage
         V = jnp.asarray(voltage, self.nominal_voltage.dtype)
@@ -135,7 +135,7 @@ class Thrusters(eqx.Module):
     def pwm(
         self, force: Float[Array, "n *batch"], voltage: ArrayLike | None = None
     ) -> Float[Array, "n *batch"]:
-        """PWM in µs whose steady force is `force`, held within 1100–1900 µs."""
+        """PWM in µs whose steady force is `force`, clipped to 1100–1900 µs."""
         return self._mirror(self.curve.pwm(force, self._voltage(voltage, force.ndim)))
 
     def _mirror(self, pwm: Float[Array, "n *batch"]) -> Float[Array, "n *batch"]:
@@ -155,7 +155,7 @@ class Thrusters(eqx.Module):
     ) -> Float[Array, "*batch"]:
         """Battery voltage V = Voc - R ΣI(PWM, V) under the thrusters' current.
 
-        `open_circuit` is the nominal voltage unless given: a number or one for each batch entry.
+        `open_circuit` defaults to the nominal voltage: a number or one for each batch entry.
         """
         V = self._voltage(open_circuit, 0)
         return self.curve.loaded_voltage(self._mirror(pwm), V, self.resistance)
@@ -172,15 +172,15 @@ class Thrusters(eqx.Module):
         voltage: ArrayLike | None = None,
         scale: Literal["common", "groups"] = "common",
     ) -> Float[Array, "n *batch"]:
-        """Forces in N within the limits that give `F_Bo_B`, or as much of it as they can.
+        """Forces in N within the limits that give `F_Bo_B`, or as much of it as is feasible.
 
-        The least forces in the sense of `effort` (weighted pseudo-inverse; Fossen 2011, ch. 12.3),
-        then, where a limit binds, the smallest inner bias, horizontals against each other and
-        verticals against each other, that leaves the wrench as it is: forward thrust exceeds
-        reverse thrust, and the bias moves load to the thrusters that run forward. What still
-        doesn't fit is scaled down: `common` by one factor, so that the wrench keeps its direction,
-        `groups` horizontals and verticals each by their own, as ArduSub's mixer does: heave, roll
-        and pitch then keep their authority while the vehicle races, and the direction turns.
+        The forces of least `effort` (weighted pseudo-inverse; Fossen 2011, ch. 12.3), plus, where a
+        limit is active, the smallest null-space bias of the horizontals and of the verticals, which
+        leaves the wrench unchanged: forward thrust exceeds reverse thrust, and the bias moves load
+        to the thrusters that run forward. A wrench that is still infeasible is scaled down:
+        `common` by one factor, which keeps its direction, `groups` horizontals and verticals each
+        by their own, as ArduSub's mixer does: heave, roll and pitch then keep their authority at
+        full speed, and the direction changes.
         """
         force = jnp.tensordot(self.inverse, F_Bo_B, 1)
         low, high = self.curve.limits(self._voltage(voltage, force.ndim))
@@ -192,7 +192,7 @@ class Thrusters(eqx.Module):
             planar, upright = self.groups
             in_plane = _column(np.array([1, 1, 0, 0, 0, 1], bool), force)
             factor = self._fitting_scale(force, low, high, planar)[None]
-            # the verticals balance the moments of what the horizontals really give
+            # the verticals balance the moments of the horizontals' actual forces
             force = jnp.tensordot(self.inverse, F_Bo_B * jnp.where(in_plane, factor, 1), 1)
             factor = self._fitting_scale(force, low, high, upright)[None]
             vertical = np.isin(np.arange(len(force)), upright)
@@ -212,10 +212,10 @@ class Thrusters(eqx.Module):
     def _fitting_scale(
         self, force: Array, low: Array, high: Array, group: tuple[int, ...]
     ) -> Array:
-        """Largest s ≤ 1 for which some bias c puts s f + c n within the limits.
+        """Largest s ≤ 1 for which s f + c n is within the limits for some bias c.
 
         With g = f/n and limits l, h divided likewise, s g_i + c ≤ h_i and s g_j + c ≥ l_j for all
-        pairs: s (g_i - g_j) ≤ h_i - l_j. A thruster without bias (n = 0) bounds s alone.
+        pairs: s (g_i - g_j) ≤ h_i - l_j. A thruster without bias (n = 0) bounds s by itself.
         """
         index = np.array(group)
         n = _column(self.bias[index], force)
@@ -249,12 +249,12 @@ class Thrusters(eqx.Module):
         command: Float[Array, "n *batch"],
         dt: ArrayLike,
     ) -> tuple[Float[Array, "n *batch"], Float[Array, "n *batch"]]:
-        """`lag` with the pause in which a sensorless motor drive starts a propeller from rest.
+        """`lag` with the delay of a sensorless motor drive that starts a propeller from rest.
 
-        `waited` (s, start with zeros) counts the time since a stopped thruster was told to turn;
-        nothing happens until it reaches `start_delay`. A thruster that turns, also one that passes
-        through zero on its way to the other side, waits no more until it has stood still without
-        command. Returns the new force and the new `waited`.
+        `waited` (s, initially zero) is the time since a stopped thruster got a command; the force
+        stays constant until it reaches `start_delay`. A running thruster, also one that passes
+        through zero to reverse, is not delayed again until it has been stopped without a command.
+        Returns the new force and the new `waited`.
         """
         dt = jnp.asarray(dt, force.dtype)
         rests = jnp.abs(force) < REST
@@ -274,7 +274,7 @@ def _column(values: Array | np.ndarray, x: Array) -> Array:
 
 
 def _null_vector(B: Float[np.ndarray, "6 k"]) -> Float[np.ndarray, "k"]:
-    """Forces without wrench, largest entry 1, if they form a line; else zeros."""
+    """Basis of the null space of B, largest entry 1, if it has dimension one; else zeros."""
     _, values, rows = np.linalg.svd(B)
     values = np.concatenate([values, np.zeros(B.shape[1])])[: B.shape[1]]
     if np.sum(values < 1e-9 * values[0]) != 1:

@@ -1,1 +1,1 @@
-"""Vehicles in numbers: the presets that are shipped, their thrusters' curves."""
+"""Vehicle parameters: the shipped presets and their thruster curves."""

@@ -1,8 +1,8 @@
-"""A vehicle in numbers: hull, hydrodynamics, thrusters, battery; and the presets that are shipped.
+"""Parameters of a vehicle: hull, hydrodynamics, thrusters, battery; and the shipped presets.
 
-All coefficients are stated about Bo in B (forward, left, up). Added mass and damping are positive
-magnitudes, diagonal, of the SNAME derivatives (X_u̇ and so on, whose own sign is negative); a
-diagonal is the same in forward-left-up and in forward-starboard-down axes.
+All coefficients are about Bo in B (forward, left, up). Added mass and damping are diagonal, and are
+the positive magnitudes of the SNAME derivatives (X_u̇ and so on, which are negative); a diagonal is
+the same in forward-left-up and in forward-starboard-down axes.
 """
 
 import os
@@ -45,7 +45,7 @@ class Quadratic:
 
 @dataclass(frozen=True)
 class Mount:
-    """Where a thruster sits (m from Bo) and its force in B per newton at PWM above 1500.
+    """Position of a thruster (m from Bo) and its force in B per newton at PWM above 1500.
 
     `motor` is ArduSub's MOT_n_DIRECTION: -1 where PWM above 1500 turns the propeller backwards.
     """
@@ -57,7 +57,7 @@ class Mount:
 
 @dataclass(frozen=True)
 class Propulsion:
-    """Eight thrusters in ArduSub's order; lag (s); battery's open voltage (V), resistance (Ω)."""
+    """Eight thrusters in ArduSub's order; lag (s); open-circuit voltage (V), resistance (Ω)."""
 
     mounts: tuple[Mount, ...]
     curve: T200 | Quadratic = field(default_factory=T200)
@@ -69,10 +69,10 @@ class Propulsion:
 
 @dataclass(frozen=True)
 class Vehicle:
-    """Everything the models need to know of a vehicle; SI units, B forward-left-up, Bo the origin.
+    """All parameters of a vehicle model; SI units, B forward-left-up, Bo the origin.
 
-    `sources` says for each entry (by its path, such as `propulsion.mounts`) where it comes from;
-    [E] marks an engineering estimate. The file of every shipped preset has one for every number.
+    `sources` gives the source of each entry by its path, such as `propulsion.mounts`; [E] marks an
+    engineering estimate. The file of every shipped preset has one for every number.
     """
 
     name: str
@@ -157,10 +157,10 @@ def load_vehicle(name_or_path: str | Path) -> Vehicle:
     """Read a preset by its name, or a vehicle's YAML file by its path (anything with a suffix).
 
     Raises:
-        UserError: there is no such preset or file, or its content is no vehicle.
+        UserError: there is no such preset or file, or its content is not a vehicle.
     """
     if isinstance(name_or_path, Path) or Path(name_or_path).suffix:
-        if not os.path.exists(name_or_path):  # its name may come from data, so say what it is
+        if not os.path.exists(name_or_path):  # the name may come from data: name its kind
             raise UserError(
                 f"vehicle `{name_or_path}`: there is no such file; name a preset or the path of a "
                 ".yaml file"

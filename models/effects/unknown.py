@@ -48,7 +48,7 @@ class Unknown(Effect):
     a wrench on an axis of (z - c) / s times its own velocity, and times that velocity's square.
     `play` and `slew`: one thruster or all (`thrusters`) have backlash of ± numbers[0] (N) or a
     rate limit of numbers[0] (N/s); the weight 0 is no such effect, 1 the full one.
-    `exchange`: two thrusters, by number, take this share of each other's command.
+    `exchange`: two thrusters, by number, take a share (the weight) of each other's command.
     """
 
     name: ClassVar[str] = "unknown"

@@ -42,7 +42,7 @@ class GyroBias(Effect):
 
 
 class HeadingError(Effect):
-    """ψ_recorded = ψ + s sin ψ + c cos ψ + o: compass deviation by the vehicle's own field.
+    """ψ_recorded = ψ + s sin ψ + c cos ψ + o: compass deviation by the vehicle's magnetic field.
 
     ψ is measured from east, counter-clockwise. s and c are the semicircular deviation (Bowditch
     2019, ch. 8); o is a constant offset.

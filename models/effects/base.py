@@ -83,7 +83,7 @@ class Effect(eqx.Module):
         name: the cause's name in reports.
         parameters: those of one place.
         places: where it can act (axis, thruster number, frame).
-        simpler: causes that explain the same data with fewer parameters, preferred if as good.
+        simpler: causes that explain the same data with less, preferred unless clearly worse.
         echoes: causes with similar signatures, which may appear as each other's residue.
         essential: parameters of which at least one must differ from zero for this cause.
         absorber: whether it fits slow structure of any origin, and is therefore ranked last.

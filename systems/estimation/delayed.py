@@ -1,11 +1,11 @@
-"""An error-state Kalman filter at a delayed horizon, so that late measurements need no tricks.
+"""An error-state Kalman filter at a delayed time horizon, for measurements that arrive late.
 
-A DVL's reading arrives 0.1 to 0.2 s after its time of validity. The filter therefore stands
-`horizon` seconds in the past: inertial samples and readings wait in a ring of slots, one for each
-inertial sample, and a reading goes to the slot of its own time, whenever it arrives. When a slot
-leaves the ring the filter predicts over its sample and fuses its readings, all in their true
-order: the estimate is that of an ordinary Kalman filter without delays. The present follows by
-applying the waiting samples' preintegrated increment (Khosravian et al. 2015 give this predictor).
+A DVL's reading arrives 0.1 to 0.2 s after its time of validity. The filter therefore estimates the
+state `horizon` seconds in the past. Inertial samples and readings are buffered in a ring of slots,
+one for each inertial sample; a reading enters the slot of its time of validity. When a slot leaves
+the ring the filter predicts over its sample and fuses its readings, in chronological order: the
+estimate is that of an ordinary Kalman filter without delays. The present state follows by applying
+the preintegrated increment of the buffered samples (the predictor of Khosravian et al. 2015).
 """
 
 import math
@@ -28,12 +28,12 @@ from .inertial import Motion, Samples
 from .trust import SIZES, Shown, Trust, counted, imu_off, judged, suspected, with_doubt
 
 SLOT = 22
-"""Has sample, force 3, mean rate 3 | has dvl, v 3 | has depth, depth | has compass, yaw | rate at
-the end 3 | `inertial.LEFT_OPEN`."""
+"""Columns of a slot: has sample, force 3, mean rate 3 | has dvl, v 3 | has depth, depth | has
+compass, yaw | rate at the end 3 | `inertial.LEFT_OPEN`."""
 _DVL, _DEPTH, _COMPASS, _RATE, _OPEN = 7, 11, 13, 15, 18
 _FLAGS = np.array([_DVL, _DEPTH, _COMPASS])
 _SINCE = 9  # components of `FilterState.since` that are sums
-_LONGEST = 0.1  # s that the covariance waits at most for a reading
+_LONGEST = 0.1  # s: longest interval between predictions of the covariance
 
 STATUS = (
     "time",
@@ -56,27 +56,27 @@ HEALTH = ("state", "imu", "dvl", "depth", "compass")
 
 @dataclass(frozen=True)
 class EkfConfig:
-    """Alignment and gates of the filter; the sensors' own configurations give their noises.
+    """Initial covariance and gates of the filter; the sensors' configurations give their noises.
 
     Attributes:
         position_std: of the initial position in body axes (m).
         attitude_std: of the initial attitude about the body axes (rad).
         velocity_std: of the initial velocity in body axes (m/s).
-        imu_factor: the IMU's noise densities times this are the filter's. It covers errors of
-            second order, of bias times attitude say. Over 30 runs of a minute in calm water the
-            NEES of attitude is 3.4 ± 0.2 at 1 and that of velocity 2.5 ± 0.1 at 1.5, where 3 is
-            right (`spinndrift check estimator --only calm`, and `tests/test_filtering.py` without a
-            DVL).
-        horizon: how long readings may take to arrive (s).
-        gate: share of good readings that pass the chi-square gate.
-        patience: after so many rejections in a row either the sensor is at fault and is left out,
-            until as many readings pass again, or the filter may have lost its way: then what the
-            sensor measures counts as unknown, by the size of the residual, and its reading is taken
+        imu_factor: the filter multiplies the IMU's noise densities by this factor. It covers
+            second-order errors such as bias times attitude error. Over 30 one-minute runs in calm
+            water the NEES of attitude is 3.4 ± 0.2 at 1 and that of velocity 2.5 ± 0.1 at 1.5; a
+            consistent filter has 3 (`spinndrift check estimator --only calm`, and
+            `tests/test_filtering.py` without a DVL).
+        horizon: longest latency of a reading (s).
+        gate: probability that a good reading passes the chi-square gate.
+        patience: number of consecutive rejections after which a sensor is judged. Either it is at
+            fault and left out until as many readings pass in a row, or the filter may have
+            diverged: then the covariance grows by the squared residual and the reading is fused
             (`systems.estimation.trust`).
         output_rate: estimates per second (Hz).
-        silence: a sensor without an accepted reading for so long is not trusted (s).
-        lost_velocity: the state is lost where velocity is known no better than this, 1 σ (m/s).
-        lost_attitude: the same of roll, pitch and yaw (rad).
+        silence: time without an accepted reading after which a sensor is not trusted (s).
+        lost_velocity: standard deviation of velocity above which the state is lost (m/s).
+        lost_attitude: the same for roll, pitch and yaw (rad).
     """
 
     position_std: Vector3 = (0.02, 0.02, 0.02)
@@ -104,14 +104,14 @@ class EkfConfig:
 
 
 class FilterState(NamedTuple):
-    """Everything that changes."""
+    """The filter's state."""
 
     nominal: Navigation
     P: Float[Array, "18 18"]
     ring: Float[Array, "slots 22"]
     since: Float[Array, "12"]
-    """Since P's time: the time, sums of force · dt and rate · dt, variances that missing forces and
-    rates leave, and v_B at its beginning."""
+    """Since the time of P: elapsed time, sums of force · dt and rate · dt, variances due to missing
+    forces and rates; and v_B at the time of P."""
     samples: Samples
     motion: Motion
     shown: Shown
@@ -119,7 +119,7 @@ class FilterState(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """What the sensors show at one time; a reading's time tells which slot it belongs to."""
+    """Sensor outputs at one time; the time of validity of a reading selects its slot."""
 
     imu: Float[Array, "6"]
     """Specific force (m/s²) and angular rate (rad/s) in the sensor's axes."""
@@ -131,7 +131,7 @@ class Readings(NamedTuple):
     """Yaw (rad), valid, time (s)."""
 
     def by_kind(self) -> tuple[Float[Array, "5"], Bool[Array, "3"], Float[Array, "3"]]:
-        """Of DVL, depth gauge and compass: all values, valid marks, times (s)."""
+        """Values, validity flags and times (s) of DVL, depth gauge and compass."""
         readings = (self.dvl, self.depth, self.compass)
         values = jnp.concatenate([each[:-2] for each in readings])
         marks = jnp.stack([each[-2] > 0 for each in readings])
@@ -148,7 +148,7 @@ class DelayedFilter(eqx.Module):
     config: EkfConfig = eqx.field(static=True)
 
     def __check_init__(self) -> None:
-        """Check that the DVL's readings arrive in time and that no sensor is perfect."""
+        """Check that the DVL's readings arrive within the horizon and that no noise is zero."""
         for sensor in (self.dvl, self.depth, self.compass):
             require(
                 sensor.noise > 0, sensor, "noise", "give more than zero: a filter divides by it"
@@ -168,11 +168,11 @@ class DelayedFilter(eqx.Module):
 
     @property
     def slots(self) -> int:
-        """Samples that wait."""
+        """Number of buffered samples."""
         return math.ceil(self.config.horizon * self.imu.rate - 1e-9)
 
     def samples_at_once(self, most: int) -> int:
-        """How many samples `steps` may take, a divisor of `most`, so that no reading is missed."""
+        """Largest divisor of `most` so that `take_in` of so many samples misses no reading."""
         dvl = 1 / self.dvl.rate - (self.dvl.latest_latency - self.dvl.earliest_latency)
         shortest = min(dvl, 1 / self.depth.rate, 1 / self.compass.rate)
         fit = [
@@ -214,9 +214,9 @@ class DelayedFilter(eqx.Module):
     def step(self, state: FilterState, readings: Readings, k: Float[Array, ""]) -> FilterState:
         """Take in sample number k (of time k · period) and advance the horizon by one slot.
 
-        Sample 0 belongs to the start: it moves nothing. Before it, k is negative. The nominal state
-        moves with every sample; the covariance follows, with the samples' mean, where a reading is
-        fused and every 0.1 s.
+        Sample 0 is at the initial time and causes no prediction; before it, k is negative. The
+        nominal state is predicted with every sample; the covariance is predicted with the mean of
+        the samples, before a reading is fused and at least every 0.1 s.
         """
         state, slots = self.take_in(state, readings.imu[None], readings, k)
         state, at = self.move(state, slots, jnp.zeros((), k.dtype))
@@ -231,8 +231,8 @@ class DelayedFilter(eqx.Module):
     ) -> tuple[FilterState, Float[Array, "n 22"]]:
         """Put samples that end with number `last` into the ring; return the slots that leave it.
 
-        `samples` are the IMU's, oldest first; of `readings` only the other sensors count. The slots
-        are then passed by `move`, and where it stops `fuse`, until all are: `step` for n samples.
+        `samples` are the IMU's, oldest first; the IMU's entry in `readings` is not used. The caller
+        then alternates `move` and `fuse` until it has processed all slots: `step` for n samples.
         """
         dtype, h, n = state.ring.dtype, self.period, samples.shape[0]
         number = last - (self.slots + n - 1) + jnp.arange(self.slots + n, dtype=dtype)
@@ -265,14 +265,14 @@ class DelayedFilter(eqx.Module):
         return state._replace(ring=ring[n:], samples=memory, shown=shown), ring[:n]
 
     def _still(self, x: Navigation, omega: Float[Array, "3"]) -> Float[Array, "3"]:
-        """The force without bias that keeps the velocity in B at a rate ω."""
+        """The specific force without bias that keeps v_B constant at angular rate ω."""
         up = jnp.asarray((0.0, 0.0, self.imu.gravity), x.v_B.dtype)
         return se3.rotate_inverse(x.X_WB, up) + se3.cross(omega, x.v_B)
 
     def move(
         self, state: FilterState, slots: Float[Array, "n 22"], first: Float[Array, ""]
     ) -> tuple[FilterState, Float[Array, ""]]:
-        """Move the nominal state from slot `first` on over the next one that needs `fuse`.
+        """Predict the nominal state from slot `first` through the next one that needs `fuse`.
 
         Returns the number of that slot, or n.
         """
@@ -310,7 +310,7 @@ class DelayedFilter(eqx.Module):
     def fuse(
         self, state: FilterState, slot: Float[Array, "22"], k: Float[Array, ""]
     ) -> FilterState:
-        """Bring P up to date and use the readings of the slot that left with sample number k."""
+        """Predict P and fuse the readings of the slot that left with sample number k."""
         x, trust = state.nominal, state.trust
         F, P = self._covariance(state, x, state.since[:_SINCE])
         plain = (
@@ -328,7 +328,7 @@ class DelayedFilter(eqx.Module):
         trust, (left_out, follow) = judged(trust, used, off, self.config.patience, well)
         own = (error_state.VELOCITY, error_state.POSITION, error_state.ROTATION)
         for i, (each, part) in enumerate(zip(plain, own, strict=True)):
-            # what is followed counts as unknown until it is read
+            # a followed sensor's quantity is as uncertain as its residual is large
             H, unknown = each.H[:, part], jnp.where(follow[i], each.residual**2, 0)
             P = P.at[part, part].add(H.T @ (unknown[:, None] * H))
         gates = tuple(float(chi2.ppf(self.config.gate, size)) for size in SIZES)
@@ -364,7 +364,7 @@ class DelayedFilter(eqx.Module):
         found: measurement.Innovation,
         used: Bool[Array, "3"],
     ) -> Float[Array, "3 18"]:
-        """The pulls after an update: each sensor's own adds, the others' correct."""
+        """The pulls after an update: a sensor's own correction adds, those of others reduce."""
         own = np.repeat(np.eye(len(SIZES), dtype=bool), SIZES, axis=1)
         read = jnp.where(used[:, None], found.residual[None], 0)
         return pulled - jnp.where(own, read, pulled @ found.H.T) @ done.gain.T
@@ -384,7 +384,7 @@ class DelayedFilter(eqx.Module):
     def _covariance(
         self, state: FilterState, after: Navigation, gone: Float[Array, "9"]
     ) -> tuple[Float[Array, "18 18"], Float[Array, "18 18"]]:
-        """F and P after `gone`: what `FilterState.since` sums."""
+        """F and P after an interval with the sums `gone` (as in `FilterState.since`)."""
         time = gone[0]
         some = jnp.maximum(time, self.period)
         before = state.nominal._replace(v_B=state.since[_SINCE:])
@@ -401,12 +401,12 @@ class DelayedFilter(eqx.Module):
         return F, (P + P.T) / 2
 
     def _between_samples(self, state: FilterState) -> Float[Array, "18 18"]:
-        """What one sample of an IMU that does not integrate leaves open about its interval T.
+        """Covariance of the interpolation over a period T of an IMU that does not integrate.
 
         Between two known values a Brownian rate of density σ² has an integral of variance
-        σ² T³ / 12, and second differences of variance 2 σ² T. Independent forces of variance s²,
-        whose second differences have 6 s², leave at most s² T² open of the change of velocity.
-        Of smooth motion second differences show next to nothing.
+        σ² T³ / 12, and second differences of variance 2 σ² T. Independent forces of variance s²
+        have second differences of variance 6 s² and add a variance of at most s² T² to velocity.
+        Second differences of smooth motion are near zero.
         """
         T = self.period
         open_ = jnp.zeros_like(state.P)
@@ -441,9 +441,9 @@ class DelayedFilter(eqx.Module):
     ) -> tuple[Float[Array, "7"], Float[Array, "6"], Float[Array, "18 18"]]:
         """Pose, twist and error covariance `ahead` seconds after the newest sample.
 
-        The waiting samples are applied to the horizon's state; beyond the newest one its rate and
-        the mean force of the last few hold on. The covariance crosses the waiting time in one step,
-        and grows beyond it by how far samples have lately been from what was foreseen of them.
+        The buffered samples are applied to the state at the horizon; beyond the newest one its rate
+        and the mean force of the last few are held. The covariance is predicted over the buffered
+        samples in one step, and beyond them grows by the recent one-step prediction errors.
         """
         x, ring = state.nominal, state.ring
         time = ring[:, 0] * self.period
@@ -469,7 +469,7 @@ class DelayedFilter(eqx.Module):
     def _foreseen(
         self, state: FilterState, now: Navigation, ahead: float | Float[Array, ""]
     ) -> Float[Array, "18 18"]:
-        """Covariance of what the mean force and rate of `ahead` are off what was foreseen."""
+        """Covariance due to the error of the predicted mean force and rate over `ahead`."""
         a = ahead * jnp.eye(3, dtype=state.P.dtype)
         J = jnp.zeros((error_state.ERRORS, 6), state.P.dtype)
         J = J.at[error_state.POSITION, :3].set(ahead / 2 * a)

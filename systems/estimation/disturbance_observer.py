@@ -16,7 +16,7 @@ from ..compiled.pure import Event, Inputs, Pure, State, shown
 
 
 class ObserverState(eqx.Module):
-    """What the observer knew at its last call; `seen` is 0 before the first."""
+    """Bias, and the observer's inputs at its last call; `seen` is 0 before the first."""
 
     F_bias_Bo_W: Float[Array, "6"]
     X_WB: Float[Array, "7"]
@@ -26,13 +26,13 @@ class ObserverState(eqx.Module):
 
 
 class MomentumObserver(eqx.Module):
-    """Low-passed difference between the motion that was seen and the one that was commanded.
+    """Low-pass filtered difference between the observed motion and the model's.
 
-    Over one period the model without disturbance would have accelerated by a(X, ξ, F); the wrench
-    that explains the rest is M(ξ) ((ξ⁺ − ξ)/dt − a), a discrete form of the generalised-momentum
-    observer (De Luca and Mattone 2003). With the axes of W it changes slowly for a current or a
-    tether however the vehicle turns, and a first-order low-pass of `time_constant` takes noise and
-    waves out of it. `limit` (N, N·m) bounds the norms of its force and of its moment.
+    Over one period the model without disturbance accelerates by a(X, ξ, F); the disturbance wrench
+    is M(ξ) ((ξ⁺ − ξ)/dt − a), a discrete form of the generalised-momentum observer (De Luca and
+    Mattone 2003). Expressed in W, the wrench of a current or a tether changes slowly even while the
+    vehicle turns; a first-order low-pass of `time_constant` removes noise and waves. `limit`
+    (N, N·m) bounds the norms of its force and of its moment.
     """
 
     dynamics: Dynamics

@@ -17,17 +17,17 @@ from ..plant.learned_plant import check_state
 from .delayed import HEALTH, SLOT, STATUS, DelayedFilter, EkfConfig, FilterState, Readings
 from .error_state import ERRORS
 
-_WAITING = 6  # state group of the samples that wait, after the filter's own and the outputs'
+_WAITING = 6  # state group of the buffered samples, after the filter's own and the outputs'
 
 
 class Ekf(LeafSystem):
     """Error-state Kalman filter on SE(3), driven by the IMU, at a delayed horizon.
 
-    At every IMU period it takes in the sample shown, which is that of one period ago. At
-    `config.output_rate` (more often if a sensor reads faster) it moves over the samples that came,
-    fuses DVL, depth and compass `config.horizon` in the past in the order of their times of
-    validity (`systems.estimation.delayed`), and brings the estimate to the present with the samples
-    that wait. The error's order and frame are those of
+    At every IMU period it reads the sample of one period ago. At `config.output_rate` (more often
+    if a sensor reads faster) it predicts over the new samples, fuses DVL, depth and compass
+    `config.horizon` in the past in the order of their times of validity
+    (`systems.estimation.delayed`), and predicts the present state with the buffered samples. The
+    order and frame of the error are those of
     `systems.estimation.error_state`: `covariance` is the 18 × 18 matrix by rows, whose first six
     rows and columns belong to [δp, δθ] in body axes. Horizontal position is dead reckoning: its
     variance grows. `status` has the components `STATUS`, `health` those of `HEALTH`.
@@ -66,7 +66,7 @@ class Ekf(LeafSystem):
         """Expect the given sensors (their defaults if left out) and start at `X0_WB`, `V0_WB_B`.
 
         Raises:
-            ValueError: the start is no state, or the output rate is no divisor of the IMU's rate.
+            ValueError: the start is not a state, or the output rate does not divide the IMU's rate.
             UserError: the horizon is shorter than the DVL's latency.
         """
         super().__init__()
@@ -133,7 +133,7 @@ class Ekf(LeafSystem):
         self._functions = take_in, move, fuse, show, unravel
         results = list(outputs.values())
         self._start = VectorFunction(initialise, [9], [n, *results])
-        # Several calls, as XLA runs small programs in line and larger ones on its pool of threads.
+        # Several calls: XLA runs small programs inline and larger ones on its thread pool.
         m = self._samples
         self._take_in = VectorFunction(
             take_in, [n, 6 * (m - 1), *sizes.values(), 1], [n, 1, SLOT * m]
@@ -154,14 +154,14 @@ class Ekf(LeafSystem):
         n, sizes = self._samples, [port.size() for port in self._readings]
 
         def step(state: State, given: list[Array], last: Array) -> Array:
-            """The filter's state after the samples that wait and the one that is shown."""
+            """The filter's state after the buffered samples and the present one."""
             flat, at, slots = take_in(state[0], state[_WAITING], *given, last[None])
 
             def fuse_and_move(carry: tuple[Array, Array]) -> tuple[Array, Array]:
                 flat, at = carry
                 slot = jax.lax.dynamic_slice(slots.reshape(-1), (SLOT * at.astype(int),), (SLOT,))
                 flat = fuse(flat, slot, (last - n + 1 + at)[None])
-                return move(flat, slots, (at + 1)[None])  # at the end it moves nothing: at = n
+                return move(flat, slots, (at + 1)[None])  # no slot left at at = n
 
             return jax.lax.while_loop(lambda carry: carry[1] < n, fuse_and_move, (flat, at))[0]
 
@@ -193,7 +193,7 @@ class Ekf(LeafSystem):
             discrete_state.set_value(index, value)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        """Keep the sample that is shown; with the last of several, step over all of them."""
+        """Buffer the present sample; with the last of several, step over all of them."""
         t = context.get_time()
         tick = round(t / self._period)
         phase = tick % self._samples
@@ -202,7 +202,7 @@ class Ekf(LeafSystem):
             waiting = discrete_state.get_mutable_value(_WAITING)
             waiting[6 * phase - 6 : 6 * phase] = imu
             return
-        last = tick - 1.0  # what is shown was sampled one period ago
+        last = tick - 1.0  # the present output was sampled one period ago
         held = context.get_discrete_state()
         readings = [value_or_zeros(port, context) for port in self._readings[1:]]
         state, at, slots = self._take_in(

@@ -1,4 +1,4 @@
-"""Inertial navigation on SE(3) and how its small errors travel.
+"""Inertial navigation on SE(3) and the linear propagation of its error.
 
 Nominal state: pose `X_WB`, velocity v of Bo in W expressed in B, biases of gyroscope and
 accelerometer, and three slow errors of other sensors: scale of the DVL, offset of the depth gauge,
@@ -6,8 +6,8 @@ wander of the compass. The true state is `retract(nominal, δ)` with the error �
 
     δ = [δp 3, δθ 3 | δv 3 | δb_g 3 | δb_a 3 | scale, offset, wander],    X_WB = X̂_WB exp([δp, δθ]),
 
-so the pose's error lives in the body frame (left-invariant; Barrau and Bonnabel 2017) and in the
-order of every twist here; the rest adds. This module handles one state; batches go through `vmap`.
+so the pose error is expressed in the body frame (left-invariant; Barrau and Bonnabel 2017) in the
+order of a twist; the other errors are additive. Functions take one state; `vmap` makes batches.
 """
 
 import math
@@ -39,7 +39,7 @@ class Navigation(NamedTuple):
 
 
 class Increment(NamedTuple):
-    """What inertial samples alone say about a time T: rotation, velocity and position in its frame.
+    """Preintegrated samples of an interval T: rotation, position and velocity increments.
 
     `X` holds ΔR and Δp, the position reached without initial velocity and gravity, `v` is Δv, both
     expressed in the frame at the interval's start (preintegration, Forster et al. 2017, eq. 33).
@@ -51,7 +51,7 @@ class Increment(NamedTuple):
 
 
 def retract(nominal: Navigation, delta: Float[Array, "18"]) -> Navigation:
-    """The state that differs from `nominal` by the error δ."""
+    """The state whose error relative to `nominal` is δ."""
     return Navigation(
         se3.retract(nominal.X_WB, delta[POSE]),
         nominal.v_B + delta[VELOCITY],
@@ -88,7 +88,7 @@ def chain(first: Increment, second: Increment) -> Increment:
 
 
 def chain_all(increments: Increment) -> Increment:
-    """The increment over a batch (n,) of intervals in order, √n runs of them at a time."""
+    """The increment over a batch (n,) of consecutive intervals, as √n runs in parallel."""
     n = increments.time.shape[0]
     runs = math.isqrt(n - 1) + 1
     length = -(-n // runs)
@@ -99,7 +99,7 @@ def chain_all(increments: Increment) -> Increment:
     )
 
     def spread(all_of: Array, none: Array) -> Array:
-        """Place in the run first, then component, then run."""
+        """Reorder the axes to: place in the run, component, run."""
         together = jnp.concatenate([all_of, none], axis=-1)
         return jnp.moveaxis(together.reshape(*all_of.shape[:-1], runs, length), -1, 0)
 
@@ -185,8 +185,8 @@ def transition(
     N_a = jnp.concatenate([-(T / 2) * eye, zero, -eye, rest])
     s_g, s_a = imu.gyroscope_density**2 / 2, imu.accelerometer_density**2 / 2
     Q = s_g * T * (N_g @ N_g.T) + s_a * T * (N_a @ N_a.T)
-    # White noise over T is its mean and, independent of it, a first moment of variance T³ / 12: it
-    # moves the position of accelerations and the velocity of turns under gravity.
+    # White noise over T has a mean and an independent first moment of variance T³ / 12. The moment
+    # adds to position through the accelerometer and to velocity through the gyroscope and gravity.
     moment = T**3 / 12
     Q = Q.at[POSITION, POSITION].add(s_a * moment * eye)
     Q = Q.at[VELOCITY, VELOCITY].add(s_g * moment * (skew(g_B) @ skew(g_B).T))

@@ -1,8 +1,8 @@
-"""Inertial samples one by one: which to believe, and how far each was from what was foreseen.
+"""Fault detection for inertial samples, and the statistics of their one-step predictions.
 
-A sample is left out where it is not finite, at or beyond the instrument's range, stuck (values
-repeat to the last bit) or far from the samples before it. What is left out adds to the covariance:
-by the size of what was refused, since it may have been true, and by how the vehicle usually moves.
+A sample is left out if it is not finite, at or beyond the instrument's range, stuck (values repeat
+bit for bit) or far from the samples before it. A sample that is left out adds to the covariance: by
+the size of the rejected value, as it may have been right, and by the vehicle's usual motion.
 """
 
 from typing import NamedTuple
@@ -16,51 +16,51 @@ from ...models.sensors import Imu
 from ...models.sensors.base import velocity_at
 
 FEW = 5
-"""Samples whose mean force is what is foreseen of the next."""
+"""Number of samples whose mean force predicts the next."""
 
-_REMEMBERED = 2.0  # s: time constant of the averages of how samples differ
-_RECENT = 0.25  # s
-_USUAL = 10.0  # s: time constant of the averages of how the vehicle moves
+_REMEMBERED = 2.0  # s: time constant of the averages of the differences between samples
+_RECENT = 0.25  # s: time constant of the recent motion
+_USUAL = 10.0  # s: time constant of the averages of the vehicle's motion
 _KEPT_UP = 1.0  # s for which an acceleration or a rate of turn lasts
-_FADES = 0.3  # s: time constant with which the last rate fades where none follows
-_STUCK_TOGETHER = 5  # repeats of all three values of a triad: noise does not do that
-_STUCK_ALONE = 50  # repeats of one value, whose steps may be as coarse as its noise
+_FADES = 0.3  # s: time constant with which the last rate decays while rates are missing
+_STUCK_TOGETHER = 5  # repeats of all three values of a triad: noise makes them improbable
+_STUCK_ALONE = 50  # repeats of one value, whose resolution may be as coarse as its noise
 _ODD = 10.0  # standard deviations beyond which a sample is odd
-_ODD_RUN = 5  # odd samples in a row are a motion
+_ODD_RUN = 5  # more odd samples in a row than this are true motion
 
 
 LEFT_OPEN = 4
-"""Of force, then of rate: 2 T times how long it has been missing, at most a second (s²), and the
-variance of what was refused of velocity (m²/s²) or angle (rad²)."""
+"""Number of columns: for force, then rate: 2 T times the time it has been missing, at most a second
+(s²), and the variance of velocity (m²/s²) or angle (rad²) due to the rejected value."""
 
 
 class Samples(NamedTuple):
-    """What is remembered of the samples until now, in body axes."""
+    """Statistics of the samples until now, in body axes."""
 
     shown: Float[Array, "6"]
-    """Newest reading as it came, in the sensor's axes."""
+    """Newest raw reading, in the sensor's axes."""
     repeats: Float[Array, "6"]
-    """For how many readings each value has been the same."""
+    """Number of readings for which each value has been the same."""
     missing: Float[Array, "2"]
-    """For how long force and rate have been missing (s)."""
+    """Time for which force and rate have been missing (s)."""
     odd: Float[Array, ""]
     """Odd samples in a row."""
     calm: Float[Array, ""]
     """Time since a sample was last bad or a spike (s); what begins a motion is neither."""
     count: Float[Array, ""]
-    """Samples until now."""
+    """Number of samples until now."""
     forces: Float[Array, "few 3"]
     """The newest good forces (m/s²)."""
     rates: Float[Array, "2 3"]
-    """The newest two rates (rad/s), the biases still in them."""
+    """The newest two rates (rad/s), biases included."""
     steps: Float[Array, "6 6"]
-    """Mean square of what a sample of [force, rate] differs from the one foreseen."""
+    """Mean square of the one-step prediction error of [force, rate]."""
     bends: Float[Array, "6 6"]
     """Mean square of the second differences of [force, rate]."""
 
     @classmethod
     def start(cls, rate: Float[Array, "3"]) -> "Samples":
-        """Before the first sample, at a rate that was estimated."""
+        """Before the first sample, at an estimated rate."""
         zero = jnp.zeros((), rate.dtype)
         square = jnp.zeros((6, 6), rate.dtype)
         return cls(
@@ -78,13 +78,13 @@ class Samples(NamedTuple):
 
     @property
     def foreseen(self) -> Float[Array, "6"]:
-        """The next sample: mean of the last few forces, and the last rate."""
+        """Prediction of the next sample: mean of the last few forces, and the last rate."""
         known = jnp.clip(self.count, 1, FEW)
         return jnp.concatenate([jnp.sum(self.forces, axis=0) / known, self.rates[-1]])
 
 
 class Motion(NamedTuple):
-    """How the vehicle moves, for what a missing sample leaves open."""
+    """Statistics of the vehicle's motion, for the covariance of a missing sample."""
 
     recent: Float[Array, "6"]
     """Acceleration (m/s²) and rate (rad/s) over the last quarter of a second, in body axes."""
@@ -93,13 +93,13 @@ class Motion(NamedTuple):
 
     @classmethod
     def start(cls, dtype: jnp.dtype) -> "Motion":
-        """Of a vehicle that was not seen yet."""
+        """Before the first sample."""
         return cls(jnp.zeros(6, dtype), jnp.asarray([0.3**2, 0.2**2], dtype))
 
     def after(
         self, acceleration: Float[Array, "3"], rate: Float[Array, "3"], dt: Float[Array, ""]
     ) -> "Motion":
-        """With what was seen for another dt; nothing is seen in no time."""
+        """Updated with the motion over dt; unchanged for a dt of zero."""
         now = jnp.concatenate([acceleration, rate])
         recent = self.recent + (1 - jnp.exp(-dt / _RECENT)) * (now - self.recent)
         squares = jnp.sum(recent.reshape(2, 3) ** 2, axis=1)
@@ -108,10 +108,10 @@ class Motion(NamedTuple):
         return Motion(recent, jnp.maximum(usual, floor))
 
     def variances(self, left_open: Float[Array, "4"]) -> Float[Array, "2"]:
-        """Variances of velocity and angle that a row's `LEFT_OPEN` stands for.
+        """Variances of velocity and angle from a row's `LEFT_OPEN`.
 
-        An acceleration a that lasts for τ makes a velocity of variance a² t² at first and 2 a² τ t
-        later.
+        An acceleration a with correlation time τ gives velocity a variance of a² t² at first and
+        2 a² τ t later.
         """
         return left_open[0::2] * self.usual + left_open[1::2]
 
@@ -122,10 +122,10 @@ def take(
     sample: Float[Array, "6"],
     number: Float[Array, ""],
 ) -> tuple[Samples, Float[Array, "11"]]:
-    """The memory after a sample and its row in body axes; nothing happens where `number` is < 0.
+    """The memory after a sample and its row in body axes; unchanged where `number` is < 0.
 
-    The row: 1 if it moves the vehicle, force 3, mean rate 3, then `LEFT_OPEN`. A missing force is
-    zero: what stands in for it depends on the state.
+    The row: 1 if it is predicted over, force 3, mean rate 3, then `LEFT_OPEN`. A missing force is
+    zero: its replacement depends on the state.
     """
     dtype, T = sample.dtype, 1 / imu.rate
     limits = jnp.repeat(jnp.asarray([imu.accelerometer_range, imu.gyroscope_range], dtype), 3)
@@ -147,7 +147,7 @@ def take(
         turning = (rate - memory.rates[-1]) * imu.rate
         force = force - se3.cross(rate, spin) - se3.cross(turning, r)
 
-    # How far the sample is from what was foreseen, in standard deviations of such steps.
+    # The sample's prediction error is compared with the standard deviation of such errors.
     step = jnp.concatenate([force, rate]) - memory.foreseen
     noise = jnp.repeat(jnp.asarray(imu.noise_std(), dtype), 3)
     floor = jnp.asarray((2.0,) * 3 + (0.5,) * 3, dtype)
@@ -189,11 +189,11 @@ def _learn(
     rate: Float[Array, "3"],
     believed: Bool[Array, "2"],
 ) -> Samples:
-    """The averages after a sample; one that is left out teaches nothing of itself."""
+    """The averages after a sample; a sample that is left out does not change them."""
     known = believed.all() & (memory.count > FEW)
 
     def mean_square(old: Array, x: Array) -> Array:
-        """Plain mean over the first ones, then what fades with time."""
+        """Arithmetic mean over the first samples, then an exponential average."""
         fading = 1 - jnp.exp(-jnp.asarray(1 / (imu.rate * _REMEMBERED), x.dtype))
         weight = jnp.maximum(1 / jnp.maximum(memory.count - FEW, 1), fading)
         return jnp.where(known, old + weight * (x[:, None] * x[None] - old), old)

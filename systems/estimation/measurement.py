@@ -66,12 +66,12 @@ def depth_innovation(
 def compass_innovation(
     compass: Compass, nominal: Navigation, reading: Float[Array, "1"]
 ) -> Innovation:
-    """How far the bow points across the heading that the compass shows, its wander taken off.
+    """Component of the bow perpendicular to the compass heading, corrected for the wander.
 
-    The component of the bow across the true heading is zero at every attitude, and has a derivative
-    where yaw has none. Of a yaw error Δ it is cos θ sin Δ, so the residual is cos θ times that of
-    yaw; beyond 90° it grows no further. A reading's noise, cos θ times the compass', counts as the
-    compass' own: with the bow up a compass tells no more than that.
+    The component of the bow perpendicular to the true heading is zero at every attitude, and is
+    differentiable where yaw is not. A yaw error Δ makes it cos θ sin Δ, so the residual is cos θ
+    times that of yaw; beyond 90° it is clipped. The noise, cos θ times that of the compass, is
+    taken as the compass' own: a compass is no more accurate than that while the bow is up.
     """
     yaw = compass.expected(nominal.X_WB)
     off = jnp.clip(wrap(reading - yaw - nominal.sensors[2:3]), -math.pi / 2, math.pi / 2)
@@ -86,7 +86,7 @@ def compass_innovation(
 def _pose_row(
     H: Float[Array, "1 6"], sensor: int, times: float | Float[Array, ""] = 1.0
 ) -> Float[Array, "1 18"]:
-    """The row of a reading of the pose plus `times` one sensor's slow error."""
+    """The row of H of a measurement of the pose plus `times` one sensor's slow error."""
     row = jnp.zeros((1, ERRORS), H.dtype).at[:, POSE].set(H)
     return row.at[:, SENSORS.start + sensor].set(times)
 
@@ -117,7 +117,7 @@ def small_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
 
 def together(found: Sequence[Innovation]) -> Innovation:
-    """Several sensors' innovations as one; their noises are independent."""
+    """Several sensors' innovations stacked; their noises are independent."""
     sizes = [each.residual.size for each in found]
     R = jnp.zeros((sum(sizes), sum(sizes)), found[0].R.dtype)
     for each, end in zip(found, accumulate(sizes), strict=True):
@@ -130,7 +130,7 @@ def together(found: Sequence[Innovation]) -> Innovation:
 def normalized_squares(
     S: Float[Array, "m m"], residual: Float[Array, "m"], sizes: Sequence[int]
 ) -> Float[Array, " n"]:
-    """Each sensor's NIS by itself, of sensors with so many components each."""
+    """The NIS of each sensor by itself; `sizes` are their numbers of components."""
     scores = []
     for size, end in zip(sizes, accumulate(sizes), strict=True):
         own = slice(end - size, end)
@@ -139,7 +139,7 @@ def normalized_squares(
 
 
 class Update(NamedTuple):
-    """What readings make of a state."""
+    """A corrected state, and the statistics of the update."""
 
     nominal: Navigation
     P: Float[Array, "18 18"]
@@ -173,7 +173,7 @@ def update(
     mark = jnp.repeat(accepted, jnp.array(sizes), total_repeat_length=r.size)
     both = mark[:, None] & mark[None]
     S_inverse = small_inverse(jnp.where(both, S, jnp.eye(r.size, dtype=P.dtype)))
-    # Rows that don't count have no gain: the inverse holds them apart from the others.
+    # Rows that are not used have zero gain: the inverse is block-diagonal in them.
     K = jnp.where(mark[None], PH @ jnp.where(both, S_inverse, 0), 0)
     delta = K @ jnp.where(mark, r, 0)
     eye = jnp.eye(ERRORS, dtype=P.dtype)

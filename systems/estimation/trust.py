@@ -1,22 +1,22 @@
-"""Which sensors besides the IMU are believed, and what doubt the covariance has to show.
+"""Fault detection for the sensors besides the IMU, and the covariance inflation that follows.
 
-A reading that fails the gate is left out. After `patience` of them in a row something is wrong, and
-the question is what:
+A reading that fails the gate is left out. After `patience` consecutive failures the sensor is
+judged:
 
-- A sensor that *jumped*, by more than the IMU can have been off since its reading before, while the
-  IMU and another sensor are well, is at fault. It is left out until `patience` readings in a row
+- A sensor that *jumped* by more than the IMU can have drifted since its previous reading, while the
+  IMU and another sensor are healthy, is at fault. It is left out until `patience` readings in a row
   pass the gate again.
-- Otherwise filter and sensor drifted apart and nothing here can tell which of them is wrong: its
+- Otherwise filter and sensor drifted apart, and the faulty one cannot be identified: the sensor's
   readings are followed.
 
-A sensor is *suspect* if it is at fault, stuck or followed, or if its innovations have a mean: those
-of a consistent filter have none (Mehra 1970). It stays so for a minute; one that was stuck only for
-some seconds, for it was right until then. For each sensor the filter keeps how far its readings
-have pulled the estimate from where it would be without them. Where a suspect pulled the estimate
-from, the covariance that is told must not rule out; the filter's gains stay those of its own.
+A sensor is *suspect* if it is at fault, stuck or followed, or if its innovations have a nonzero
+mean: those of a consistent filter have zero mean (Mehra 1970). It remains so for a minute, or for a
+few seconds if it was only stuck, as it was right until then. For each sensor the filter tracks its
+*pull*: the shift of the estimate due to its readings. The reported covariance is inflated until it
+covers the pull of every suspect; the filter's gains use the covariance without this inflation.
 
-A sensor whose readings scatter more than the gate's law says has its noise raised by their mean NIS
-(covariance matching; Mehra 1970); if several scatter so, it is the IMU's noise that is raised.
+A sensor whose mean NIS is above its expected value has its noise variance raised by that mean
+(covariance matching; Mehra 1970); if several do, the IMU's noise variance is raised instead.
 """
 
 from typing import NamedTuple
@@ -33,28 +33,28 @@ SIZES = (3, 1, 1)
 
 _PARTS = (slice(0, 3), slice(3, 4), slice(4, 5))
 _STUCK_TOGETHER = 2  # repeats of all three velocities
-_STUCK_ALONE = (4, 8, 4)  # repeats of one value; a gauge's steps may be as coarse as its noise
-_BEYOND = 1.1  # times the highest speed is no velocity
-_OFF = 20.0  # times the deviation of its bias is more than the IMU can be off
-_SUSPECT = 60.0  # s for which a sensor is suspect at least
-_MOVES_AGAIN = 3.0  # s for which one that was stuck still is: what it showed before was right
-_RECENT = 20.0  # readings of a sensor without suspicion whose pulls are kept
+_STUCK_ALONE = (4, 8, 4)  # repeats of one value; a gauge's resolution may be as coarse as its noise
+_BEYOND = 1.1  # factor on the highest speed above which a velocity is invalid
+_OFF = 20.0  # bound on the IMU's error, in standard deviations of its bias
+_SUSPECT = 60.0  # s: shortest time for which a sensor is suspect
+_MOVES_AGAIN = 3.0  # s for which a sensor that was stuck is suspect: it was right before
+_RECENT = 20.0  # memory, in readings, of the pulls of a sensor that is not suspect
 _ALONE = (10.0, 60.0, 60.0)
-"""For how long (s) the IMU alone knows velocity, depth and yaw well enough to doubt a sensor by."""
+"""Time (s) for which the IMU alone predicts velocity, depth and yaw accurately enough."""
 _BIASED = 0.8  # mean of normalised innovations: white ones have a deviation of 0.16 over `_RECENT`
 _MATCHED = 50.0  # readings over which NIS are averaged
-_CLIPPED = 8.0  # times what is usual is the most that one reading counts: outliers are rare
-_GROWTH = 1.05  # of the IMU's variances, by reading while several sensors scatter
-_UNUSUAL = 1.6  # mean NIS a value that chance does not bring about over `_MATCHED` readings
+_CLIPPED = 8.0  # bound on one reading's NIS relative to the mean, against outliers
+_GROWTH = 1.05  # of the IMU's variances, per reading while several sensors scatter
+_UNUSUAL = 1.6  # threshold of the mean NIS per value over `_MATCHED` readings, above chance
 
 
 class Shown(NamedTuple):
-    """What the sensors last showed: v 3, depth, yaw."""
+    """The sensors' last readings: v 3, depth, yaw."""
 
     values: Float[Array, "5"]
     stamps: Float[Array, "3"]
     repeats: Float[Array, "5"]
-    """For how many readings each value has been the same."""
+    """Number of readings for which each value has been the same."""
 
     @classmethod
     def start(cls, dtype: jnp.dtype) -> "Shown":
@@ -64,10 +64,10 @@ class Shown(NamedTuple):
 
     @property
     def stuck(self) -> Bool[Array, "3"]:
-        """Whether a sensor's values stand still, to the last bit, though readings come."""
+        """Whether a sensor repeats the same values bit for bit in new readings."""
         longest = jnp.stack([self.repeats[part].max() for part in _PARTS])
         alone = longest >= jnp.asarray(_STUCK_ALONE, longest.dtype)
-        zeros = jnp.all(self.values[:3] == 0)  # lock lost, shown as a velocity
+        zeros = jnp.all(self.values[:3] == 0)  # lost bottom lock, reported as a zero velocity
         return alone.at[0].set(alone[0] | (self.repeats[:3].min() >= _STUCK_TOGETHER) | zeros)
 
     def with_readings(
@@ -77,7 +77,7 @@ class Shown(NamedTuple):
         valid: Bool[Array, "3"],
         stamps: Float[Array, "3"],
     ) -> tuple["Shown", Bool[Array, "3"]]:
-        """The memory with the readings shown now, and which of them can be used at all."""
+        """The memory with the present readings, and which of them are usable."""
         new = valid & (stamps != self.stamps) & jnp.isfinite(stamps)
         fresh = jnp.repeat(new, jnp.array(SIZES), total_repeat_length=5)
         again = jnp.where(values == self.values, self.repeats + 1, 0)
@@ -93,7 +93,7 @@ class Shown(NamedTuple):
 
 
 class Trust(NamedTuple):
-    """What is known of DVL, depth gauge and compass."""
+    """Statistics of DVL, depth gauge and compass."""
 
     nis: Float[Array, "3"]
     """Of the last reading."""
@@ -108,21 +108,21 @@ class Trust(NamedTuple):
     distrusted: Float[Array, "3"]
     """1 where a sensor is at fault and left out."""
     scatter: Float[Array, "3"]
-    """Mean NIS of a value, at the sensor's own noise."""
+    """Mean NIS per value, at the sensor's configured noise."""
     mean: Float[Array, "5"]
     """Mean of the innovations divided by their standard deviations."""
     suspected_at: Float[Array, "3"]
     """When a sensor was last found suspect (s)."""
     stuck_at: Float[Array, "3"]
-    """When its values last stood still (s)."""
+    """When its values were last stuck (s)."""
     pulled: Float[Array, "3 18"]
-    """Error that the estimate without a sensor's readings would have, of that with them."""
+    """Error δ of the estimate without a sensor's readings relative to the one with them."""
     imu_factor: Float[Array, ""]
-    """By what the variances of the IMU's noises are raised."""
+    """Factor on the variances of the IMU's noises."""
 
     @classmethod
     def start(cls, dtype: jnp.dtype) -> "Trust":
-        """All is well."""
+        """No sensor is suspect."""
         zero, one = jnp.zeros(3, dtype), jnp.ones(3, dtype)
         never = jnp.full(3, -1e9, dtype)
         five, pulled = jnp.zeros(5, dtype), jnp.zeros((3, 18), dtype)
@@ -134,7 +134,7 @@ class Trust(NamedTuple):
 
     @property
     def noise_factor(self) -> Float[Array, "3"]:
-        """By what the variances of the sensors' noises are raised."""
+        """Factors on the variances of the sensors' noises."""
         alone = jnp.sum(self._scattered) < 2
         return jnp.where(self._scattered & alone, self.scatter, 1)
 
@@ -145,13 +145,13 @@ class Trust(NamedTuple):
 
 
 def imu_off(imu: Imu, dvl: Dvl, depth: DepthSensor, compass: Compass) -> tuple[float, float, float]:
-    """What the IMU can at most be off between two readings: m/s, m, rad."""
+    """Bounds on the IMU's error between two readings: m/s, m, rad."""
     a, w = _OFF * imu.accelerometer_bias, _OFF * imu.gyroscope_bias
     return a / dvl.rate, a / depth.rate**2 / 2, w / compass.rate
 
 
 class Verdict(NamedTuple):
-    """On the sensors, before their readings are used."""
+    """The judgement on the sensors before their readings are used."""
 
     left_out: Bool[Array, "3"]
     follow: Bool[Array, "3"]
@@ -166,7 +166,7 @@ def judged(
 ) -> tuple[Trust, Verdict]:
     """Before an update: which sensors to leave out and which to follow whatever their NIS.
 
-    `used` says which readings came, `well` where IMU and another sensor are well.
+    `used` says which readings came, `well` whether the IMU and another sensor are healthy.
     """
     dtype = trust.nis.dtype
     back = (trust.distrusted > 0) & (trust.passed >= patience)
@@ -229,12 +229,12 @@ def suspected(
     time: Float[Array, ""],
     elapsed: Float[Array, ""],
 ) -> Trust:
-    """The trust with those suspect who are `found` at fault or followed, stuck or biased.
+    """The trust with those sensors suspect that are `found` at fault or followed, stuck or biased.
 
-    `pulled` holds the pulls with those of the readings that came. Of a sensor without suspicion
-    only those of the last readings are kept; of a suspect what it pulled while the IMU alone would
-    have known better, and all while it is not read. `elapsed` is the time since the update before
-    (s).
+    `pulled` holds the pulls after the present update. For a sensor that is not suspect they decay
+    over the last readings. For a suspect they decay over the time for which the IMU alone is
+    accurate, and not at all while its readings are left out. `elapsed` is the time since the
+    previous update (s).
     """
     biased = jnp.stack([jnp.abs(trust.mean[part]).max() > _BIASED for part in _PARTS])
     trust = trust._replace(
@@ -242,7 +242,7 @@ def suspected(
         stuck_at=jnp.where(stuck, time, trust.stuck_at),
     )
     alone = jnp.exp(-elapsed / jnp.asarray(_ALONE, pulled.dtype))[:, None]
-    # a horizontal position that went wrong stays wrong
+    # no sensor corrects a position error, so the DVL's pull on it does not decay
     fades = jnp.broadcast_to(jnp.where(accepted[:, None], alone, 1), pulled.shape)
     fades = fades.at[0, :3].set(1)
     of_others = jnp.where(came, 1 - 1 / _RECENT, 1)[:, None]
@@ -253,10 +253,10 @@ def suspected(
 def with_doubt(
     P: Float[Array, "18 18"], pulled: Float[Array, "3 18"], suspect: Bool[Array, "3"]
 ) -> Float[Array, "18 18"]:
-    """P that rules out nothing a suspect pulled the estimate from.
+    """P inflated so that it covers the pulls of all suspects.
 
-    With s = dᵀ B⁻¹ d > 1 of a pull d and the block B of position, attitude, velocity or a bias, B
-    grows by s: the pull is then of one standard deviation.
+    If s = dᵀ B⁻¹ d > 1 for a pull d and the block B of position, attitude, velocity or a bias, B is
+    multiplied by s: the pull is then one standard deviation.
     """
     starts = range(0, 15, 3)
     inverses = jax.vmap(small_inverse)(jnp.stack([P[k : k + 3, k : k + 3] for k in starts]))

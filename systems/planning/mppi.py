@@ -40,7 +40,7 @@ class Mppi(LeafSystem):
 
     `plan` is laid out by `layout` and `samples` by `samples`; both hold zeros before the first
     call, and `plan` whenever no finite plan was found (a state estimate of NaN, say), which the
-    tracking controller takes for "no plan". `F_bias_Bo_W` is an observed wrench with the axes of
+    tracking controller reads as "no plan". `F_bias_Bo_W` is an observed wrench with the axes of
     W, zero if not connected. `noise` is drawn anew for every call.
 
     .. pydrake_system::
@@ -59,7 +59,7 @@ class Mppi(LeafSystem):
     """
 
     def __init__(self, planner: MppiPlanner):
-        """The planner brings model, limits, obstacles, goal and settings.
+        """The planner contains model, limits, obstacles, goal and settings.
 
         Raises:
             ValueError: if JAX runs in single precision.
@@ -92,7 +92,7 @@ class Mppi(LeafSystem):
 
     @cached_property
     def _programs(self) -> tuple[Program, list[Program], Program]:
-        """Draws, rolls out (a program for each part: of equal parts it is one) and chooses."""
+        """Programs that draw, roll out (one for each part; equal parts share it) and choose."""
         vector = {n: jax.ShapeDtypeStruct((n,), np.float64) for n in (1, 4, 6, 7)}
         nominal = jax.ShapeDtypeStruct((6 * self.planner.config.horizon,), np.float64)
         now = vector[7], vector[6], vector[6]
@@ -134,7 +134,7 @@ class Mppi(LeafSystem):
     ) -> list[Float[np.ndarray, "_"]]:
         """One call at time t (s): the next `nominal`, and the values of the three ports.
 
-        `nominal` holds the wrenches (horizon × 6) that the call before planned from its time on.
+        `nominal` holds the wrenches (horizon × 6) planned by the previous call, from its time on.
         """
         draw, roll, choose = self._programs
         now = X_WB, V_WB_B, F_bias_Bo_W

@@ -21,42 +21,42 @@ class MppiConfig:
         horizon: number of steps.
         dt: length of a step (s).
         substeps: of the model in a step; null takes those a learned model was trained with, and 2
-            for physics. With a single one some learned models diverge.
+            for physics. Some learned models diverge with a single one.
         period: time between calls (s), a multiple of `dt`: the warm start shifts by it.
         sequences: control sequences sampled in a call.
-        realisations: noise paths each of them meets, an even number (pairs of opposite sign); 1
+        realisations: noise paths of each sequence, an even number (pairs of opposite sign); 1
             plans with the model's drift alone.
             `sequences` × `realisations` is the number of rollouts.
         pose_weight: diagonal of L in ‖log(g⁻¹ g_goal)‖²_L (1/m² and 1/rad²).
         twist_weight: diagonal of Q in ‖ξ_goal − ξ‖²_Q (s²/m² and s²/rad²).
-        terminal_time: the running cost of the last state counts this much longer (s).
-        effort_weight: cost rate of the thrust beyond what holds the vehicle at the goal, where 1
-            is the whole of each axis' limit (0 leaves the paper's cost as it is).
-        rate_weight: the same for the change of the wrench within a second.
+        terminal_time: terminal cost, as this many seconds of the last state's running cost (s).
+        effort_weight: cost rate of the wrench beyond the one that holds the vehicle at the goal,
+            as a fraction of each axis' limit (0 gives the paper's cost).
+        rate_weight: the same for the rate of change of the wrench (1/s).
         speed_limit: linear speed (m/s) above which `speed_weight` counts.
         speed_weight: cost rate of (|v| − speed_limit)² (s²/m²).
         noise: standard deviation of the sampled wrenches as a fraction of each axis' limit.
-        knots: numbers of spline pieces over the horizon; the sequences are shared out among
-            them, so that slow pushes and quick corrections are both tried.
-        smallest_noise: the sequences' amplitudes run from 1 down to this, geometrically.
+        knots: numbers of spline pieces over the horizon; the sequences are divided among them, so
+            that both slow and fast corrections are sampled.
+        smallest_noise: the sequences' amplitudes fall from 1 to this, geometrically.
         wrench_fraction: part of the thrusters' feasible wrenches that a plan may use; the rest is
             left to the tracking controller.
         effective_samples: the temperature is set so that this many sequences carry the weight.
         margin: distance (m) from the hull to an obstacle below which a soft cost begins.
         margin_weight: cost rate at the obstacle's surface.
-        risk: what becomes of the costs of a sequence's realisations: their mean, the mean of the
-            worst `cvar_part` of them, or the worst.
+        risk: measure of the costs of a sequence's realisations: their mean, the mean of the worst
+            `cvar_part` of them (CVaR), or the worst.
         cvar_part: part of the realisations that `cvar` counts.
         collision_risk: α of the chance constraint P(g ∈ G) ≥ 1 − α over the horizon; None leaves
             the constraint out.
-        risk_weight: cost of a violation: of a probability that exceeds α by one, and of each metre
-            by which the clearance would have to grow.
-        clearance_std: least standard deviation (m) of the clearance; stands for what the model's
-            noise leaves out (state estimate, obstacle positions).
-        tracked: the noise paths are held to the plan by the tracking controller's gains, as the
-            vehicle will be; false lets them stray over the whole horizon.
-        hold_attitude: sequences are sampled beyond the wrench with which the tracking controller's
-            gains turn the vehicle to the goal's attitude; false samples all of the wrench.
+        risk_weight: cost of a violation: per unit of probability above α, and per metre of missing
+            clearance.
+        clearance_std: least standard deviation (m) of the clearance; covers errors that are not in
+            the model's noise (state estimate, obstacle positions).
+        tracked: the noise paths follow the plan under the tracking controller's gains, as the
+            vehicle does; false lets them diverge in open loop over the horizon.
+        hold_attitude: sequences are sampled in addition to the tracking controller's feedback
+            towards the goal's attitude; false samples the whole wrench.
         shown_paths: sampled paths in the output for reports.
         threads: the sequences are rolled out in so many parts, each in a thread of its own.
     """

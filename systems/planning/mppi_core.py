@@ -26,22 +26,22 @@ from .path_integral import (
 )
 
 _WORST = 1e3
-"""Condition beyond which slopes of the felt wrench are not inverted."""
+"""Condition number beyond which the slope of the acting wrench is not inverted."""
 
 
 class MppiState(eqx.Module):
-    """What one call hands to the next: the sequence chosen, from the time of the last call on.
+    """The chosen sequence, from the time of the last call on, for the warm start of the next.
 
-    What turns the vehicle to the goal's attitude comes on top of it (`MppiPlanner`).
+    The attitude controller's moments are not included (`MppiPlanner`).
     """
 
     F_Bo_B: Float[Array, "horizon 6"]
 
 
 class MppiOutput(NamedTuple):
-    """The plan and what it was chosen from; times k dt with k = 0 … H count from the call.
+    """The plan and the samples it was chosen from; times k dt with k = 0 … H count from the call.
 
-    `F_Bo_B` is all that the planned vehicle is given, what holds its attitude included.
+    `F_Bo_B` is the whole planned wrench, including the moments that hold the attitude.
     """
 
     X_WB: Float[Array, "7 n"]
@@ -59,11 +59,11 @@ class MppiOutput(NamedTuple):
 
 
 class Draw(NamedTuple):
-    """What a call draws: its sequences in parts, and the noise that all of them meet.
+    """Samples of a call: its sequences in parts, and the noise that all of them share.
 
     Attributes:
-        nominal: the last plan, shifted by the time that went by.
-        before: the wrench of the last plan that has acted until now.
+        nominal: the last plan, shifted by the elapsed time.
+        before: the wrench of the last plan that acted until now.
         parts: the sequences, in as many parts as `MppiConfig.threads`.
         dW: Brownian increments (√s) of the realisations; None for a single one.
     """
@@ -75,7 +75,7 @@ class Draw(NamedTuple):
 
 
 class Rolled(NamedTuple):
-    """What became of n sequences in r realisations; the states are those of the first."""
+    """Rollouts of n sequences in r realisations; the states are those of the first realisation."""
 
     cost: Float[Array, "r n"]
     clearance: Float[Array, "r n"]
@@ -89,32 +89,32 @@ class MppiPlanner(eqx.Module):
         min_u E ∫ ‖log(g⁻¹ g_goal)‖²_L + ‖ξ_goal − ξ‖²_Q dt   subject to   u ∈ U,
         d(g, ξ) = model,  P(g ∈ G over the horizon) ≥ 1 − α,
 
-    by path integrals (Williams et al. 2016). Around the last plan, shifted by the time that went
-    by, wrench sequences are sampled with smooth noise and cut to U. Every sequence meets the same
-    `realisations` of the model's process noise (in pairs of opposite sign), so sequences are
-    compared under equal luck. Costs become weights, the weighted mean sequence is cut to U, and of
-    mean, best sample, best sample that keeps the chance constraint and last plan one is taken: a
-    mean of passing left and of passing right of a pylon is never flown. It is the one of least cost
-    of those that keep the constraint, and if none does the one that violates it least: however far
-    the goal, no cost of being away from it buys a collision. The plan's states are the model's
-    drift under it.
+    by path integrals (Williams et al. 2016). Around the last plan, shifted by the elapsed time,
+    wrench sequences are sampled with smooth noise and projected to U. Every sequence is rolled out
+    under the same `realisations` of the model's process noise (in antithetic pairs), as common
+    random numbers. Costs become weights and the weighted mean sequence is projected to U. The
+    candidates are the mean, the best sample, the best sample that satisfies the chance constraint,
+    and the last plan, since the mean of passing left and passing right of a pylon may collide. The
+    candidate of least cost that satisfies the constraint is chosen, or else the one that violates
+    it least: a distant goal's cost never outweighs a collision. The plan's states are those of the
+    model's drift under it.
 
-    With `tracking` gains the noise paths are those of a vehicle that is held to the plan, as it
-    will be: the two paths of a pair are drawn to their middle, which stands for the path without
-    noise, by K_p log(g⁻¹ g_mid) + K_d (ξ_mid − ξ). Without them a path strays ever further, as the
-    problem above has it, and the plan shuns gaps that the tracked vehicle passes safely.
+    With `tracking` gains the noise paths are those of a vehicle that tracks the plan: the two paths
+    of a pair are pulled to their midpoint, which approximates the path without noise, by
+    K_p log(g⁻¹ g_mid) + K_d (ξ_mid − ξ). Without them the paths diverge in open loop, as in the
+    problem above, and the plan avoids gaps that the tracked vehicle passes safely.
 
-    With `tracking` gains and `hold_attitude`, what is sampled are wrenches beyond K_p and K_d of
-    the attitude alone, with which every path is turned to the goal's attitude, in all one wrench of
-    U. A hull that makes way is turned broadside by Munk's moment (Fossen 2011, section 6.3.1):
-    hardly any sequence of wrenches alone keeps its attitude over the horizon, least in a current.
+    With `tracking` gains and `hold_attitude`, the sampled wrenches are added to a feedback with K_p
+    and K_d on the attitude alone, towards the goal's attitude; the sum is projected to U. The Munk
+    moment turns a moving hull broadside (Fossen 2011, section 6.3.1): hardly any open-loop sequence
+    of wrenches keeps the attitude over the horizon, least of all in a current.
 
-    The noise of the sequences is that of the wrench which the body feels. Where the model's thrust
-    is not what is commanded (a weak thruster, say), commands are sampled that together make it;
+    The noise of the sequences applies to the wrench that acts on the body. Where the model's thrust
+    differs from the command (a weak thruster, say), commands are sampled that produce this noise;
     noise on the commands themselves would hardly ever surge without turning.
 
     `F_bias_W` is a wrench about Bo with axes of W that acts besides the model's (an observed
-    current, say); the plan's wrenches then contain what counters it.
+    current, say); the plan's wrenches then include its compensation.
     """
 
     dynamics: Dynamics
@@ -168,8 +168,8 @@ class MppiPlanner(eqx.Module):
     def hold_wrench(self, F_bias_W: Float[Array, "6"]) -> Float[Array, "6"]:
         """The wrench that keeps the vehicle at rest at the goal.
 
-        What counters the potential, and then what the model leaves over: buoyancy, payload, tether
-        or current of an extended model.
+        It balances the potential wrench and the remaining static wrenches of an extended model:
+        buoyancy, payload, tether or current.
         """
         hold = -self.dynamics.potential_wrench(self.X_WG)
         hold = hold - self.dynamics.balance(self.X_WG, jnp.zeros_like(hold), hold)[1]
@@ -190,7 +190,7 @@ class MppiPlanner(eqx.Module):
     ) -> tuple[MppiState, MppiOutput]:
         """Plan from a state; the same arguments give the same plan, bit for bit.
 
-        It draws, rolls out and chooses; who has threads to spare rolls each part out by itself.
+        It draws, rolls out and chooses; a multithreaded caller rolls out each part by itself.
         """
         bias = jnp.zeros_like(self.V_goal) if F_bias_W is None else F_bias_W
         draw = self.draw(state, key, bias)
@@ -199,7 +199,7 @@ class MppiPlanner(eqx.Module):
         return self.choose(draw, [rolled], X_WB, V_WB_B, bias)
 
     def draw(self, state: MppiState, key: Array, F_bias_W: Float[Array, "6"]) -> Draw:
-        """Sequences about the last plan, and the process noise that they all meet."""
+        """Sequences about the last plan, and the process noise that they all share."""
         c = self.config
         control_key, noise_key = jax.random.split(key)
         last, bias = self._cast(state.F_Bo_B, F_bias_W)
@@ -217,9 +217,9 @@ class MppiPlanner(eqx.Module):
         F_bias_W: Float[Array, "6"],
         before: Float[Array, "6"],
     ) -> Rolled:
-        """Sequences from a state under all noise paths; of the states it keeps positions.
+        """Rollouts of sequences under all noise paths; of the states only positions are kept.
 
-        A model with lag or delay has been commanded `before` until now.
+        `before` is the command until now, for a model with lag or delay.
         """
         X, V, bias = self._cast(X_WB, V_WB_B, F_bias_W)
         n = F_Bo_B.shape[2]
@@ -233,7 +233,7 @@ class MppiPlanner(eqx.Module):
         V_WB_B: Float[Array, "6"],
         F_bias_W: Float[Array, "6"],
     ) -> tuple[MppiState, MppiOutput]:
-        """The plan, from what became of each of the parts."""
+        """The plan, from the rollouts of all parts."""
         c, dW = self.config, draw.dW
         X, V, bias = self._cast(X_WB, V_WB_B, F_bias_W)
         F = jnp.concatenate(draw.parts, axis=2)
@@ -287,7 +287,7 @@ class MppiPlanner(eqx.Module):
     def sample(
         self, key: Array, nominal: Float[Array, "horizon 6"], F_bias_W: Float[Array, "6"]
     ) -> Float[Array, "horizon 6 sequences"]:
-        """Feasible wrench sequences about `nominal`: itself, then holding, then with noise."""
+        """Feasible wrench sequences: `nominal`, the hold wrench, then `nominal` with noise."""
         c = self.config
         n = c.sequences
         noise = jnp.asarray(c.noise, nominal.dtype) * self.axes
@@ -330,7 +330,7 @@ class MppiPlanner(eqx.Module):
         return total, probability
 
     def violation(self, rolled: Rolled) -> Float[Array, " n"]:
-        """How far sequences are from keeping the chance constraint; 0 for those that do."""
+        """Violation of the chance constraint by each sequence; 0 where it is satisfied."""
         c, clearance = self.config, rolled.clearance
         if c.collision_risk is None or self.cylinders.radius.shape[0] == 0:
             return jnp.zeros_like(clearance[0])
@@ -340,9 +340,9 @@ class MppiPlanner(eqx.Module):
     def _process_noise(self, key: Array) -> Float[Array, "horizon substeps 6 r"] | None:
         """Brownian increments (√s) for the realisations; None for a single one.
 
-        Pairs have opposite signs, so the mean is that without noise. Where paths stray freely, each
-        axis is scaled to the mean square that its Brownian path has over the horizon: a handful of
-        them then spreads as much as many would.
+        Pairs have opposite signs, so the mean is zero. Without tracking, each axis is scaled to the
+        expected mean square of its Brownian path over the horizon, so that a few realisations have
+        the spread of many.
         """
         c = self.config
         if c.realisations == 1:
@@ -360,10 +360,10 @@ class MppiPlanner(eqx.Module):
         return self.tracking is not None and self.config.tracked
 
     def _turned(self, F: Array, X: Array, V: Array, n: int) -> Array:
-        """Wrenches and what turns n sequences' vehicles to the goal's attitude, cut to U.
+        """Wrenches of n sequences plus the feedback to the goal's attitude, projected to U.
 
-        The two paths of a pair get the same, that of their middle: what draws them to it is not
-        planned (`_pull`).
+        Both paths of a pair get the feedback of their midpoint: the feedback to the midpoint is not
+        part of the plan (`_pull`).
         """
         if self.tracking is None or not self.config.hold_attitude:
             return F
@@ -377,7 +377,7 @@ class MppiPlanner(eqx.Module):
         return self.limits.clip(F + jnp.concatenate([jnp.zeros_like(moment), moment]))
 
     def _pull(self, X: Array, V: Array, n: int) -> Array:
-        """What tracking adds for n sequences: it draws each path to the middle of its pair."""
+        """Tracking feedback for n sequences: it pulls each path to the midpoint of its pair."""
         assert self.tracking is not None
         K_p, K_d = self.tracking
         half = self.config.realisations // 2 * n
@@ -391,7 +391,7 @@ class MppiPlanner(eqx.Module):
         return [array.astype(self.V_goal.dtype) for array in arrays]
 
     def _cut(self, F: Array) -> Array:
-        """Wrenches (horizon, 6, …) cut to the feasible set."""
+        """Wrenches (horizon, 6, …) projected to the feasible set."""
         return jnp.moveaxis(self.limits.clip(jnp.moveaxis(F, 1, 0)), 0, 1)
 
     def _state_cost(self, X: Array, V: Array) -> Array:
@@ -450,7 +450,7 @@ class MppiPlanner(eqx.Module):
 
 
 def _first_choice(cost: Float[Array, " n"], violation: Float[Array, " n"]) -> Array:
-    """Index of the least cost of what violates nothing, else of the least violation."""
+    """Index of the least cost among feasible sequences, or of the least violation if none is."""
     finite = jnp.isfinite(cost) & jnp.isfinite(violation)
     kept = finite & (violation <= 0)
     rest = jnp.where(finite, violation, jnp.inf)
@@ -460,11 +460,11 @@ def _first_choice(cost: Float[Array, " n"], violation: Float[Array, " n"]) -> Ar
 def command_of_felt(
     dynamics: Dynamics, X_WB: Float[Array, "7"], scale: Float[np.ndarray, "6"]
 ) -> Float[np.ndarray, "6 6"] | None:
-    """The change of the commanded wrench for a unit change of the one that the body feels.
+    """The change of the commanded wrench for a unit change of the one that acts on the body.
 
     The inverse of the model's mean slope over ± `scale` (N, N·m) about a command of zero, at rest;
     None where it is the identity, as for every model without effects on its thrusters, and where
-    some direction can hardly be commanded at all.
+    the slope is nearly singular.
     """
     X = jnp.asarray(X_WB, dynamics.rigid_inertia.dtype)
     steps = jnp.asarray(np.concatenate([np.diag(scale), -np.diag(scale)], axis=1), X.dtype)

@@ -1,7 +1,7 @@
 """Vertical cylinders in the water (pylons, piles) and the vehicle's distance to them.
 
-Planning measures with a set of spheres that covers the hull, which is cheap and errs to the safe
-side; the judgement whether a vehicle did touch something measures with the box itself.
+Planning uses a set of spheres that covers the hull, which is cheap and conservative; collision
+checks of a run use the box itself.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ class Pylon:
         diameter: (m).
         bottom: z of the lower end (m).
         top: z of the upper end (m).
-        name: how reports call it.
+        name: its name in reports.
     """
 
     x: float
@@ -144,8 +144,8 @@ class BoxHull(eqx.Module):
         """Signed distance (m) of the box to the nearest cylinder; +inf if there is none.
 
         The least signed distance of the box to a point of the cylinder's axis, less its radius.
-        The distance to a convex body is convex along a line, so golden sections find it. Beside
-        the cylinder this is exact; past its ends it takes them for hemispheres, to the safe side.
+        The distance to a convex body is convex along a line, so golden sections find it. It is
+        exact beside the cylinder; beyond its ends it treats them as hemispheres (conservative).
         """
         if cylinders.radius.shape[0] == 0:
             return jnp.full_like(X_WB[0], jnp.inf)

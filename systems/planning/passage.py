@@ -1,7 +1,7 @@
-"""Whether there is a way to a goal that keeps clear of the obstacles, however it is planned.
+"""Whether any path to a goal keeps clear of the obstacles.
 
-A planner that looks a few seconds ahead can't tell a goal that is ringed by pylons from one that
-lies behind a corner. This can, before the flight: it seeks the widest way on a grid.
+A planner with a horizon of a few seconds can't distinguish a goal that is enclosed by pylons from
+one behind a corner. This module does so before the run: it finds the widest path on a grid.
 """
 
 from collections.abc import Sequence
@@ -17,19 +17,19 @@ from .obstacles import Pylon
 
 _CELL = 0.04  # m
 _CELLS = 400_000
-_ABOUT = 1.0  # m of free water around everything that stands
-_REACH = 2.0  # m above and below start and goal that ways are sought
+_ABOUT = 1.0  # m of free water around start, goal and obstacles
+_REACH = 2.0  # m above and below start and goal that are searched
 _HALVINGS = 16
 _NEIGHBOURS = np.stack([np.diag([0, 1, 0]), np.ones((3, 3)), np.diag([0, 1, 0])])
 
 
 class Passage(NamedTuple):
-    """The widest way to a goal.
+    """The widest path to a goal.
 
     Attributes:
-        clearance: no way keeps more than this (m) from the obstacles all along.
-        std: standard deviation of the clearance that is reckoned with (m).
-        allowed: allowed probability of a collision; None asks that the vehicle fits through.
+        clearance: largest minimum distance (m) to the obstacles that a path can have.
+        std: assumed standard deviation of the clearance (m).
+        allowed: allowed probability of a collision; None requires that the vehicle fits through.
     """
 
     clearance: float
@@ -38,14 +38,14 @@ class Passage(NamedTuple):
 
     @property
     def risk(self) -> float:
-        """Probability of a collision on the widest way: on any other it is higher."""
+        """Probability of a collision on the widest path: on any other it is higher."""
         if self.std > 0:
             return float(ndtr(-self.clearance / self.std))
         return float(self.clearance < 0)
 
     @property
     def safe(self) -> bool:
-        """Whether the allowed risk may be kept to."""
+        """Whether a path with the allowed risk may exist."""
         return self.clearance >= 0 if self.allowed is None else self.risk <= self.allowed
 
 
@@ -58,14 +58,14 @@ def widest_way(
     bed: float = -np.inf,
     enough: float = np.inf,
 ) -> float:
-    """The clearance (m) that no way to within `goal_radius` of a goal exceeds; inf without pylons.
+    """Upper bound (m) on the clearance of paths to within `goal_radius` of a goal; inf if no pylon.
 
-    The vehicle counts as an upright cylinder that is as wide as the narrower side of its hull,
-    which fits into a level hull of any heading. Ways may rise to the surface and dive to `bed`
-    (z, m), no more than 2 m above or below both start and goal. The grid's cells are given the
-    clearance of the best point that they may have: the bound is never too low, and at most by the
-    diagonal of a cell (of 4 cm in a harbour, more in a wide field) too high. A start with less than
-    `enough` counts as being where it first could have that much: the way out is not judged.
+    The vehicle is taken as an upright cylinder as wide as the narrower side of its hull, which fits
+    into a level hull of any heading. Paths may rise to the surface and dive to `bed` (z, m), no
+    more than 2 m above or below both start and goal. Each grid cell has the clearance of its best
+    point: the bound is never too low, and too high by at most the diagonal of a cell (of 4 cm in a
+    harbour, more in a wide field). A start with less clearance than `enough` is extended by the
+    missing distance: the way out is not judged.
     """
     if not pylons:
         return np.inf
@@ -93,7 +93,7 @@ def widest_way(
             around[k] = np.minimum(around[k], _signed(beside, past))
 
     def near(point: np.ndarray, reach: float) -> np.ndarray:
-        """Cells that have a point within reach of one, and the cell that it is in."""
+        """Cells with a point within `reach` of the given one, and the cell that contains it."""
         off = np.array([max(a - point[2], point[2] - b, 0.0) for a, b in slabs])[:, None, None]
         flat = np.hypot(X - point[0], Y - point[1])[None]
         inside = np.hypot(np.maximum(flat - cell / np.sqrt(2), 0), off) <= reach
@@ -123,7 +123,7 @@ def widest_way(
 def upright_gap(
     p_WB: Float[np.ndarray, "3"], pylon: Pylon, size: tuple[float, float, float]
 ) -> float:
-    """Clearance (m) of the upright cylinder that `widest_way` takes for the hull."""
+    """Clearance (m) of the upright cylinder by which `widest_way` represents the hull."""
     away = np.hypot(p_WB[0] - pylon.x, p_WB[1] - pylon.y)
     beside = np.asarray(away - pylon.diameter / 2 - min(size[:2]) / 2)
     past = float(max(p_WB[2] - pylon.top, pylon.bottom - p_WB[2])) - size[2] / 2
@@ -131,6 +131,6 @@ def upright_gap(
 
 
 def _signed(beside: Float[np.ndarray, "*cells"], past: float) -> Float[np.ndarray, "*cells"]:
-    """Signed distance of two upright cylinders from their gaps beside and past each other."""
+    """Signed distance of two upright cylinders from their horizontal and vertical gaps."""
     outside = np.hypot(np.maximum(beside, 0), max(past, 0.0))
     return np.asarray(outside + np.minimum(np.maximum(beside, past), 0))

@@ -1,4 +1,4 @@
-"""The parts of path integral control that know nothing of vehicles: noise, risk, weights."""
+"""The parts of path integral control that do not depend on the vehicle: noise, risk, weights."""
 
 import math
 from typing import Any, Literal
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from scipy.interpolate import BSpline
 
 _BISECTIONS = 48
-_LOG_TEMPERATURES = -40.0, 80.0  # far beyond any cost that float32 tells apart
+_LOG_TEMPERATURES = -40.0, 80.0  # beyond all cost differences that float32 resolves
 
 
 def spline_basis(horizon: int, pieces: int) -> Float[np.ndarray, "horizon coefficients"]:
@@ -40,12 +40,12 @@ def combine_risk(
 def chance_violation(
     clearance: Float[Array, "r n"], alpha: float, least_std: float
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
-    """How far control sequences are from P(clearance > 0) ≥ 1 − α.
+    """Violation of P(clearance > 0) ≥ 1 − α by control sequences.
 
     `clearance` (m) is each realisation's least over the horizon. r realisations resolve a
-    probability no finer than 1/r, so their law is taken as normal with their mean μ and variance
-    σ² = s² + σ₀² (sample variance and floor): P(collision) = Φ(−μ/σ), and the constraint holds
-    if μ ≥ σ Φ⁻¹(1 − α).
+    probability no finer than 1/r, so the distribution is taken as normal with their mean μ and
+    variance σ² = s² + σ₀² (sample variance and floor): P(collision) = Φ(−μ/σ), and the constraint
+    holds if μ ≥ σ Φ⁻¹(1 − α).
 
     Returns:
         The probabilities, their excess over α, and the missing clearance (σ Φ⁻¹(1 − α) − μ)₊ in m,
@@ -69,12 +69,12 @@ def effective_count(weights: Float[Array, " n"]) -> Float[Array, ""]:
 def path_integral_weights(
     cost: Float[Array, " n"], effective_samples: float
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-    """w_i ∝ exp(−S_i/λ) with the λ at which `effective_samples` of them count; and that λ.
+    """w_i ∝ exp(−S_i/λ), with λ such that the effective sample size is `effective_samples`; and λ.
 
     Williams et al. 2016, "Aggressive driving with model predictive path integral control", eq. 6,
-    in log-sum-exp form. The number that counts, 1/Σw², grows with λ, so bisection finds it; only
-    the order and the gaps of the good costs matter, not how far the collisions lie above. Costs
-    that are not finite get no weight, and if none is finite all weights are equal.
+    in log-sum-exp form. The effective sample size 1/Σw² grows with λ, so bisection finds λ; only
+    the differences of the low costs matter, not how high the costs of collisions are. Costs that
+    are not finite get no weight, and if none is finite all weights are equal.
     """
     finite = jnp.isfinite(cost)
     some = jnp.any(finite)
@@ -82,7 +82,7 @@ def path_integral_weights(
         some, jnp.min(jnp.where(finite, cost, jnp.inf)), 0
     )
     excess = jnp.where(some, excess, 0)
-    # of few finite costs, no more can count than there are
+    # the effective sample size can't exceed the number of finite costs
     target = jnp.minimum(
         effective_samples, 0.999 * jnp.sum(finite & some | ~some, dtype=cost.dtype)
     )

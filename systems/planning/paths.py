@@ -37,7 +37,7 @@ class PoseConfig:
 
 
 class Motion(NamedTuple):
-    """Pose, twist and the rate of the twist's components at the times asked for."""
+    """Pose, twist and the rate of the twist's components at given times."""
 
     X_WB: Float[Array, "7 *batch"]
     V_WB_B: Float[Array, "6 *batch"]
@@ -45,14 +45,14 @@ class Motion(NamedTuple):
 
 
 class Path(abc.ABC):
-    """Where to be when; time (s) counts from the start of the simulation."""
+    """A reference pose over time; time (s) counts from the start of the simulation."""
 
     @abc.abstractmethod
     def pose(self, t: Float[Array, " n"]) -> Float[Array, "7 n"]:
         """X_WB at times t."""
 
     def motion(self, t: Float[Array, " n"]) -> Motion:
-        """Poses with the twists and accelerations that lead from one to the next.
+        """Poses with their twists and accelerations.
 
         With q̇ and ṗ by forward differentiation, v = Rᵀ ṗ and (0, ω) = 2 q* ∘ q̇.
         """
@@ -89,7 +89,7 @@ class Waypoints(Path):
     whose speed peaks at 15/8 of the mean.
 
     Attributes:
-        poses: at least two; the first is where to be at `start`.
+        poses: at least two; the first is that at `start`.
         speed: mean linear speed along a leg (m/s).
         turn_rate: mean angular speed (rad/s) that a leg doesn't exceed.
         pause: time at rest on each pose but the last (s).
@@ -141,7 +141,7 @@ class FigureEight(Path):
         length: from tip to tip, 2a (m).
         width: of the lobes, 2b (m).
         period: of a whole figure (s).
-        ramp: time to gather speed (s).
+        ramp: time to accelerate (s).
         follow: turn the bow along the path (else the heading stays that of `centre`).
     """
 
@@ -160,7 +160,7 @@ class FigureEight(Path):
 
     def pose(self, t: Float[Array, " n"]) -> Float[Array, "7 n"]:
         s = jnp.clip(t / self.ramp, 0, 1)
-        # ∫ of the smooth step 3s² − 2s³; past the ramp time runs on
+        # ∫ of the smooth step 3s² − 2s³; beyond the ramp the phase rate is constant
         run = self.ramp * (s**3 - s**4 / 2) + jnp.maximum(t - self.ramp, 0)
         phase = 2 * math.pi / self.period * run
         a, b = self.length / 2, self.width / 2

@@ -1,4 +1,4 @@
-"""The plan vector: what a planner or a reference tells the tracking controller."""
+"""The plan vector: the output of a planner or a reference for the tracking controller."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -29,9 +29,9 @@ class Setpoint(NamedTuple):
 
 @dataclass(frozen=True)
 class PlanLayout:
-    """How a plan lies in one flat vector: t0, then (H+1) × (pose 7, twist 6), then H × wrench 6.
+    """Layout of a plan in a flat vector: t0, then (H+1) × (pose 7, twist 6), then H × wrench 6.
 
-    A vector of zeros holds no plan (its quaternions have length zero): `at` then says not valid.
+    A vector of zeros holds no plan (its quaternions have length zero): `at` then returns not valid.
 
     Attributes:
         horizon: H, the number of intervals.
@@ -64,10 +64,10 @@ class PlanLayout:
         return Plan(vector[0], states[:7], states[7:], wrenches)
 
     def at(self, vector: Float[Array, " size"], t: Float[Array, ""]) -> Setpoint:
-        """The plan at time t (s): geodesic between poses, straight between twists, wrench held.
+        """The plan at time t (s): geodesic between poses, linear between twists, wrench held.
 
-        Before t0 the first state counts. After the end the vehicle shall stay: the last pose, a
-        twist of zero, and the last wrench, which carries what holding takes.
+        Before t0 it is the first state. After the end the vehicle holds its pose: the last pose, a
+        twist of zero, and the last wrench, which includes the static wrenches.
         """
         plan = self.unpack(vector)
         s = (t - plan.t0) / jnp.asarray(self.dt, vector.dtype)

@@ -17,7 +17,7 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True)
 class SampleLayout:
-    """How samples lie in one flat vector: t0, then horizon × 3 × paths positions, then weights.
+    """Layout of samples in a flat vector: t0, then horizon × 3 × paths positions, then weights.
 
     Attributes:
         horizon: steps of a path.

@@ -1,4 +1,4 @@
-"""A reference that tells the tracking controller where to be: a plan without planning."""
+"""A reference for the tracking controller from a given path, without a planner."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +17,7 @@ from .plan import Plan, PlanLayout
 def feedforward(
     dynamics: Dynamics, motion: Motion, F_bias_Bo_W: Float[Array, "6"]
 ) -> Float[Array, "6 n"]:
-    """The wrench under which a model in still water makes a motion: inverse dynamics.
+    """The wrench that makes a model follow a motion in still water: inverse dynamics.
 
     F = M ξ̇ − ad*_ξ(M ξ) + D ξ + D^f |ξ|ξ − F_V(g) − F_bias (see `models.dynamics`).
     """
@@ -30,7 +30,7 @@ def feedforward(
 
 
 class Reference(LeafSystem):
-    """Puts out a path's next states every `period`, in the same `plan` vector as a planner's.
+    """Outputs a path's next states every `period`, in the same `plan` vector as a planner's.
 
     The wrenches are the model's inverse dynamics along the path less the observed bias
     `F_bias_Bo_W` (axes of W, zero if not connected); without a model they only counter the bias.

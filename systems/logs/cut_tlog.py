@@ -1,4 +1,4 @@
-"""Cutting a telemetry log down: whole packets of chosen messages, spans and rates, nothing changed.
+"""Reduces a telemetry log to chosen messages, spans and rates; packets are kept byte for byte.
 
 python -m spinndrift.systems.logs.cut_tlog dive.tlog out.tlog.xz --spans 52.8 142.8
 """
@@ -27,7 +27,7 @@ RATES: dict[str, float] = {
     "BATTERY_STATUS": 2.0,
     "VISION_POSITION_DELTA": 0.2,
 }
-# Kept all along, so that arming, modes and the clock are known between the spans.
+# Kept throughout, so that arming, modes and the clock are known between the spans.
 ALWAYS = ("HEARTBEAT", "STATUSTEXT", "SYSTEM_TIME", "GPS_GLOBAL_ORIGIN")
 PARAMETERS = (
     "BARO1_GND_PRESS",
@@ -53,8 +53,8 @@ def cut_tlog(
 ) -> bytes:
     """Return the chosen packets with their time stamps, in order and byte for byte.
 
-    `spans` are seconds since boot on the vehicle's clock. Of each message in `rates` as many are
-    kept as come nearest to that rate; `parameters` are kept wherever they were reported.
+    `spans` are seconds since boot on the vehicle's clock. The messages in `rates` are decimated to
+    nearly these rates; `parameters` are kept wherever they were reported.
 
     Raises:
         UserError: if the log has no message with the vehicle's time, or nothing falls in a span.

@@ -58,10 +58,10 @@ class _Format:
     columns: tuple[str, ...]
 
     def dtype(self) -> np.dtype | None:
-        """Layout of a record, of the length that its FMT record tells; None if it has none.
+        """Layout of a record, of the length in its FMT record; None if the format is invalid.
 
-        So it is where a column has no name or another's, the time is no number, or the columns are
-        longer than a record.
+        It is invalid if a column has no name or a duplicate one, the time is not a number, or the
+        columns are longer than a record.
         """
         columns = list(zip(self.columns, self.codes, strict=False))
         names = [column for column, _ in columns]
@@ -78,7 +78,7 @@ class _Format:
 
 
 def read_bin(data: bytes, wanted: Collection[str], progress: Progress = no_progress) -> BinLog:
-    """Decode the wanted message types; damaged stretches are skipped and told in the notes."""
+    """Decode the wanted message types; damaged stretches are skipped and reported in the notes."""
     formats, offsets, skipped = _scan(data, wanted, progress)
     tables: dict[str, Table] = {}
     unreadable = []

@@ -1,15 +1,15 @@
-"""Height and climb of an autopilot that took the water for fresh.
+"""Correction of height and climb of an autopilot that assumed fresh water.
 
-Its filter takes the depth from a pressure that it divides by a gradient too small, and the motion
-between from the accelerometer. So with σ the depths that it measures for one of water,
+Its filter fuses depth, computed from pressure with too small a gradient, with the accelerometer.
+With σ the ratio of its computed depth to the true depth,
 
     z_est = z + (σ - 1) G z,        v_est = v + (σ - 1) L v,
     L = ω² / (s² + √2 ω s + ω²),    G = (√2 ω s + ω²) / (s² + √2 ω s + ω²):
 
-wrong where the motion is slow, right where it is fast, which is taken off to first order in σ - 1,
-with L and G of what was estimated. This is the stationary Kalman filter of a
-height with white acceleration noise (Kalman and Bucy 1961), for which ω⁴ is the intensity of that
-noise over that of the measurement.
+a scale error in slow motion and none in fast motion. It is removed to first order in σ - 1, with L
+and G of the estimate. This is the stationary Kalman filter of a height with white acceleration
+noise (Kalman and Bucy 1961), for which ω⁴ is the ratio of the intensities of acceleration noise and
+measurement noise.
 """
 
 import itertools
@@ -24,17 +24,17 @@ from ..mavlink import codec
 from .signals import Series
 
 CROSSOVER = 0.3
-"""Hz, with the noise below: 0.31 by the simulator's truth, 0.27 by pressure, in ArduSub 4.5.6's own
-dive."""
+"""Hz, with the noise below: 0.31 from the simulator's truth, 0.27 from pressure, on a dive with
+ArduSub 4.5.6's own parameters."""
 _NOISE = {"EK3_ACC_P_NSE": 0.35, "EK3_ALT_M_NSE": 0.1}
 """m/s² and m, as in that dive."""
 _BAROMETER = 1  # EK3_SRC1_POSZ
 _PAUSE, _GRID = 2.0, 0.01
-"""s without a sample after which a filter starts anew, and its longest step."""
+"""s without a sample after which the filter restarts, and its longest step."""
 
 
 def crossover(known: Mapping[str, float]) -> float:
-    """Frequency (Hz) above which climb is that of the accelerometer; `known` are parameters."""
+    """Frequency (Hz) above which climb is from the accelerometer; `known` are parameters."""
     given = {name: value for name, value in known.items() if value > 0}
     own = {**_NOISE, **given}
     ratio = own["EK3_ACC_P_NSE"] / own["EK3_ALT_M_NSE"]
@@ -47,9 +47,9 @@ def in_water(
     known: Mapping[str, float],
     density: float | None,
 ) -> tuple[Series | None, Series | None]:
-    """Position and velocity with z (m, m/s, up) as they are in water of `density` (kg/m³).
+    """Position and velocity with z (m, m/s, up) corrected for water of `density` (kg/m³).
 
-    Without a density, or where the height is not the barometer's, they stay as they are.
+    Without a density, or if the height is not from the barometer, they are unchanged.
     """
     source = known.get("EK3_SRC1_POSZ", _BAROMETER)
     if density is None or source != _BAROMETER:
@@ -75,9 +75,9 @@ def _filtered(
     top: Float[np.ndarray, "3"],
     bottom: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, " n"]:
-    """Output of a transfer function, at rest in the first value after every pause.
+    """Output of a transfer function, in steady state at the first value after every pause.
 
-    Samples may be uneven: between pauses the filter runs on an even grid of its own.
+    Samples may be unevenly spaced: between pauses the filter runs on a uniform grid of its own.
     """
     edges = [0, *(np.flatnonzero(np.diff(t) > _PAUSE) + 1).tolist(), t.size]
     found = np.empty_like(x)

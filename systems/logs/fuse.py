@@ -1,11 +1,10 @@
 """Signals of a log, cut and brought to one uniform grid: the trajectories of a recording.
 
-Attitude along the geodesic, position by the cubic that has the estimated velocity as its slope,
-velocity linearly and turned into the body, rates and IMU as means about each instant
-(`models/recordings/resample.py`). The command of a step is the mean, over that step, of the line
-through the logged outputs: they are samples of something that changes faster, and holding each
-until the next would delay the commands by half a sampling period (50 ms at the 10 Hz of a DataFlash
-log).
+Attitude is interpolated along the geodesic, position by the Hermite cubic with the estimated
+velocity as its slope, velocity linearly and then rotated into the body; rates and IMU are means
+about each instant (`models/recordings/resample.py`). The command of a step is the mean over that
+step of the linear interpolation of the logged outputs: a zero-order hold of these samples would
+delay the commands by half a sampling period (50 ms at the 10 Hz of a DataFlash log).
 """
 
 from itertools import pairwise
@@ -76,14 +75,14 @@ def fuse(
 
 
 def _parts(segment: Segment) -> list[Segment]:
-    """Equal parts of at most `_LONGEST_S`: a recording pads all runs to the longest one."""
+    """Equal parts of at most `_LONGEST_S`, because a recording pads all runs to the longest one."""
     count = int(np.ceil(segment.duration / _LONGEST_S))
     edges = np.linspace(segment.start, segment.stop, count + 1).tolist()
     return [Segment(a, b, segment.labels) for a, b in pairwise(edges)]
 
 
 def name_of(segment: Segment, number: int) -> str:
-    """Scenario name: running number, mode, and what was special."""
+    """Scenario name: running number, mode, and special states."""
     words = [_STATES.get(label, label) for label in segment.labels if label != UNAIDED]
     modes = [word for word in words if word not in _STATES.values()]
     special = [word for word in words if word in _STATES.values()]
@@ -135,9 +134,9 @@ def _at(series: Series, t: np.ndarray) -> np.ndarray:
 
 
 def _instants(series: Series, t: np.ndarray) -> np.ndarray:
-    """Values at the instants t; of sensors much faster than 100 Hz the mean over 10 ms.
+    """Values at the instants t; the mean over 10 ms for sensors much faster than 100 Hz.
 
-    Ten ms and no more: a mean over half a step of 50 ms takes 2 % off the accelerations at 5 Hz.
+    A mean over half a step of 50 ms would attenuate accelerations at 5 Hz by 2 %.
     """
     if series.rate > _FAST_HZ:
         return mean(t, series.t, series.x, _MEAN_S)

@@ -22,19 +22,19 @@ from .signals_tlog import signals_from_tlog
 from .tlog import read_tlog
 
 RATES = (50.0, 40.0, 25.0, 20.0)
-"""Rates (Hz) at which logs are imported unless another one is asked for; the last by default."""
+"""Rates (Hz) at which logs are imported unless another one is given; the last by default."""
 
 
 @dataclass(frozen=True)
 class LogOptions:
-    """What is taken from a vehicle's log.
+    """Options of the import of a vehicle's log.
 
     Attributes:
         minimum: shortest stretch kept (s).
         gap: longest pause between samples of one signal within a stretch (s).
         water_density: kg/m³, to correct depth and the slow part of the climb of an autopilot that
-            assumed fresh water, where its height is the barometer's (`depth.in_water`); None takes
-            its figures as they are.
+            assumed fresh water, if its height is from the barometer (`depth.in_water`); None leaves
+            them uncorrected.
         disarmed: keep disarmed stretches too.
         system: MAVLink system id, if several autopilots are in the log.
     """
@@ -57,10 +57,10 @@ def import_log(
     """Import a log: one scenario for each stretch of constant mode, armed, without gaps or resets.
 
     Args:
-        path: the log; its kind is told by its content.
+        path: the log; its kind is determined from its content.
         rate: of the recording (Hz); None takes that of the slowest stream of state and outputs,
             within 20 to 50 Hz.
-        vehicle: preset or file whose thruster directions the PWM shall have; named in the result.
+        vehicle: preset or file whose thruster directions the PWM is to have; named in the result.
         options: what is taken from the log.
         progress: called with the fraction done, 0 to 1.
 
@@ -105,7 +105,7 @@ def import_log(
 
 
 def own_rate(signals: Signals) -> float:
-    """The largest of `RATES` that no stream of state or outputs falls short of, or the least."""
+    """The largest of `RATES` that every stream of state and outputs reaches, or else the least."""
     streams = (signals.attitude, signals.rates, signals.outputs, signals.velocity)
     slowest = min(s.rate for s in streams if s is not None)
     return next((rate for rate in RATES if rate <= 1.05 * slowest), RATES[-1])
@@ -120,15 +120,15 @@ def load_data(
     resample: bool = True,
     progress: Progress = no_progress,
 ) -> Recording:
-    """Read any data there is: a recording (.nc), a CSV folder, or a vehicle's log.
+    """Read data of any kind: a recording (.nc), a CSV folder, or a vehicle's log.
 
     Args:
         path: file, or folder with a `recording.yaml`.
-        rate: Hz; None keeps that of the data (20 for logs, or their streams' own as in
-            `import_log` where nothing is to be resampled).
-        vehicle: preset or file; None keeps what the data name (bluerov2_heavy for logs).
+        rate: Hz; None keeps that of the data (20 for logs, or that of `own_rate` if `resample` is
+            False).
+        vehicle: preset or file; None keeps the one that the data name (bluerov2_heavy for logs).
         options: what is taken from a log.
-        resample: False keeps the samples of CSV files at uneven times where they are.
+        resample: False keeps the unevenly spaced samples of CSV files.
         progress: called with the fraction done, 0 to 1.
 
     Raises:

@@ -1,4 +1,4 @@
-"""A log file's bytes: unpacked if compressed, cut-off files read as far as they go, kind told."""
+"""A log file's bytes, decompressed as far as the file is intact, and the kind of the log."""
 
 import gzip
 import lzma
@@ -23,12 +23,12 @@ _NEEDED = (
 
 
 def no_progress(fraction: float) -> None:
-    """The progress callback that tells nobody."""
+    """The progress callback that does nothing."""
 
 
 @dataclass(frozen=True)
 class LogBytes:
-    """Unpacked content, what it is, and what was wrong with the file (empty if nothing)."""
+    """Decompressed content, its kind, and notes on damage of the file (empty if intact)."""
 
     data: bytes
     kind: Kind
@@ -36,7 +36,7 @@ class LogBytes:
 
 
 def read_log_bytes(path: Path, progress: Progress = no_progress) -> LogBytes:
-    """Read a log, plain or .xz/.gz, and tell its kind by its content rather than its name.
+    """Read a log, plain or .xz/.gz, and determine its kind from its content, not its name.
 
     Raises:
         UserError: if the file is missing, empty, broken from its first byte, or no such log.

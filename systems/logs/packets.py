@@ -1,4 +1,4 @@
-"""MAVLink packets in a telemetry log: framing, checksums, fields; nothing of their meaning.
+"""MAVLink packets in a telemetry log: framing, checksums, fields; not their interpretation.
 
 The layout of a packet is that of the MAVLink serialisation guide (versions 1 and 2); checksum
 seeds, message ids and field layouts are those of pymavlink's ArduPilot dialect.
@@ -39,7 +39,7 @@ Packet = tuple[int, int, int, int, int, int]
 
 @dataclass(frozen=True)
 class Packets:
-    """Where the packets of a log lie: one entry each, in file order; `record` is the time stamp."""
+    """Offsets and headers of a log's packets in file order; `record` is that of the time stamp."""
 
     record: np.ndarray
     payload: np.ndarray
@@ -69,13 +69,13 @@ def message_name(number: int) -> str:
 
 
 def scan(data: bytes, progress: Progress = no_progress) -> Packets:
-    """Find the packets; after a damaged stretch the search goes on at the next sound packet."""
+    """Find the packets; after a damaged stretch the search continues at the next valid packet."""
     rows: list[tuple[int, int, int, int, int, int, int]] = []
     append = rows.append
     i, size, skipped = 0, len(data), 0
     report = step = max(size // 50, 1)
     while i + 20 <= size:
-        # as `_packet` does, but without a call for each of a million packets
+        # inlines `_packet`, to avoid a call for each of a million packets
         magic, length, after = data[i + 8], data[i + 9], 0
         if magic == _V2:
             after = i + 20 + length + (_SIGNATURE if data[i + 10] & 1 else 0)
@@ -129,7 +129,7 @@ def _sound(data: bytes, at: int, packet: Packet) -> bool:
 
 
 def _resync(data: bytes, start: int, size: int) -> int:
-    """Return the next record from `start` whose packet has a right checksum, or the end."""
+    """Return the next record from `start` whose packet has a valid checksum, or the end."""
     for match in _MAGIC.finditer(data, start + 8):
         at = match.start()
         if at + 8 > size:
@@ -159,9 +159,9 @@ def layout(name: str) -> np.dtype:
 def rows_of(
     data: bytes, packets: Packets, candidates: np.ndarray, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Decode packets of one message: their fields, and the indices of those with a right checksum.
+    """Decode packets of one message: their fields, and the indices of those with a valid checksum.
 
-    MAVLink 2 cuts trailing zeros off a payload; they are put back.
+    MAVLink 2 truncates trailing zeros of a payload; they are restored.
     """
     dtype = layout(name)
     size = dtype.itemsize

@@ -1,4 +1,4 @@
-"""What a log holds and lacks, in plain sentences."""
+"""The report of an import: what a log contains and lacks, in sentences."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,15 +17,15 @@ _CONSISTENT = 0.9
 
 @dataclass(frozen=True)
 class ImportReport:
-    """Sentences for a person; also kept in the recording's notes.
+    """Sentences for the user; also kept in the recording's notes.
 
     Attributes:
         source: the file.
-        segments: what was kept, one line each.
-        has: what the log tells.
-        lacks: what it does not tell and what can't be learned from it therefore.
-        done: what was done to the data.
-        dropped: what was cut away and why.
+        segments: the stretches that were kept, one line each.
+        has: what the log contains.
+        lacks: what it lacks, and what can't be learned from it for that reason.
+        done: how the data were processed.
+        dropped: what was left out, and why.
     """
 
     source: str
@@ -54,7 +54,7 @@ class ImportReport:
     __str__ = text
 
     def notes(self) -> tuple[str, ...]:
-        """Return the sentences that belong to the data for good."""
+        """Return the sentences that are stored with the data."""
         return (*self.has, *self.lacks, *self.done, *self.dropped)
 
 
@@ -87,7 +87,7 @@ def tell(
 
 
 def _left_out(signals: Signals) -> list[str]:
-    """A sentence on each signal of which samples were left out."""
+    """A sentence on each signal with samples that were left out."""
     found = [value for value in vars(signals).values() if isinstance(value, Series)]
     return [
         f"{one.source}: {one.left_out} sample{'s' * (one.left_out > 1)} left out that "
@@ -133,7 +133,7 @@ def _battery(signals: Signals) -> list[str]:
 
 
 def _consistency(kept: Sequence[Trajectory], dt: float) -> tuple[list[str], list[str]]:
-    """Sentences on how far the velocities explain the poses: good ones, bad ones."""
+    """Sentences on the agreement of velocities with poses: on good agreement, on poor agreement."""
     long = [k for k in kept if len(k) > 2]
     found = [agreement(dt * np.arange(len(k)), k.X_WB.T, k.V_WB_B.T) for k in long]
     sizes = np.array([len(k) for k in long])

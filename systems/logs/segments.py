@@ -1,4 +1,4 @@
-"""Cutting a log into stretches in which nothing but the motion changes."""
+"""Cuts a log into stretches of constant mode, arming, aiding and wiring, without gaps or jumps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,12 +10,12 @@ from .signals import Series, Signals, Spans
 
 _GUARD_S = 0.1
 _SLOWEST_S = 60.0
-"""s between samples of the slowest signal: fewer tell nothing of a motion."""
+"""s: longest period of a signal that still describes a motion."""
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A stretch from start to stop (s on the log's clock), named by its states; kept or why not."""
+    """A stretch from start to stop (s on the log's clock), labelled by its states."""
 
     start: float
     stop: float
@@ -31,7 +31,7 @@ def segments(signals: Signals, gap: float) -> tuple[list[Segment], list[str]]:
     """Return the stretches with constant states, without gaps or jumps, in time order.
 
     `gap` (s) is the longest pause allowed between samples, or five typical steps if that is longer.
-    The second result tells what cut them, one sentence a kind.
+    The second result lists the causes of the cuts, one sentence for each kind.
     """
     told: list[str] = []
     spans = [Segment(-np.inf, np.inf, ())]
@@ -61,7 +61,7 @@ def segments(signals: Signals, gap: float) -> tuple[list[Segment], list[str]]:
 
 
 def jumps(signals: Signals) -> list[tuple[float, str]]:
-    """Times at which the estimate moves as no vehicle can: filter resets and lane switches.
+    """Times at which the estimate jumps faster than a vehicle moves: filter resets, lane switches.
 
     A position step is compared with the velocity estimate, an attitude step with the body rates.
     """

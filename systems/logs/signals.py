@@ -1,6 +1,6 @@
-"""What either kind of log yields, in the frames and units of `models/se3.py`, on its own times.
+"""Signals of a log of either kind, in the frames and units of `models/se3.py`, at their own times.
 
-Readers fill `Signals`; cutting and resampling (`segments.py`, `fuse.py`) know no message names.
+Readers fill `Signals`; `segments.py` and `fuse.py`, which cut and resample, use no message names.
 """
 
 import math
@@ -16,17 +16,17 @@ from ..mavlink.codec import MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS, filter_dela
 
 @dataclass(frozen=True)
 class Series:
-    """Samples x (*components, n) at strictly increasing times t (n,), and where they come from."""
+    """Samples x (*components, n) at strictly increasing times t (n,), and their source."""
 
     t: np.ndarray
     x: np.ndarray
     source: str
     left_out: int = 0
-    """Samples that were no numbers, or beyond what any vehicle does."""
+    """Number of samples that were not finite or beyond the `LIMITS` of the quantity."""
 
     @property
     def rate(self) -> float:
-        """Typical rate (Hz): the mean one, leaving out gaps."""
+        """Mean rate without gaps (Hz)."""
         steps = np.diff(self.t)
         return 1.0 / float(np.mean(steps[steps <= 5 * np.median(steps)])) if steps.size else 0.0
 
@@ -52,7 +52,7 @@ class Signals:
         specific_force: in B (m/s²).
         pressure_depth: m, positive down.
         outputs: PWM (µs) of thrusters 1 … 8, direction normalised.
-        spans: armed, mode, aiding, wiring: what must stay constant within a segment.
+        spans: armed, mode, aiding, wiring: the states that are constant within a segment.
         cuts: times at which a segment must end: resets, reboots.
     """
 
@@ -75,8 +75,8 @@ class Signals:
 def series(t: np.ndarray, x: np.ndarray, source: str, quantity: str) -> Series | None:
     """Make a series: sorted, without repeated times; None if fewer than two samples are left.
 
-    Left out are samples beyond the `LIMITS` of the quantity, and with NaN or infinity in a
-    component that has numbers elsewhere.
+    Samples are left out if they are beyond the `LIMITS` of the quantity, or if a component that has
+    finite values elsewhere is not finite.
     """
     t, x = np.asarray(t, np.float64), np.asarray(x, np.float64)
     if not t.size:
@@ -94,9 +94,9 @@ def series(t: np.ndarray, x: np.ndarray, source: str, quantity: str) -> Series |
 
 
 def sampled_spans(t: np.ndarray, labels: Sequence[str]) -> Spans:
-    """Spans of a state reported from time to time (heartbeats): from first to last equal report.
+    """Spans of a state reported periodically (heartbeats): from first to last equal report.
 
-    Between two differing reports nothing is known, so that time belongs to no span.
+    Between two differing reports the state is unknown, so that time belongs to no span.
     """
     names = np.asarray(labels, dtype=object)
     change = np.flatnonzero(np.concatenate([[True], names[1:] != names[:-1]]))
@@ -114,7 +114,7 @@ def event_spans(t: np.ndarray, labels: Sequence[str], first: float, last: float)
 
 
 def undelayed(one: Series, known: Mapping[str, float], parameter: str) -> tuple[Series, list[str]]:
-    """Take the delay of the autopilot's own low-pass off the times of an inertial signal."""
+    """Subtract the delay of the autopilot's low-pass from the times of an inertial signal."""
     cutoff = known.get(parameter, 0.0)
     if not 1.0 <= cutoff <= 500.0:
         return one, []
@@ -146,13 +146,13 @@ _RANGES = (
     (r"EK3_SRC1_POSZ", 0.0, 100.0),
     (r"EK3_(ACC_P|ALT_M)_NSE", 1e-3, 1e3),
 )
-"""What the autopilot allows for parameters that matter here, and somewhat more."""
+"""Plausible ranges of the parameters in use, somewhat wider than the autopilot's."""
 
 
 def parameters_of(
     t: np.ndarray, names: np.ndarray, values: np.ndarray
 ) -> tuple[list[Parameter], list[str]]:
-    """The parameters of a log, and a sentence on those left out because they can't be so."""
+    """The parameters of a log, and a sentence on those left out as implausible."""
     found, strange = [], []
     for at, raw, value in zip(t.tolist(), names.tolist(), values.tolist(), strict=True):
         name = raw.decode("ascii", "replace")
@@ -170,7 +170,7 @@ def parameters_of(
 
 @dataclass(frozen=True)
 class Wiring:
-    """Output channel (1-based) and direction of thrusters 1 … 8; when outputs were re-purposed."""
+    """Output channels (1-based) and directions of thrusters 1 … 8; spans of reassigned outputs."""
 
     channels: tuple[int, ...]
     directions: tuple[int, ...]
@@ -184,8 +184,8 @@ _SETTLING_S = 1.3  # an output's new function is in force by then
 def wiring(parameters: Sequence[Parameter], first: float, last: float) -> Wiring:
     """Read thruster wiring from SERVOn_FUNCTION and MOT_n_DIRECTION as they were during the log.
 
-    A channel that ever had motor function 33 … 40 drives that thruster, also while it is switched
-    to pass-through (1, 51 … 66) or off.
+    A channel that ever had motor function 33 … 40 drives that thruster, even while it is set to
+    pass-through (1, 51 … 66) or off.
     """
     functions: dict[int, list[tuple[float, int]]] = {}
     directions: dict[int, int] = {}
@@ -257,10 +257,10 @@ def _settled(changes: Sequence[tuple[float, str]], first: float, last: float) ->
 def thruster_outputs(
     t: np.ndarray, channels_us: np.ndarray, wired: Wiring, motors: Sequence[float], source: str
 ) -> tuple[Series | None, list[str]]:
-    """PWM of thrusters 1 … 8 from output channels (16, n), signed as the vehicle's file has them.
+    """PWM of thrusters 1 … 8 from output channels (16, n), with the signs of the vehicle's file.
 
-    `motors` are the directions the vehicle's own description already contains; where the log's
-    MOT_n_DIRECTION differs, the value is mirrored about 1500.
+    `motors` are the directions in the vehicle's description; where the log's MOT_n_DIRECTION
+    differs, the value is mirrored about 1500.
     """
     notes = []
     index = np.array(wired.channels) - 1

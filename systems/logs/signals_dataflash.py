@@ -99,7 +99,7 @@ def signals_from_bin(
 
 
 def _usable(table: Table) -> Table:
-    """Messages in time order that have a time, with columns of numbers (and of names, of PARM)."""
+    """Messages with a valid time, in time order; numeric columns only (and the names of PARM)."""
     kept = Table(table.name)
     for column, values in table.items():
         text = (table.name, column) == ("PARM", "Name")
@@ -116,7 +116,7 @@ def _columns(tables: Mapping[str, Table], name: str, *columns: str) -> Sequence[
 
 
 def _primary_core(tables: Mapping[str, Table]) -> int:
-    """The filter core that flew most of the log."""
+    """The filter core that was primary for most of the log."""
     status = tables.get("XKF4")
     if status is None or "PI" not in status:
         return 0
@@ -125,7 +125,7 @@ def _primary_core(tables: Mapping[str, Table]) -> int:
 
 
 def _of(table: Table, column: str, value: int) -> Table:
-    """Rows of one instance; all of them if the log has no such column, the first one if not it."""
+    """Rows of one instance, or of the first if it is absent; all if there is no such column."""
     if column not in table:
         return table
     rows = table[column] == value
@@ -215,7 +215,7 @@ def _states(tables: Mapping[str, Table], first: float, last: float) -> dict[str,
     if not arming:
         events = {_ARMED_EVENT: True, _DISARMED_EVENT: False}
         arming = [(t, events[i]) for t, i in _columns(tables, "EV", "Id") if i in events]
-    if arming:  # before the first change it was the other way round
+    if arming:  # before the first change the state was the opposite
         states = [(first, not arming[0][1]), *arming]
         spans["armed"] = event_spans(
             np.array([t for t, _ in states]),

@@ -115,7 +115,7 @@ def _attitude(tables: Mapping[str, Table]) -> Series:
 
 
 def _rates(tables: Mapping[str, Table], attitude: Series) -> tuple[Series, tuple[str, ...]]:
-    """Body rates: with the attitude (bias removed by the filter), or from a much faster gyro."""
+    """Body rates: those of the attitude message (without bias), or of a much faster gyro."""
     table = tables[attitude.source]
     x = codec.body_vector(table["rollspeed"], table["pitchspeed"], table["yawspeed"])
     own = series(table["t"], x, f"{attitude.source} rates", "rate")

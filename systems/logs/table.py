@@ -1,18 +1,18 @@
-"""Columns of one kind of message of a log, as far as they can be what a sensor or a filter says."""
+"""Columns of one kind of message of a log; implausibly large numbers become NaN."""
 
 import numpy as np
 
 from ...models.config.errors import UserError
 
 _LARGEST = 1e18
-"""Squares of numbers below it are finite in either precision; no clock counts so many µs."""
+"""Squares of smaller numbers are finite in single precision; clocks in µs stay below it."""
 
 
 class Table(dict[str, np.ndarray]):
-    """Columns by name, one entry a message; `name` is that of the message.
+    """Columns by name, with one entry per message; `name` is that of the message.
 
     Raises:
-        UserError: a column is asked for that the messages lack.
+        UserError: on access to a column that the messages lack.
     """
 
     def __init__(self, name: str, columns: dict[str, np.ndarray] | None = None):
@@ -26,17 +26,17 @@ class Table(dict[str, np.ndarray]):
         )
 
     def rows(self, which: np.ndarray) -> "Table":
-        """The messages of these indices, or where this is true."""
+        """The messages selected by indices or a boolean mask."""
         return Table(self.name, {column: values[which] for column, values in self.items()})
 
 
 def whole(values: np.ndarray) -> np.ndarray:
-    """Flags, modes or indices as int64; 0 where they are no number."""
+    """Flags, modes or indices as int64; 0 where they are NaN."""
     return np.nan_to_num(values, nan=0.0).astype(np.int64)
 
 
 def numbers(values: np.ndarray) -> np.ndarray:
-    """The values in float64; NaN where they are infinite or so large that bits must be damaged."""
+    """The values in float64; NaN where they are infinite or so large that they must be corrupt."""
     with np.errstate(invalid="ignore"):  # a damaged number may signal when it is converted
         wide = values.astype(np.float64)
     wide[~(np.abs(wide) < _LARGEST)] = np.nan

@@ -1,12 +1,12 @@
 """MAVLink telemetry log (.tlog) into arrays on the vehicle's own clock.
 
 A record is eight bytes of the logger's clock (big-endian µs) and a MAVLink 1 or 2 packet, in both
-directions and of every system on the link. `packets.py` finds them; here they become tables.
+directions and of every system on the link. `packets.py` finds them; this module makes tables.
 
-Clocks. Logger clocks jump and links delay, so samples take the vehicle's time since boot:
-`time_boot_ms` as it is; the 32-bit `time_usec`, which wraps after 71.6 minutes, unwrapped next to
-the last `time_boot_ms` before it; messages without a time take that of the last one with it, plus
-what the logger's clock says has passed, at most one second. A reboot starts a new stretch.
+Clocks. Logger clocks jump and links have latency, so samples use the vehicle's time since boot:
+`time_boot_ms` unchanged; the 32-bit `time_usec`, which wraps after 71.6 minutes, unwrapped next to
+the last `time_boot_ms` before it; a message without a time has that of the last message with one,
+plus the elapsed time on the logger's clock, at most one second. A reboot starts a new stretch.
 """
 
 from collections import Counter
@@ -54,7 +54,7 @@ def read_tlog(
     """Decode the wanted messages of one autopilot: of `system` if given, else of the busiest.
 
     Raises:
-        UserError: if no autopilot speaks in the log, or not the system asked for.
+        UserError: if the log has no messages of an autopilot, or none of the chosen system.
     """
     packets = scan(data, progress)
     heard = _heard(packets)
@@ -106,7 +106,7 @@ def _choose(
         key = (int(packets.system[i]), int(packets.component[i]))
         if row["autopilot"] != _NO_AUTOPILOT and row["type"] != _GROUND_STATION:
             autopilots.setdefault(key, (int(row["type"]), int(row["autopilot"])))
-    if not autopilots:  # no heartbeat: whoever reports an attitude flies
+    if not autopilots:  # no heartbeat: a system that reports an attitude is an autopilot
         autopilots = {(s, c): (-1, -1) for (n, s, c) in heard if n.startswith("ATTITUDE")}
     if not autopilots:
         speakers = sorted({f"{s}/{c}" for _, s, c in heard})
@@ -145,7 +145,7 @@ def _choose(
 def _put_on_vehicle_clock(
     tables: dict[str, Table], index: dict[str, np.ndarray], stamps: np.ndarray
 ) -> tuple[tuple[float, ...], list[str]]:
-    """Add the column `t` to every table and sort by it; see the module's head."""
+    """Add the column `t` to every table and sort by it; see the module's docstring."""
     timed = [name for name in tables if "time_boot_ms" in tables[name]]
     if not timed:
         raise UserError(
@@ -179,7 +179,7 @@ def _put_on_vehicle_clock(
 
 
 def _epochs(raw: np.ndarray) -> tuple[np.ndarray, tuple[float, ...]]:
-    """What to add to each boot time so that later boots follow earlier ones, and their starts."""
+    """Offset of each boot time so that later boots follow earlier ones, and the boots' starts."""
     back = np.flatnonzero(np.diff(raw) < -_REBOOT_S) + 1
     shift = np.zeros_like(raw)
     boots = []

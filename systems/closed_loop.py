@@ -40,7 +40,7 @@ LOG_PERIODS: Mapping[str, float] = {
 
 
 class Signal(NamedTuple):
-    """What was logged of a port."""
+    """The logged samples of a port."""
 
     time: Float[np.ndarray, " n"]
     value: Float[np.ndarray, "n size"]
@@ -58,21 +58,21 @@ def build_diagram(
 ) -> Diagram:
     """Close the loop: subsystems `station`, `controller`, and a log `log_<port>` of each port.
 
-    A row of the logs is one instant, whichever ports they are of (`systems.compiled.signal_log`):
-    what the updates of t make stands at t, and beside it the truth of t. The truth is what a system
-    shows that holds the state behind one of the station's ports `CHEATS`.
+    A row of the logs is one instant for all ports (`systems.compiled.signal_log`): the results of
+    the updates at t, together with the truth at t. The truth is the output of systems that hold the
+    state behind one of the station's ports `CHEATS`.
 
     `extend(builder, station, controller)` may add more, a visualiser say, before the diagram is
     built. The diagram has no input ports; its randomness comes from sources inside (`seeded`).
 
-    `goal` (m, W) is for a controller that is told it (`Own`). With `stand_in` that system is the
-    station: a vehicle's driver, a recording played back, another simulator. It takes `F_Bo_B` and
-    has the outputs `X_WB` and `V_WB_B`; what else it has of `station_ports` is logged as well. The
-    configuration `station` still says for which vehicle and among which obstacles to control.
+    `goal` (m, W) is passed to a user-defined controller (`Own`). `stand_in`, if given, replaces the
+    station: a vehicle's driver, the playback of a recording, another simulator. Its input is
+    `F_Bo_B`, its outputs are `X_WB` and `V_WB_B`; its further outputs of `station_ports` are logged
+    as well. The configuration `station` still defines the vehicle and the obstacles.
 
     Raises:
         UserError: a configuration names what can't be read, or controller or stand-in lack a port.
-        NotImplementedError: hardware is asked for.
+        NotImplementedError: `hardware` is true.
     """
     builder = DiagramBuilder()
     if stand_in is None:
@@ -105,10 +105,10 @@ def seeded(diagram: Diagram, context: Context, seed: int) -> None:
 
 
 def logged(diagram: Diagram, context: Context) -> dict[str, Signal]:
-    """All logs of a closed loop by the port's name, as far as all of them have come.
+    """All logs of a closed loop by the port's name, up to the last row that all of them have.
 
-    After `AdvanceTo(t)` the updates of t are still to come, and with them its row. A log of Drake's
-    that `extend` has added under a name `log_…` comes as Drake took it.
+    After `AdvanceTo(t)` the updates of t are still pending, and so is its row. A Drake log that
+    `extend` has added under a name `log_…` is returned unchanged.
     """
     found: dict[str, Any] = {
         system.get_name().removeprefix("log_"): system
@@ -128,7 +128,7 @@ def logged(diagram: Diagram, context: Context) -> dict[str, Signal]:
 
 
 def _truth(station: System, controller: System) -> set[Port]:
-    """The output ports of both that show the state of a system behind one of `CHEATS`."""
+    """The output ports of both that depend on the state of a system behind one of `CHEATS`."""
     wires: dict[Port, Port] = {}
     flat = {system: flatten(system, wires) for system in (station, controller)}
     for source, reader in ((station, controller), (controller, station)):

@@ -1,4 +1,4 @@
-"""Code of one's own in a diagram: Drake systems that a configuration names by file and class."""
+"""User-defined Drake systems in a diagram, named in a configuration by file and class."""
 
 import importlib
 import importlib.util
@@ -17,13 +17,13 @@ from pydrake.systems.framework import InputPort, OutputPort, System
 from ..models.config.errors import UserError
 
 Offered = Mapping[str, Callable[[], Any]]
-"""What a constructor is given if it has an argument of that name, each as a function that makes
-it; one that makes None has nothing to give."""
+"""Values passed to a constructor that has an argument of that name, each as a function that makes
+it; a function that returns None has no value to pass."""
 
 
 @dataclass(frozen=True)
 class OwnSystem:
-    """A system of one's own.
+    """A user-defined system.
 
     Attributes:
         system: `path/to/file.py:ClassName` or `package.module:ClassName` of a Drake system.
@@ -40,7 +40,7 @@ class OwnSystem:
         return f"{Path(where).resolve() if where.endswith('.py') else where}:{name}"
 
     def make(self, offered: Offered) -> System:
-        """Run the code and build the system; `parameters` count before what is offered.
+        """Run the code and build the system; `parameters` take precedence over `offered`.
 
         Raises:
             UserError: there is no such file, module or class, it fails, or it takes other
@@ -83,14 +83,14 @@ class OwnSystem:
 
 @dataclass(frozen=True)
 class OwnFilter(OwnSystem):
-    """A state estimator of one's own in the place of the station's.
+    """A user-defined state estimator that replaces the station's.
 
     It has the outputs `X_WB` and `V_WB_B`, and any of the station's `covariance`, `status` and
-    `health`; where it lacks one, the station shows NaN there, and good health. It is connected to
+    `health`; where it lacks one, the station outputs NaN there, and good health. It is connected to
     those of `imu`, `dvl`, `depth`, `compass` (`systems.plant.sensor_suite`), `pwm` and
-    `initial_noise` that are among its inputs. Its constructor is given, if it has arguments of
+    `initial_noise` that are among its inputs. Its constructor receives, if it has arguments of
     these names, the station's `vehicle`, its sensors' configurations `imu`, `dvl`, `depth`,
-    `compass`, the start `X0_WB` and `V0_WB_B`, and all of the `station`'s configuration.
+    `compass`, the start `X0_WB` and `V0_WB_B`, and the whole configuration `station`.
     """
 
 
@@ -109,7 +109,7 @@ def check_ports(
     needs: tuple[Mapping[str, int], Mapping[str, int]],
     may_have: tuple[Mapping[str, int], Mapping[str, int]] = ({}, {}),
 ) -> None:
-    """Check that a system has the input and output ports it needs, and others in their sizes.
+    """Check that a system has its required ports, and optional ones in their right sizes.
 
     Raises:
         UserError: it lacks a port, or a port has another size.
@@ -127,7 +127,7 @@ def check_ports(
 
 @contextmanager
 def _blamed(where: str) -> Iterator[None]:
-    """Turn what foreign code raises into a sentence that names the place."""
+    """Turn exceptions of user code into a sentence that names the place."""
     try:
         yield
     except UserError:

@@ -1,1 +1,1 @@
-"""Diagrams in one compiled loop: what systems compute, as pure functions."""
+"""Diagrams as one compiled loop: systems' events and outputs as pure functions."""

@@ -1,4 +1,4 @@
-"""A diagram as a flat network of systems that tell what they compute."""
+"""A diagram as a flat network of systems with pure functions."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ Group = tuple[System, int]
 
 
 class NotPureError(Exception):
-    """A diagram holds what only Drake can step."""
+    """A diagram contains a system that only Drake can step."""
 
 
 @dataclass(frozen=True, eq=False)
 class Leaf:
-    """A system with what it computes, and the sizes of its groups of discrete state."""
+    """A system with its pure functions, and the sizes of its groups of discrete state."""
 
     system: System
     pure: Pure
@@ -45,14 +45,14 @@ class Log(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """A diagram's systems without the diagrams that group them, and what feeds what.
+    """A diagram's leaf systems and their connections, without the subdiagrams.
 
     Attributes:
-        leaves: systems that tell what they compute.
+        leaves: systems with pure functions.
         wires: the output port that feeds an input port.
         constants: output ports whose values never change.
         noise: sources of random numbers, with the period (s) at which they draw.
-        logs: what is logged.
+        logs: the logs.
     """
 
     leaves: tuple[Leaf, ...]
@@ -66,8 +66,8 @@ class Network:
         """The network of a diagram without inputs; `log_periods` (s) of Drake's logs by name.
 
         Raises:
-            NotPureError: a system is none of these, or a source draws at another period than that
-                of its readers.
+            NotPureError: a system is none of the above, or a source draws at another period than
+                its readers.
         """
         wires: dict[Port, Port] = {}
         leaves, constants, logs, sources = [], [], [], []
@@ -95,7 +95,7 @@ class Network:
 
     @cached_property
     def groups(self) -> tuple[tuple[Group, slice], ...]:
-        """Every group of state with its place among all of them."""
+        """Every group of state with its slice of the state vector."""
         found, at = [], 0
         for leaf in self.leaves:
             for index, size in enumerate(leaf.sizes):
@@ -110,7 +110,7 @@ class Network:
 
 
 def places(ports: Iterable[Port]) -> tuple[list[slice], int]:
-    """Where the values of output ports lie, one after the other, and how long they are in all."""
+    """The slices of concatenated output port values, and their total length."""
     found, at = [], 0
     for system, index in ports:
         size = system.get_output_port(index).size()
@@ -120,7 +120,7 @@ def places(ports: Iterable[Port]) -> tuple[list[slice], int]:
 
 
 class Ports:
-    """Values of output ports for one state, computed when they are asked for."""
+    """Values of output ports for one state, computed on demand."""
 
     def __init__(self, network: Network, state: Mapping[Group, Array], known: Mapping[Port, Array]):
         """`known` are the values of constants and of noise."""
@@ -174,7 +174,7 @@ class _Inputs(Mapping[str, Array]):
 
 
 class Flat(NamedTuple):
-    """A system's leaves: those that are no diagrams.
+    """A system's leaves: the systems in it that are not diagrams.
 
     Attributes:
         leaves: all of them.
@@ -188,7 +188,7 @@ class Flat(NamedTuple):
 
 
 def flatten(system: System, wires: dict[Port, Port]) -> Flat:
-    """The leaves of a system; adds to `wires` what feeds what among them."""
+    """The leaves of a system; adds the connections among them to `wires`."""
     if not isinstance(system, Diagram):
         feeds = [[(system, i)] for i in range(system.num_input_ports())]
         return Flat([system], feeds, [(system, i) for i in range(system.num_output_ports())])
@@ -212,7 +212,7 @@ def flatten(system: System, wires: dict[Port, Port]) -> Flat:
 
 
 def holders(port: Port, wires: Mapping[Port, Port]) -> set[System]:
-    """The leaves whose state a leaf's output port shows, through others that keep no state."""
+    """The leaves with state on which a leaf's output port depends, through stateless leaves."""
     system, index = port
     if (
         system.num_continuous_states()
@@ -244,7 +244,7 @@ def _noise(
 
 
 def _draws(source: RandomSource, period: float) -> bool:
-    """Whether a source draws at 0 and at every period from then on."""
+    """Whether a source draws at 0 and at every period after."""
     simulator = Simulator(source)
     counts = []
     for periods in (0.5, 1.5, 10.5):
@@ -256,7 +256,7 @@ def _draws(source: RandomSource, period: float) -> bool:
 def simultaneous(
     network: Network, periods: list[float]
 ) -> dict[tuple[int, int], list[tuple[Leaf, Event]]]:
-    """Events by the number of their period in `periods` and how often they take part."""
+    """Events by the index of their period in `periods` and their `every`."""
     found: dict[tuple[int, int], list[tuple[Leaf, Event]]] = {}
     for leaf in network.leaves:
         for event in leaf.pure.events:
@@ -271,7 +271,7 @@ def changed_by(
     """The groups that simultaneous events change, and a function that computes them."""
 
     def change() -> dict[Group, Array]:
-        own = ports()  # of this trace alone
+        own = ports()  # values of this trace only
         found: dict[Group, Array] = {}
         for leaf, event in events:
             found |= own.update(leaf, event, t)

@@ -1,7 +1,7 @@
-"""What a system computes, as pure functions: for those who compile a whole diagram.
+"""A system's events and outputs as pure functions, to compile a whole diagram.
 
-A Drake system of this package computes in compiled functions, one call an event. Some systems also
-tell what these events do in terms of JAX arrays, by a method `pure()`; `systems.compiled.simulator`
+A Drake system of this package computes in compiled functions, one call per event. Some systems also
+return their events as functions of JAX arrays, by a method `pure()`; `systems.compiled.simulator`
 then steps a diagram of such systems without leaving compiled code.
 """
 
@@ -14,8 +14,8 @@ State = Sequence[Float[Array, "_"]]
 """A system's groups of discrete state."""
 
 Inputs = Mapping[str, Float[Array, "_"]]
-"""Values of a system's input ports by name; one that nothing is connected to is missing. A value is
-computed when it is asked for."""
+"""Values of a system's connected input ports by name; an unconnected port is missing. Values are
+computed on demand."""
 
 Output = Callable[[State, Inputs], Float[Array, "_"]]
 
@@ -24,9 +24,9 @@ class Event(NamedTuple):
     """A periodic update of discrete state.
 
     Attributes:
-        period: of the event (s); it happens at 0 for the first time.
+        period: of the event (s); the first one is at 0.
         update: from time, state and inputs to the groups that change, by their number.
-        every: it takes part in every so many of the periods (1: in all).
+        every: it happens once in this many periods (1: in all).
     """
 
     period: float
@@ -38,10 +38,10 @@ class Pure(NamedTuple):
     """A system's periodic events and output ports.
 
     Attributes:
-        events: what happens when; initialisation is left to Drake.
-        outputs: of every port that others may read.
+        events: the periodic updates; initialisation is left to Drake.
+        outputs: functions of all output ports that other systems may read.
         noise: input ports with new random numbers at every period of the first event.
-        finite: groups of state in which a number that is not finite ends the simulation.
+        finite: groups of state that must be finite; otherwise the simulation ends.
     """
 
     events: tuple[Event, ...]
@@ -52,7 +52,7 @@ class Pure(NamedTuple):
 
 @runtime_checkable
 class HasPure(Protocol):
-    """A system that tells what it computes."""
+    """A system with pure functions."""
 
     def pure(self) -> Pure:
         """Its events and outputs as pure functions."""
@@ -60,5 +60,5 @@ class HasPure(Protocol):
 
 
 def shown(group: int) -> Output:
-    """An output port that shows a group of state."""
+    """An output port whose value is a group of state."""
     return lambda state, _: state[group]

@@ -1,9 +1,9 @@
-"""Logs whose rows are instants: what is true at t stands beside what is estimated of t.
+"""Logs with one row per instant: the truth at t and the estimate for t are in the same row.
 
-Drake publishes before it updates: a log at t sees the truth of t and the estimate that the updates
-of t are about to replace. Besides, the floats of 3 × 0.05 and 15 × 0.01 differ, so that a log and
-an update of one time come in either order. Both kinds of port are therefore read beside t, where
-nothing happens.
+Drake publishes before it updates: a log at t records the truth at t, but the estimate from before
+the updates of t. In addition, the floats 3 × 0.05 and 15 × 0.01 differ, so that a log and an update
+of the same time occur in either order. Ports are therefore read slightly before or after t, where
+no events occur.
 """
 
 from typing import Any
@@ -21,12 +21,12 @@ from pydrake.systems.framework import (
 )
 
 _ASIDE = 1e-6
-"""How far beside an instant ports are read (s): more than rounding puts between the times of
-simultaneous events (1e-11 s after a day), far less than any period."""
+"""Offset from an instant at which ports are read (s): more than the rounding difference between
+times of simultaneous events (1e-11 s after a day), far less than any period."""
 
 
 class Rows:
-    """Values of a port at multiples of a period, in the manner of Drake's `VectorLog`."""
+    """Values of a port at multiples of a period, with the interface of Drake's `VectorLog`."""
 
     def __init__(self, size: int, period: float):
         self._period = period
@@ -34,7 +34,7 @@ class Rows:
         self._count = 0
 
     def AddData(self, time: float, value: Float[np.ndarray, " size"]) -> None:
-        """Append a row that was read beside its instant."""
+        """Append a row that was read slightly before or after its instant."""
         if self._count == len(self._times):
             self._times = np.concatenate([self._times, np.zeros_like(self._times)])
             self._values = np.concatenate([self._values, np.zeros_like(self._values)])
@@ -47,15 +47,15 @@ class Rows:
         return self._times[: self._count]
 
     def data(self) -> Float[np.ndarray, "size n"]:
-        """The values, one column an instant."""
+        """The values, one column per instant."""
         return self._values[: self._count].T
 
 
 class SignalLog(LeafSystem):
     """Logs a port at every multiple of `period`: its value after the updates of that time.
 
-    With `early` it is the value before them, which is what a plant's state has at that time: the
-    update of t moves a plant on from t, but makes the estimate, the reading, the command of t.
+    With `early` it is the value before them. That is the plant's state at t: the update at t
+    advances the plant from t to t + period, but computes the estimate, reading or command for t.
 
     .. pydrake_system::
 
@@ -83,7 +83,7 @@ class SignalLog(LeafSystem):
             {self.nothing_ticket()},
         )
         self._rows = rows.cache_index()
-        if early:  # the first row has no time before it
+        if early:  # the first row can't be read before its instant
             self.DeclareInitializationPublishEvent(self._first)
         self.DeclarePeriodicPublishEvent(period, self.offset, self._add)
 

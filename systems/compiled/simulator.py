@@ -23,20 +23,20 @@ _DRAWN = 500  # periods of noise at once
 class CompiledSimulator:
     """Steps a diagram as Drake's `Simulator` does, in one compiled loop.
 
-    Every system must tell what it computes (`systems.compiled.pure`), or be a constant, a log whose
-    period is given, or a source of noise that draws at its reader's period. Times are those of
-    Drake's events, number for number, and so is the order at one time: logs, noise, and all updates
-    from the state before. After every `AdvanceTo` state and logs are in the context, so that all
-    ports can be read; the sources of noise alone don't move there. Two runs of one seed are equal
-    bit for bit; to Drake's own run they are equal but for rounding, since one program rounds in
-    other places than several.
+    Every system must have pure functions (`systems.compiled.pure`), or be a constant, a log whose
+    period is given, or a source of noise that draws at its reader's period. Times are exactly those
+    of Drake's events, and so is the order at one time: logs, noise, then all updates from the state
+    before. After every `AdvanceTo` state and logs are in the context, so that all ports can be
+    read; only the noise sources are not advanced there. Two runs with one seed are bit-identical.
+    They differ from Drake's own run by rounding only, because one program rounds in other places
+    than several.
     """
 
     def __init__(self, diagram: Diagram, log_periods: Mapping[str, float] | None = None):
         """`log_periods` (s) of Drake's own logs by their systems' names; a `SignalLog` has its own.
 
         Raises:
-            NotPureError: the diagram holds what only Drake can step.
+            NotPureError: the diagram contains a system that only Drake can step.
         """
         self._drake = Simulator(diagram)
         self._context = self._drake.get_mutable_context()
@@ -52,7 +52,7 @@ class CompiledSimulator:
         return self._context
 
     def reset_context(self, context: Context) -> None:
-        """Go on in another context of the diagram; what is compiled stays."""
+        """Continue in another context of the diagram; compiled programs are kept."""
         self._drake.reset_context(context)
         self._context = self._drake.get_mutable_context()
         self._state = None
@@ -62,7 +62,7 @@ class CompiledSimulator:
         self._loop.flat(*(np.zeros(size) for size in self._sizes))
 
     def Initialize(self) -> None:
-        """Let Drake run the events of initialisation, and go on from the state that they leave."""
+        """Run Drake's initialisation events and start from the resulting state."""
         self._drake.Initialize()
         network, root = self._network, self._context
         self._state = np.zeros(self._sizes[0])
@@ -79,11 +79,11 @@ class CompiledSimulator:
         self._noise = [_Noise(source, period, root) for source, period in network.noise]
 
     def AdvanceTo(self, boundary_time: float) -> None:
-        """Step to a time (s). Updates due at that very time are left to the next call.
+        """Step to a time (s). Updates at that exact time are left to the next call.
 
         Raises:
-            FloatingPointError: a state that must be finite no longer is; the context's state stays
-                as it was before this call.
+            FloatingPointError: a state that must be finite no longer is; the context keeps its
+                state from before this call.
         """
         if self._state is None:
             self.Initialize()
@@ -142,7 +142,7 @@ class CompiledSimulator:
     def _run(
         self, state: Array, constants: Array, count: Array, times: Array, ticks: Array, noise: Array
     ) -> tuple[Array, Array]:
-        """Some steps of the diagram: the state after them, and what the logs saw before each."""
+        """Some steps of the diagram: the state after them, and the logged values before each."""
         network, logged = self._network, self._logged
         ticks, noise = ticks.reshape(_STEPS, -1), noise.reshape(_STEPS, -1)
 
@@ -180,10 +180,10 @@ class CompiledSimulator:
 
 
 class _Block(NamedTuple):
-    """Some steps, of which only the first `count` happen.
+    """A block of steps, of which only the first `count` are executed.
 
     `ticks` are the numbers of the periods that begin at each step, -1 for none; the last column
-    is 0 where something is logged. `logged` are the steps at which each log takes its value.
+    is 0 at steps with a log. `logged` are the steps at which each log takes its value.
     """
 
     count: int
@@ -193,7 +193,7 @@ class _Block(NamedTuple):
 
 
 class _Schedule:
-    """Drake's times of periodic events: whole multiples of their periods, as floats give them."""
+    """Drake's times of periodic events: integer multiples of their periods in floating point."""
 
     def __init__(self, network: Network):
         events = (event for leaf in network.leaves for event in leaf.pure.events)
@@ -202,7 +202,7 @@ class _Schedule:
         self._logs = network.logs
 
     def start(self, now: float) -> None:
-        """Begin at a time whose logs are taken already."""
+        """Start at a time whose logs have been taken already."""
         self._ticks = [_first(period, now) for period in self.periods]
         self._log_ticks = [_first(log.period, now, log.offset) for log in self._logs]
         self._log_ticks = [
@@ -215,7 +215,7 @@ class _Schedule:
         ]
 
     def blocks(self, boundary: float) -> Iterator[_Block]:
-        """All steps before a time, and what is logged until that time."""
+        """All steps before a time, and the logs until that time."""
         block = self._empty()
         while True:
             times = [k * p for k, p in zip(self._ticks, self.periods, strict=True)]
@@ -255,13 +255,13 @@ def _first(period: float, now: float, offset: float = 0.0) -> int:
 
 
 class _Noise:
-    """What a source draws, by the number of the period, from where its context has it."""
+    """The draws of a noise source by the number of the period, from its context's state on."""
 
     def __init__(self, source: RandomSource, period: float, root: Context):
         self.period, self._start = period, _first(period, root.get_time())
         size = source.get_output_port(0).size()
         builder = DiagramBuilder()
-        # the kind of distribution comes with the state
+        # the kind of distribution is part of the state
         twin = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, size, period))
         self._log = LogVectorOutput(twin.get_output_port(), builder, period)
         self._simulator = Simulator(builder.Build())
@@ -271,9 +271,9 @@ class _Noise:
         self._first, self._values, self._newest = 0, np.zeros((0, size)), 0
 
     def rows(self, ticks: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n size"]:
-        """What is shown at steps that begin the given periods, or none (-1): what was drawn last.
+        """The source's output at steps that begin the given periods; the last draw at others (-1).
 
-        A source draws before others read: what it showed at first is seen by no event.
+        A source draws before other systems read, so no event reads its initial output.
         """
         found = np.zeros((ticks.size, self._values.shape[1]))
         for row, tick in enumerate(ticks.astype(int)):
@@ -285,7 +285,7 @@ class _Noise:
         return found
 
     def _draw(self) -> None:
-        """Go on by a block; of the former one its last row is kept."""
+        """Draw the next block; the last row of the previous one is kept."""
         context = self._simulator.get_mutable_context()
         now = context.get_time()
         self._simulator.AdvanceTo(now + (_DRAWN + 0.5 * (now == 0)) * self.period)

@@ -1,1 +1,1 @@
-"""Controllers by kind; what a controller is told when the estimate is lost."""
+"""Controllers by kind, and the gate that withholds a lost estimate from them."""

@@ -1,4 +1,4 @@
-"""What a controller may believe of the estimated state: all of it, or, when it is lost, nothing."""
+"""A gate between estimator and controller that withholds the estimate while it is lost."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,17 +10,17 @@ from ..compiled.pure import Inputs, Output, Pure
 from ..estimation.delayed import HEALTH
 
 LOST = 2.0
-"""State of a filter's health from which on its estimate says nothing."""
+"""State of a filter's health from which on its estimate is unusable."""
 
 
 class HealthGate(LeafSystem):
-    """Passes the estimate on while the filter's `health` is good or degraded; when lost, NaN.
+    """Passes the estimate through while the filter's `health` is good or degraded; NaN when lost.
 
-    What reads it then does what it does for a state that isn't known: planners make no plan and
-    start anew afterwards, observers keep what they have seen, and impedance control asks for no
-    wrench. Without a position there is none to hold, and feedback of a wrong state is worse than
-    none: drag brings the vehicle to rest, its righting moment keeps it level, and net buoyancy
-    raises it slowly. `health` that isn't connected counts as good, one that isn't finite as lost.
+    Its readers then treat the state as unknown: planners make no plan and restart afterwards,
+    observers keep their estimate, and impedance control commands a zero wrench. A pose that is
+    unknown can't be held, and feedback of a wrong state is worse than none: drag brings the vehicle
+    to rest, its righting moment keeps it level, and net buoyancy raises it slowly. `health` that
+    isn't connected counts as good, one that isn't finite as lost.
 
     .. pydrake_system::
 

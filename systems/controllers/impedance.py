@@ -1,4 +1,4 @@
-"""Impedance control: holds the vehicle to a plan like a spring and a damper."""
+"""Impedance control: tracks a plan with stiffness and damping."""
 
 from dataclasses import dataclass
 
@@ -50,11 +50,11 @@ class ImpedanceGains:
 
 
 class ImpedanceLaw(eqx.Module):
-    """u = u_opt + K_p log(g⁻¹ g_opt) + K_d (ξ_opt − ξ), cut to what the thrusters can give.
+    """u = u_opt + K_p log(g⁻¹ g_opt) + K_d (ξ_opt − ξ), saturated at the thrusters' limits.
 
-    Palmer et al., "Field Experiments". The error log(g⁻¹ g_opt) is a twist in B: where the plan is,
-    seen from the vehicle. `error_limit` (m and rad) bounds the norm of its linear and of its
-    angular part, so that a plan far away pulls no harder than one at that distance.
+    Palmer et al., "Field Experiments". The error log(g⁻¹ g_opt) is a twist in B: the pose of the
+    plan relative to the vehicle. `error_limit` (m and rad) bounds the norms of its linear and its
+    angular part, and thereby the stiffness wrench of a distant plan.
     """
 
     K_p: Float[Array, "6 6"]
@@ -73,7 +73,7 @@ class ImpedanceLaw(eqx.Module):
         """Stiffness, damping and limits.
 
         Raises:
-            ValueError: a gain is no (6, 6) matrix of finite numbers, or a limit is not positive.
+            ValueError: a gain is not a finite (6, 6) matrix, or a limit is not positive.
         """
         for name, K in (("K_p", K_p), ("K_d", K_d)):
             if np.shape(K) != (6, 6) or not np.all(np.isfinite(K)):

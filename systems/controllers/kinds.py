@@ -1,9 +1,9 @@
 """Controllers by kind: each is a dataclass for YAML that adds itself to a diagram.
 
 A controller is any system with the input ports `X_WB` (7) and `V_WB_B` (6), the estimated state,
-and the output port `F_Bo_B` (6), the wrench it wants. With an input port `health` (5) it is told
-how good the estimate is (`systems.estimation.delayed.HEALTH`); those here ask for no wrench while
-it is lost (`systems.controllers.health_gate`).
+and the output port `F_Bo_B` (6), the commanded wrench. An input port `health` (5) receives the
+health of the estimate (`systems.estimation.delayed.HEALTH`); the controllers here command a zero
+wrench while it is lost (`systems.controllers.health_gate`).
 """
 
 import abc
@@ -42,14 +42,14 @@ INPUTS = {"X_WB": 7, "V_WB_B": 6}
 """Input ports of every controller and their sizes."""
 
 TOLD = {"health": len(HEALTH)}
-"""Input ports that a controller may have besides, connected if the station has them."""
+"""Optional input ports of a controller, connected if the station has them."""
 
 OUTPUTS = {"F_Bo_B": 6}
 """Output ports of every controller and their sizes; it may have more."""
 
 
 Goal = Float[np.ndarray, "3"] | None
-"""Where a run is to end (m, W), if anywhere."""
+"""Goal position of a run (m, W), if it has one."""
 
 
 class Controller(abc.ABC):
@@ -57,9 +57,9 @@ class Controller(abc.ABC):
 
     @abc.abstractmethod
     def build(self, station: StationConfig, goal: Goal = None) -> System:
-        """The system; it may read vehicle, obstacles and rates of the station it is made for.
+        """The system for a station, whose vehicle, obstacles and rates it may read.
 
-        `goal` is that of the run, for a controller that has none of its own.
+        `goal` is that of the run, for a controller without a goal of its own.
         """
 
     def add_to(self, builder: DiagramBuilder, station: StationConfig, goal: Goal = None) -> System:
@@ -104,13 +104,13 @@ class ObserverConfig:
 
 @dataclass(frozen=True)
 class Tracking:
-    """How a plan is tracked.
+    """Settings of the tracking of a plan.
 
     Attributes:
         gains: of the impedance law.
-        error_limit: the distance (m) and angle (rad) beyond which it pulls no harder.
+        error_limit: distance (m) and angle (rad) at which the tracking error is saturated.
         period: between calls (s).
-        observer: of steady wrenches, which planner and reference then counter; none if null.
+        observer: of steady wrenches, which planner and reference compensate; none if null.
     """
 
     gains: ImpedanceGains = field(default_factory=ImpedanceGains)
@@ -132,10 +132,10 @@ class Tracking:
         observed: Dynamics,
         noise_period: float | None = None,
     ) -> Diagram:
-        """A controller around the source of a plan, with its `plan` (and more) put out as well.
+        """A controller around the source of a plan; the source's output ports are exported too.
 
-        `observed` is the model from which the observer takes its expectation; `noise_period` (s)
-        is how often the source's `noise` is drawn.
+        `observed` is the model that the disturbance observer uses; `noise_period` (s) is the period
+        at which the source's `noise` is drawn.
         """
         vehicle = station.load_vehicle()
         limits = ThrusterLimits.create(vehicle.thrusters(), station.voltage)
@@ -174,13 +174,13 @@ class MppiImpedance(Controller):
     """Path integral planning among the station's obstacles, tracked by impedance control.
 
     Attributes:
-        goal: where to go.
+        goal: pose to reach.
         planner: settings of the planner.
         model: a checkpoint of the dynamics to plan with; physics if left out.
         vehicle: whose physics to plan with; the station's if left out.
-        diffusion: b of the physics' process noise (N√s and N·m√s): what waves, wake and pushes do
-            to the vehicle, as white noise. A wrench of standard deviation σ and time constant τ
-            counts as σ √(2τ).
+        diffusion: b of the physics' process noise (N√s and N·m√s): the wrenches of waves, wake and
+            contacts as white noise. A wrench of standard deviation σ and time constant τ has
+            b = σ √(2τ).
         tracking: settings of the tracking.
     """
 
@@ -201,7 +201,7 @@ class MppiImpedance(Controller):
         return self._model(station)[0]
 
     def _model(self, station: StationConfig) -> tuple[Dynamics, Mapping[str, Any]]:
-        """The model to plan with and what its checkpoint says of it."""
+        """The model to plan with and its checkpoint's metadata."""
         if self.model is not None:
             model, metadata = load_model(self.model, float)
             own = core(model)
@@ -211,7 +211,7 @@ class MppiImpedance(Controller):
         return vehicle.dynamics(np.array(self.diffusion)), {}
 
     def build(self, station: StationConfig, goal: Goal = None) -> Diagram:
-        del goal  # it has its own
+        del goal  # `self.goal` is used
         vehicle = station.load_vehicle()
         model, metadata = self._model(station)
         c = self.planner.with_substeps_of(metadata)
@@ -230,7 +230,7 @@ class MppiImpedance(Controller):
 
 @dataclass(frozen=True)
 class TrackReference(Controller):
-    """Impedance control along a path that is given beforehand; obstacles don't count.
+    """Impedance control along a given path; obstacles are ignored.
 
     Attributes:
         path: the path.
@@ -251,13 +251,13 @@ class TrackReference(Controller):
 
 @dataclass(frozen=True)
 class Own(OwnSystem, Controller):
-    """A controller of one's own.
+    """A user-defined controller.
 
-    Its constructor is given, if it has arguments of these names and `parameters` has none: the
+    Its constructor receives, if it has arguments of these names that `parameters` lacks: the
     station's `vehicle` (a `Vehicle`), its `obstacles` (a tuple of `Pylon`), the `goal` (position in
-    W, m) if the run has one, and all of the `station`'s configuration. With an input port `health`
-    it is told how good the estimate is. With an output port `plan` and an attribute `layout`, the
-    plan's `PlanLayout`, its plans are logged and judged.
+    W, m) if the run has one, and the whole configuration `station`. An input port `health` receives
+    the health of the estimate. With an output port `plan` and an attribute `layout`, the plan's
+    `PlanLayout`, its plans are logged and judged.
     """
 
     def build(self, station: StationConfig, goal: Goal = None) -> System:

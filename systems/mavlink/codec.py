@@ -21,7 +21,7 @@ Values = np.ndarray | np.float64
 
 G = 9.80665  # standard gravity, as ArduPilot's GRAVITY_MSS (m/s²)
 SURFACE_PRESSURE_HPA = 1013.25
-ARDUSUB_PASCAL_PER_METRE = 9800.0  # times BARO_SPEC_GRAV, what ArduSub takes for fresh water
+ARDUSUB_PASCAL_PER_METRE = 9800.0  # times BARO_SPEC_GRAV: ArduSub's gradient in fresh water
 
 NEUTRAL_US = 1500.0
 UINT16_MAX = 65535
@@ -192,10 +192,10 @@ def pack_voltage(cells_mv: Float[np.ndarray, "n *batch"]) -> Values:
 
 
 def thruster_pwm(output_us: Field, direction: Field = 1) -> Values:
-    """PWM (µs) that makes the standard thruster push as this one does at `output_us`.
+    """PWM (µs) at which a thruster of direction +1 has the thrust of this one at `output_us`.
 
-    With MOT_n_DIRECTION −1 the thruster is mounted or wired the other way round and the output is
-    mirrored about 1500. No pulses (0) means stopped. Its own inverse except for zero.
+    With MOT_n_DIRECTION −1 the thruster is mounted or wired in reverse and the output is mirrored
+    about 1500. No pulses (0) means stopped. Its own inverse except for zero.
     """
     us = np.asarray(output_us, float)
     us = np.where(us == 0, NEUTRAL_US, us)
@@ -221,9 +221,9 @@ def manual_control_fields(
 ) -> dict[str, int]:
     """MANUAL_CONTROL fields for axis demands in [−1, 1] about B (FLU: + left, up, nose down, ccw).
 
-    x, y, r are ±1000 about 0 and z is 0 … 1000 about 500, all four times the pilot gain at the
-    other end; s (pitch, nose up) and t (roll, right side down) are plain µs, ±400. Demands beyond
-    what the gain lets through are clipped.
+    x, y, r are ±1000 about 0 and z is 0 … 1000 about 500; the autopilot multiplies all four by the
+    pilot gain. s (pitch, nose up) and t (roll, right side down) are plain µs, ±400. Demands beyond
+    the range that the gain allows are clipped.
 
     Raises:
         ValueError: if a demand or the gain is not finite, or the gain is not positive.
@@ -249,7 +249,7 @@ def manual_control_fields(
 def manual_control_demand(
     x: int, y: int, z: int, r: int, s: int = 0, t: int = 0, gain: float = 0.5
 ) -> Float[np.ndarray, "6"]:
-    """Surge, sway, heave, roll, pitch, yaw in [−1, 1] about B that such fields demand."""
+    """Surge, sway, heave, roll, pitch, yaw in [−1, 1] about B from MANUAL_CONTROL fields."""
     return np.array(
         [
             gain * x / 1000,

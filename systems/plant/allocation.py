@@ -12,11 +12,11 @@ from ..compiled.pure import Inputs, Pure, State
 
 
 class ThrustAllocation(LeafSystem):
-    """Pulse widths (µs) and thruster forces (N) that give a wanted wrench, without delay.
+    """Pulse widths (µs) and thruster forces (N) for a commanded wrench, without delay.
 
     A wrench beyond the thrusters' limits is scaled down and keeps its direction. The inverse of the
-    thrust curve at the battery's expected voltage steps over the dead band. Wrenches that are not
-    finite are refused.
+    thrust curve at the battery's expected voltage skips the dead band. Wrenches that are not finite
+    are rejected.
 
     .. pydrake_system::
 
@@ -48,7 +48,7 @@ class ThrustAllocation(LeafSystem):
         self._function = allocate
         self._allocate = VectorFunction(allocate, [6], [count, count])
         self._F = self.DeclareVectorInputPort("F_Bo_B", 6)
-        once = {self._F.ticket()}  # computed anew for another wrench, not for another time
+        once = {self._F.ticket()}  # depends on the wrench, not on time
         self.DeclareVectorOutputPort("pwm", count, self._put_pwm, once)
         self.DeclareVectorOutputPort("thruster_force", count, self._put_forces, once)
 

@@ -13,10 +13,10 @@ from ..compiled.pure import Event, Inputs, Pure, State, shown
 
 
 class DisturbanceSource(LeafSystem):
-    """Holds the state of a `Disturbance` and puts out its wrench and flow.
+    """Holds the state of a `Disturbance` and outputs its wrench and flow.
 
-    The update at time t readies what acts on [t + period, t + 2 period), when readers see it: state
-    and outputs are those of t + period, at the pose that the present twist leads to. At
+    The update at time t computes the outputs that readers use on [t + period, t + 2 period): state
+    and outputs are those of t + period, at the pose extrapolated with the present twist. At
     initialisation `initial_noise` gives the random start (phases, first values), `noise` the first
     advance; later updates read `noise` alone. `flow_W` is the velocity (m/s) and acceleration
     (m/s²) of the water at Bo, in W. Unconnected inputs count as zero, an unconnected pose as the
@@ -98,7 +98,7 @@ class DisturbanceSource(LeafSystem):
     def _move(
         self, context: Context, discrete_state: DiscreteValues, state: np.ndarray, ahead: float
     ) -> None:
-        """Advance the state over the period that begins `ahead` of now and show what acts then."""
+        """Advance the state over the period that begins `ahead` (s) from now; set the outputs."""
         X = value_or_none(self._X, context)
         if X is None:
             X = np.array([1.0, 0, 0, 0, 0, 0, 0])

@@ -1,4 +1,4 @@
-"""A model whose networks are asked once for several small steps."""
+"""A model whose coefficients are evaluated once for several substeps."""
 
 from jaxtyping import Array, Float
 
@@ -7,11 +7,11 @@ from ...models.spd import Spd
 
 
 class FrozenCoefficients(Dynamics):
-    """The given dynamics with M, D, D^f and b held at what they are for one velocity.
+    """The given dynamics with M, D, D^f and b frozen at their values for one velocity.
 
     They change slowly with the velocity, while the drag and the potential that they enter are
-    stiff: substeps with held coefficients cost little and are stable where one step is not. The
-    noise of a held b has no Stratonovich correction, which is of the size of b ∂b/∂ξ dt.
+    stiff: substeps with frozen coefficients are cheap and stable where one step is not. The noise
+    of a frozen b has no Stratonovich correction, which is of the order of b ∂b/∂ξ dt.
     """
 
     dynamics: Dynamics

@@ -24,24 +24,24 @@ class LearnedPlant(LeafSystem):
 
     One update is `models.integrate.step` repeated: X ← X exp(h ξ), ξ ← ξ + h a + Heun noise, with
     h = period / substeps and dW = √h · `noise`. Wrenches are held over the period; the water's
-    velocity runs on with its acceleration. `A_WB_B` is the mean rate of the components of `V_WB_B`
-    over the last period, which is what an accelerometer integrates. Unconnected inputs count as
-    zero. The state at time t is the output at t, before that time's update.
+    velocity changes with its acceleration. `A_WB_B` is the mean rate of the components of `V_WB_B`
+    over the last period, as an accelerometer measures it. Unconnected inputs count as zero. The
+    state at time t is the output at t, before that time's update.
 
-    With `thrusters` the update at t first moves their forces over [t, t + period] towards the
-    curve's at the pulse widths `pwm` (µs) and the battery's voltage under load
-    (`Thrusters.lag_from_rest`); the body feels the mean of the forces at both ends, without a lag
-    the force at the end, on top of `F_Bo_B`. `voltage` is the battery's open-circuit voltage (V),
-    nominal while unconnected; with `pwm` unconnected the thrusters stand still. `thruster_force`
-    (N) and `voltage_loaded` (V), what remains of the voltage under load, are those of the end of
+    With `thrusters` the update at t first advances their forces over [t, t + period] towards those
+    of the thrust curve at the pulse widths `pwm` (µs) and the battery's voltage under load
+    (`Thrusters.lag_from_rest`); the mean of the forces at both ends (without a lag, the force at
+    the end) acts on the body in addition to `F_Bo_B`. `voltage` is the battery's open-circuit
+    voltage (V), nominal while unconnected; with `pwm` unconnected the thrusters are stopped.
+    `thruster_force` (N) and `voltage_loaded` (V), the voltage under load, are those of the end of
     the last period. These four ports exist with thrusters only.
 
     A model with effects (`models.effects.extended.Extended`) is simulated with all of them: those
-    on thrusters act on their forces one by one, with the voltage under load (a `F_Bo_B` counts as
-    thruster forces of least effort, a disturbance does not pass them); memories and random states
-    are a part of the state, and `noise` takes what random states need besides, which starts them in
-    their stationary law. `thruster_lag` stands in place of the thrusters' own lag. `X_WB_seen` and
-    `V_WB_B_seen` are pose and twist as effects on instruments show them.
+    on thrusters act on each thruster's force, with the voltage under load (`F_Bo_B` is allocated to
+    thruster forces of least effort, a disturbance bypasses the thrusters); memories and random
+    states are part of the state, and `noise` includes the draws of random states, which start from
+    their stationary distribution. `thruster_lag` replaces the thrusters' own lag. `X_WB_seen` and
+    `V_WB_B_seen` are pose and twist as measured through the effects on instruments.
 
     .. pydrake_system::
 
@@ -77,7 +77,7 @@ class LearnedPlant(LeafSystem):
         """Start at pose `X0_WB` (the identity) with twist `V0_WB_B` (at rest), thrusters at rest.
 
         Raises:
-            ValueError: `period` or `substeps` is not positive, or the start is no state.
+            ValueError: `period` or `substeps` is not positive, or the start is not a state.
         """
         super().__init__()
         if not (np.isfinite(period) and period > 0):
@@ -122,7 +122,7 @@ class LearnedPlant(LeafSystem):
         self._flowing = VectorFunction(self._steps[1], [*sizes, 6], results)
 
     def _declare_seen(self) -> None:
-        """Add the ports that show the state as effects on instruments have it."""
+        """Add the ports of the state as measured through the effects on instruments."""
         if self._effects is None or not self._effects.reads:
             self.DeclareStateOutputPort("X_WB_seen", self._X)
             self.DeclareStateOutputPort("V_WB_B_seen", self._V)
@@ -250,7 +250,7 @@ class LearnedPlant(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = context.get_discrete_state()
         parts = [state.value(0), state.value(1)]
-        # Beside thrusters this wrench is seldom connected, and asking costs less than failing.
+        # With thrusters this wrench is seldom connected, and `HasValue` is cheaper than a failure.
         parts.append(self._F.Eval(context) if self._F.HasValue(context) else np.zeros(6))
         parts += [value_or_zeros(port, context) for port in (self._F_disturbance, self._noise)]
         if self._thrusters is not None:
@@ -300,7 +300,7 @@ class LearnedPlant(LeafSystem):
 def check_state(
     X_WB: ArrayLike, V_WB_B: ArrayLike
 ) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6"]]:
-    """Pose with its quaternion brought to unit length, and twist.
+    """Pose with its quaternion normalised, and twist.
 
     Raises:
         ValueError: a wrong size, a value that is not finite, or a quaternion far from unit length.

@@ -24,7 +24,7 @@ NAMES = ("imu", "dvl", "depth", "compass")
 
 
 class SensorSuite(LeafSystem):
-    """Measures the true motion with each sensor at its own rate and holds what was read.
+    """Measures the true motion with each sensor at its own rate and holds the readings.
 
     - `imu` (6): specific force (m/s²), angular rate (rad/s), every IMU period;
     - `dvl` (7): velocity (m/s, 3), 1 if valid, altitude (m), figure of merit (m/s), time of
@@ -32,14 +32,14 @@ class SensorSuite(LeafSystem):
     - `depth` (3): depth (m, positive down), 1 once valid, time of the measurement (s);
     - `compass` (3): yaw (rad), 1 once valid, time of the measurement (s).
 
-    A reading is new when its time is. At initialisation `initial_noise` draws the sensors' biases,
+    A new reading has a new time. At initialisation `initial_noise` draws the sensors' biases,
     offsets and scale errors. All four sensors take their unit Gaussians from `noise`, which should
-    be drawn anew every IMU period. Unconnected inputs count as zero, an unconnected pose as the
+    be redrawn every IMU period. Unconnected inputs count as zero, an unconnected pose as the
     identity.
 
-    Faults (`models.sensors.faults`) act on what is shown; the sensors' own states and noise are
-    those without them. Faults that take chance have an input of their own, `fault_noise`, drawn as
-    `noise` is; without them there is no such port.
+    Faults (`models.sensors.faults`) act on the outputs; the sensors' own states and noise are
+    unchanged. Random faults have an input of their own, `fault_noise`, drawn like `noise`; without
+    them there is no such port.
 
     .. pydrake_system::
 
@@ -66,7 +66,7 @@ class SensorSuite(LeafSystem):
         compass: Compass | None = None,
         faults: tuple[SensorFault, ...] = (),
     ):
-        """Carry the given sensors, or their defaults, with `faults` in what they show."""
+        """Use the given sensors, or their defaults, with `faults` in their outputs."""
         super().__init__()
         imu, dvl = imu or Imu(), dvl or Dvl()
         depth, compass = depth or DepthSensor(), compass or Compass()
@@ -109,7 +109,7 @@ class SensorSuite(LeafSystem):
         memories = iter(range(8, len(groups)))
 
         def measured(i: int) -> _Part:
-            """A sensor's measurement; the DVL's appears between its pings and is shown apart."""
+            """A sensor's measurement; the DVL's is output separately, after its latency."""
             part, sensor = shown[i], sensors[i]
             late = sensor is dvl
             memory = (next(memories),) if part.faults and not late else ()
@@ -119,7 +119,7 @@ class SensorSuite(LeafSystem):
                 if late:
                     return (state,)
                 reading = sensor.reading(state, t)
-                if sensor is not imu:  # it goes with a valid mark and its time
+                if sensor is not imu:  # with a validity flag and its time
                     reading = jnp.concatenate([reading, jnp.stack([jnp.ones_like(t), t])])
                 return state, *part.show(reading, t, w[draws[4 + i]], *kept)
 
@@ -138,7 +138,7 @@ class SensorSuite(LeafSystem):
 
         parts = [measured(0), dvl_appears(), *(measured(i) for i in (1, 2, 3))]
         self._parts = parts
-        # Sensors whose period is a multiple of the IMU's share its events and its calls.
+        # Sensors whose period is a multiple of the IMU's share its events and compiled calls.
         shared = [part for part in parts if _divides(part.rate, imu.rate)]
         self._declare(shared)
         for part in parts:
@@ -170,13 +170,13 @@ class SensorSuite(LeafSystem):
 
     @property
     def _inputs_at_rest(self) -> list[tuple[InputPort, np.ndarray]]:
-        """The inputs that events read, with what an unconnected one counts as."""
+        """The inputs that events read, with their values while unconnected."""
         ports = (self._X, self._V, self._A, *self._draws)
         pose = np.eye(7)[0]
         return [(port, pose if port is self._X else np.zeros(port.size())) for port in ports]
 
     def _declare(self, parts: list["_Part"]) -> None:
-        """Declare events at the first part's rate; the others take part in every so many."""
+        """Declare events at the first part's rate; the others take part at integer multiples."""
         inputs_at_rest = self._inputs_at_rest
         drawn = [port.size() for port in self._draws]
         period = 1 / parts[0].rate
@@ -184,7 +184,7 @@ class SensorSuite(LeafSystem):
 
         @cache
         def call(due: tuple[bool, ...]) -> tuple[VectorFunction, list[int], list[int]]:
-            """One compiled call from the motion and the states read to what is written."""
+            """One compiled call from the motion and the states read to the states written."""
             used = [part for part, now in zip(parts, due, strict=True) if now]
             reads = [index for part in used for index in part.reads]
             writes = [index for part in used for index in part.writes]
@@ -227,7 +227,7 @@ class SensorSuite(LeafSystem):
 
 @dataclass(frozen=True)
 class _Part:
-    """What one sensor does in its event, with the state groups that it reads and writes."""
+    """One sensor's update in its event, with the state groups that it reads and writes."""
 
     rate: float
     measure: Callable[..., Outputs]
@@ -246,7 +246,7 @@ def _joined(draws: list[Array]) -> Array:
 
 @dataclass(frozen=True)
 class _Shown:
-    """A sensor with the faults of what it shows."""
+    """A sensor with the faults of its output."""
 
     sensor: Sensor
     faults: tuple[SensorFault, ...]
@@ -257,17 +257,17 @@ class _Shown:
 
     @property
     def noise_size(self) -> int:
-        """Unit Gaussians that the faults of one reading take."""
+        """Number of unit Gaussians for the faults of one reading."""
         return self._faulty.noise_size
 
     @property
     def memory_size(self) -> int:
-        """Numbers that the faults remember, the DVL's also the reading that it held last."""
+        """Size of the faults' memory; the DVL's includes its last held reading."""
         held = self.sensor.reading_size if isinstance(self.sensor, Dvl) else 0
         return held + self._faulty.memory_size
 
     def show(self, reading: Array, t: Array, w: Array, *memory: Array) -> Outputs:
-        """What is shown of a reading measured at t, and with faults their memory."""
+        """The output for a reading measured at t, and the faults' memory if there are any."""
         if not self.faults:
             return (reading,)
         n = self.sensor.reading_size
@@ -276,7 +276,7 @@ class _Shown:
         return seen[: reading.size], kept
 
     def show_held(self, reading: Array, w: Array, *memory: Array) -> Outputs:
-        """The same of the DVL's reading, which a fault meets once, when it appears."""
+        """The same for the DVL's held reading; faults act on it once, when it appears."""
         if not self.faults:
             return (reading,)
         before, kept = memory

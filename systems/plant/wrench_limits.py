@@ -1,4 +1,4 @@
-"""The wrenches a vehicle can give: the set U of planner and controller."""
+"""The feasible wrenches of a vehicle: the set U of planner and controller."""
 
 import abc
 
@@ -16,10 +16,10 @@ class WrenchLimits(eqx.Module):
 
     @abc.abstractmethod
     def clip(self, F_Bo_B: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
-        """The wrench itself if it can be given, else as much of it as can."""
+        """The wrench itself if it is feasible, else a feasible part of it."""
 
     def axes(self) -> Float[Array, "6"]:
-        """The most that can be given along each axis alone, in either sense (N, N·m)."""
+        """The largest wrench along each axis alone that is feasible in both signs (N, N·m)."""
         far = jnp.eye(6, dtype=self.dtype) * 1e4
         both = jnp.concatenate([far, -far], axis=1)
         reached = jnp.abs(jnp.sum(self.clip(both) * both, axis=0)) / 1e4
@@ -32,7 +32,7 @@ class WrenchLimits(eqx.Module):
 
 
 class BoxLimits(WrenchLimits):
-    """Each component on its own within ± its limit."""
+    """Each component independently within ± its limit."""
 
     limit: Float[Array, "6"]
 
@@ -46,10 +46,10 @@ class BoxLimits(WrenchLimits):
 
 
 class ThrusterLimits(WrenchLimits):
-    """What the thrusters give within their force limits, times `fraction`.
+    """The wrenches of the thrusters within their force limits, times `fraction`.
 
-    Horizontal and vertical thrusters are scaled each by their own factor, as ArduSub's mixer does:
-    depth and attitude keep their authority when the horizontal thrusters are at their end.
+    Horizontal and vertical thrusters are scaled by separate factors, as in ArduSub's mixer: depth
+    and attitude keep their authority while the horizontal thrusters saturate.
     """
 
     thrusters: Thrusters
@@ -71,7 +71,7 @@ class ThrusterLimits(WrenchLimits):
     def clip(self, F_Bo_B: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
         if F_Bo_B.ndim > 1:
             return self._scaled(F_Bo_B)
-        # One wrench that can be given, the usual case, needs no search for the factors.
+        # A single feasible wrench, the usual case, needs no search for the factors.
         forces = self.inverse @ F_Bo_B / self.fraction
         low, high = self.thrusters.force_limits(self.voltage)
         feasible = jnp.all((forces >= low) & (forces <= high))

@@ -1,1 +1,1 @@
-"""The station: everything between a controller's wrench and the state it is told."""
+"""The station: everything between the commanded wrench and the estimated state."""

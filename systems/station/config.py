@@ -1,4 +1,4 @@
-"""The station in numbers: vehicle, water, sensors, start, seed; a scenario without controller."""
+"""Configuration of the station: vehicle, water, sensors, start, seed."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,11 +23,11 @@ from ..planning.paths import PoseConfig
 
 @dataclass(frozen=True)
 class Sensing:
-    """The sensors on board, what goes wrong with them, and the filter that fuses them.
+    """The sensors on board, their faults, and the filter that fuses them.
 
     Attributes:
-        faults: of what the sensors show (`docs/sensor-faults.md`); the filter isn't told.
-        filter: of one's own, in the place of the one that `ekf` configures.
+        faults: of the sensors' outputs (`docs/sensor-faults.md`); the filter does not know of them.
+        filter: user-defined, in place of the one that `ekf` configures.
     """
 
     imu: Imu = field(default_factory=Imu)
@@ -41,15 +41,15 @@ class Sensing:
 
 @dataclass(frozen=True)
 class StationConfig:
-    """What a controller is put to work in.
+    """Configuration of the station that a controller runs on.
 
     Attributes:
         vehicle: a preset's name or the path of a vehicle's YAML file: hull, thrusters, physics.
         model: a checkpoint of the dynamics to simulate; the vehicle's physics if left out.
-        effects: what the plant has besides these dynamics, by name; planners don't know of it.
+        effects: effects of the plant besides these dynamics; planners don't know of them.
         diffusion: b of the physics' process noise (N√s and N·m√s); disturbances are usually better.
         disturbance_set: a named set (`models.disturbances.preset`).
-        disturbances: more of them, by kind.
+        disturbances: further disturbances, by kind.
         obstacles: pylons.
         sensing: sensors and filter.
         start: pose at t = 0.
@@ -90,7 +90,7 @@ class StationConfig:
         """The vehicle.
 
         Raises:
-            UserError: there is no such preset or file, or it is no vehicle.
+            UserError: there is no such preset or file, or it is not a vehicle.
         """
         return load_vehicle(self.vehicle)
 
@@ -112,7 +112,7 @@ class StationConfig:
         return Extended.create(core(model), (*own, *more), vehicle.thrusters())
 
     def disturbance(self) -> Combined:
-        """All disturbances as one, and with them the pushes that last of a learned model.
+        """All disturbances as one, including the correlated wrench of a learned model.
 
         Raises:
             UserError: the checkpoint can't be read.

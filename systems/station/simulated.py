@@ -1,4 +1,4 @@
-"""The station: everything between a controller's wrench and the state it is told."""
+"""The simulated station: everything between the commanded wrench and the estimated state."""
 
 import numpy as np
 from pydrake.common import RandomDistribution
@@ -14,7 +14,7 @@ from ..plant.sensor_suite import SensorSuite
 from .config import StationConfig
 
 INPUTS = {"F_Bo_B": 6}
-"""Input ports and their sizes: the wrench a controller wants."""
+"""Input ports and their sizes: the commanded wrench."""
 
 OUTPUTS = {
     "X_WB": 7,
@@ -42,7 +42,7 @@ _NEEDED = {"X_WB": 7, "V_WB_B": 6}
 _TOLD = {"covariance": 324, "status": 10, "health": 5}
 _READ = {"imu": 6, "dvl": 7, "depth": 3, "compass": 3}
 _NEVER = 1e9  # period (s) of noise that is drawn once
-_WATER = 2  # periods of the plant between steps of the water, whose waves take seconds
+_WATER = 2  # periods of the plant per step of the water: waves have periods of seconds
 
 
 def station_ports(hardware: bool = False) -> tuple[dict[str, int], dict[str, int]]:
@@ -57,11 +57,11 @@ def make_station(
 
     In simulation: allocation, plant with thrusters, disturbances, sensors and filter, as subsystems
     `allocation`, `plant`, `disturbances`, `sensors` and `ekf`. All noise comes from random sources
-    inside, which `SetRandomContext` seeds. With `estimator` that system is the filter, whatever the
-    configuration says; which ports it may have is told by `systems.own.OwnFilter`.
+    inside, which `SetRandomContext` seeds. `estimator`, if given, replaces the configured filter;
+    `systems.own.OwnFilter` lists the ports it may have.
 
     Raises:
-        NotImplementedError: hardware is asked for.
+        NotImplementedError: `hardware` is true.
         UserError: a part of the configuration names what can't be read, or the estimator lacks a
             port.
     """
@@ -84,7 +84,7 @@ def check_stand_in(system: System) -> None:
 
 
 def add_noise(builder: DiagramBuilder, system: System, name: str, period: float) -> None:
-    """Feed a system's noise port with unit Gaussians drawn every `period` (s), if it takes any."""
+    """Feed a system's noise port, unless it is empty, with unit Gaussians every `period` (s)."""
     port = system.GetInputPort(name)
     if port.size() == 0:
         return
@@ -134,7 +134,7 @@ def _simulated(config: StationConfig, estimator: System | None) -> Diagram:
     for system in (water, sensors, ekf):
         if system.HasInputPort("initial_noise"):
             add_noise(builder, system, "initial_noise", _NEVER)
-    if sensors.HasInputPort("fault_noise"):  # the last source: it leaves the others their seeds
+    if sensors.HasInputPort("fault_noise"):  # last: the other sources keep their seeds
         add_noise(builder, sensors, "fault_noise", 1 / s.imu.rate)
 
     builder.ExportInput(allocation.GetInputPort("F_Bo_B"), "F_Bo_B")
@@ -160,7 +160,7 @@ def _simulated(config: StationConfig, estimator: System | None) -> Diagram:
 
 
 def _filter(config: StationConfig) -> System:
-    """The filter that a configuration asks for."""
+    """The configured filter."""
     s, (X0, V0) = config.sensing, config.initial_state()
     if s.filter is None:
         return Ekf(s.imu, s.dvl, s.depth, s.compass, s.ekf, X0, V0)

@@ -1,4 +1,4 @@
-"""What the filter said of itself against the truth: errors, consistency, health."""
+"""The filter's estimate against the truth: errors, consistency, health."""
 
 import math
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ _CONFIDENCE = 0.95
 
 
 def estimate_error(log: RunLog) -> tuple[np.ndarray, np.ndarray] | None:
-    """The filter's error δ = (δp, δθ, δv) (N, 9) and its claimed standard deviations (N, 9).
+    """The filter's error δ = (δp, δθ, δv) (N, 9) and its estimated standard deviations (N, 9).
 
     The truth is X̂ exp([δp, δθ]), v̂ + δv (`systems.estimation.error_state`).
     """
@@ -59,7 +59,7 @@ def mahalanobis(
     usable &= (scale > 0).all(axis=1)
     scale, eye = np.where(usable[:, None], scale, 1), np.eye(3)
     alike = np.where(usable[:, None, None], P / scale[:, :, None] / scale[:, None], eye)
-    usable &= np.linalg.eigvalsh(alike)[:, 0] > 1e-9  # of correlations: the units don't matter
+    usable &= np.linalg.eigvalsh(alike)[:, 0] > 1e-9  # of correlations, which have no units
     delta, alike = delta / scale, np.where(usable[:, None, None], alike, eye)
     squares = np.einsum("ni,ni->n", delta, np.linalg.solve(alike, delta[:, :, None])[:, :, 0])
     return np.where(usable, squares, np.nan).reshape(-1, 3)
@@ -80,7 +80,7 @@ def average_bound(freedom: int, count: int = 1) -> tuple[float, float]:
 def nees_words(estimate: Mapping[str, Any]) -> str | None:
     """A run's NEES: `position 2.1, attitude 3.4, velocity 12 (outside), bounds 0.22 to 9.3`.
 
-    None where a block has none. `estimate` are the metrics of `sims.run.metrics`.
+    None if a block has no finite NEES. `estimate` are the metrics of `sims.run.metrics`.
     """
     told = {name: estimate.get(f"{name}_nees") for name in BLOCKS}
     known = {name: x for name, x in told.items() if x is not None and math.isfinite(x)}
@@ -117,5 +117,5 @@ def health_words(shares: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def _percent(share: float) -> str:
-    """In whole per cent, but never all or nothing of what is neither."""
+    """In whole per cent; 0 % and 100 % only for shares that are exactly that."""
     return "below 1 %" if share < 0.005 else f"{min(100 * share, 99 if share < 1 else 100):.0f} %"

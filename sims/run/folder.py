@@ -1,4 +1,4 @@
-"""A run on disk: a folder whose files appear together."""
+"""A run on disk: a folder whose files are written atomically together."""
 
 import itertools
 import json
@@ -34,8 +34,8 @@ def write_run(run: Run, folder: str | os.PathLike[str], report: bool = True) -> 
     """Write a run as a new folder and return its metrics.
 
     `scenario.yaml` (defaults written out), `log.nc` (a recording), `metrics.json`, and with
-    `report` also `report.html` and `meshcat.html`. But for the block `timing` the metrics of equal
-    seeds are equal.
+    `report` also `report.html` and `meshcat.html`. Except for the block `timing`, equal seeds give
+    equal metrics.
 
     Raises:
         UserError: the folder exists and is not empty, or can't be made.
@@ -45,7 +45,7 @@ def write_run(run: Run, folder: str | os.PathLike[str], report: bool = True) -> 
 
 
 def write_files(run: Run, folder: Path, report: bool = True) -> dict[str, Any]:
-    """The same into a folder that is held (`run_folder`): all files take their places at once."""
+    """As `write_run`, into a folder that is held (`run_folder`); all files appear at once."""
     values = run_metrics(run)
     with atomic_files(folder) as partial:
         (partial / "scenario.yaml").write_text(typed_yaml.dump(run.scenario), encoding="utf-8")
@@ -77,7 +77,7 @@ def run_metrics(run: Run) -> dict[str, Any]:
 
 
 def scene(scenario: Scenario) -> Scene:
-    """What stands around the vehicle in a scenario's pictures."""
+    """The surroundings of the vehicle for a scenario's figures."""
     goal, success = scenario.goal, scenario.success
     return Scene(
         scenario.station.load_vehicle().size,
@@ -126,7 +126,7 @@ def new_folder(
                 continue
             try:
                 yield stack.enter_context(run_folder(path, RUN, "", new=True))
-            except BusyError:  # another process was as fast
+            except BusyError:  # another process holds it
                 continue
             return
 

@@ -1,20 +1,20 @@
-"""What a run leaves behind: a Recording of the true motion, with what the vehicle knew and planned.
+"""The log of a run: a Recording of the true motion, with the estimates and the plans.
 
 Besides the variables of every recording (`docs/recording.md`) a run's log holds, over its time:
 
-- `X_WB_estimate`, `V_WB_B_estimate`: the filter's estimates; `error_std` (18): standard deviations
-  it claims, in the order of `systems.estimation.error_state`; `error_covariance` (27): covariances
-  that it claims of δp, δθ and δv, each 3 × 3 by rows;
-- `nis`, `rejected` (3): normalised innovation squared of the last reading of `FUSED`, and how many
-  were rejected in a row;
+- `X_WB_estimate`, `V_WB_B_estimate`: the filter's estimates; `error_std` (18): their standard
+  deviations in the order of `systems.estimation.error_state`; `error_covariance` (27): covariances
+  of δp, δθ and δv, each 3 × 3 by rows, both as the filter estimates them;
+- `nis`, `rejected` (3): normalised innovation squared of the last reading of `FUSED`, and the
+  number of consecutive rejections;
 - `health` (5), if the filter has such a port: 0 good, 1 degraded, 2 lost, then 1 where it trusts
   imu, dvl, depth and compass;
 - `X_WB_plan`, `V_WB_B_plan`: the plan at that time; `plan_valid`: 1 where there was one;
-- `F_disturbance_Bo_B` (N, N·m), `flow_W` (velocity m/s, acceleration m/s²): what the water did;
+- `F_disturbance_Bo_B` (N, N·m), `flow_W` (velocity m/s, acceleration m/s²): disturbances and flow;
 
-and for every plan made (dim `plan`): `plan_time` (s), `plan_X_WB`, and of a sampling planner also
+and for every plan (dim `plan`): `plan_time` (s), `plan_X_WB`, and with a sampling planner also
 `sample_p_WB`, `sample_weight` and `planner_figures`. Attributes: `allowed_risk` of the planner's
-chance constraint, and `least_risk`, that of the widest way to the goal.
+chance constraint, and `least_risk`, that of the widest path to the goal.
 """
 
 import os
@@ -34,15 +34,15 @@ FUSED = ("dvl", "depth", "compass")
 
 @dataclass(frozen=True)
 class Plans:
-    """Every plan of a run, thinned in time for pictures and replays.
+    """Every plan of a run, decimated in time for figures and replays.
 
     Attributes:
         time: when each was made (s).
-        dt: between the thinned states (s).
-        X_WB: planned poses; the first is where the vehicle was thought to be.
+        dt: between the decimated states (s).
+        X_WB: planned poses; the first is the estimate at that time.
         p_WB: positions of sampled paths (m, W), at `dt`, 2 `dt`, … after `time`.
         weights: of the sampled paths.
-        figures: the planner's own figures (`systems.planning.mppi.FIGURES`).
+        figures: the planner's figures of merit (`systems.planning.mppi.FIGURES`).
         allowed: probability of a collision that the planner's chance constraint allows.
     """
 
@@ -70,7 +70,7 @@ _PLAN_DIMS = {
 
 @dataclass(frozen=True)
 class RunLog:
-    """A recording of a single run with its further variables."""
+    """A recording of a single run with the additional variables of this module."""
 
     recording: Recording
 
@@ -89,7 +89,7 @@ class RunLog:
     ) -> "RunLog":
         """Build from arrays with time first; `variables` holds at least X_WB, V_WB_B, F_Bo_B.
 
-        `least_risk` is the probability of a collision on the widest way to the goal.
+        `least_risk` is the probability of a collision on the widest path to the goal.
         """
         rest = dict(variables)
         X, V = rest.pop("X_WB"), rest.pop("V_WB_B")
@@ -130,7 +130,7 @@ class RunLog:
 
     @property
     def least_risk(self) -> float | None:
-        """Probability of a collision on the widest way to the goal, if there is a goal."""
+        """Probability of a collision on the widest path to the goal, if there is a goal."""
         return self._attribute("least_risk")
 
     def _attribute(self, name: str) -> float | None:
@@ -155,7 +155,7 @@ class RunLog:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write as a recording (NetCDF); appears whole or not at all."""
+        """Write as a recording (NetCDF), atomically."""
         self.recording.save(path)
 
     @classmethod
@@ -163,7 +163,7 @@ class RunLog:
         """Read what `save` wrote.
 
         Raises:
-            UserError: the file is missing or no recording.
+            UserError: the file is missing or not a recording.
         """
         return cls(Recording.load(path))
 

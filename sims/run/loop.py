@@ -1,4 +1,4 @@
-"""Closes the loop of a scenario: builds the diagram, simulates, watches, logs."""
+"""Runs a scenario: builds the closed-loop diagram, simulates, monitors, logs."""
 
 import gc
 import signal
@@ -27,13 +27,13 @@ from .way import check_free, find_passage, holding, no_safe_plan
 Progress = Callable[[float, str], None]
 Engine = Literal["auto", "drake", "compiled"]
 _WARM_UP = 0.45  # s: beyond the filter's delay, so that every event has occurred
-_WORTH_A_LOOP = 10.0  # s of a run
-_AT_ONCE = 0.2  # s that a compiled loop advances before the monitor looks at its samples
+_WORTH_A_LOOP = 10.0  # s: shortest run that repays the compilation of a loop
+_AT_ONCE = 0.2  # s that a compiled loop advances between checks of the monitor
 
 
 @dataclass
 class Timing:
-    """What the clock on the wall said; no part of the log, which is the same for the same seed."""
+    """Wall-clock times; not part of the log, which is the same for the same seed."""
 
     engine: str = "drake"
     compilation: float = 0.0
@@ -42,17 +42,17 @@ class Timing:
     dt: float = 0.0
 
     def add(self, spent: float, planning: bool, steps: int = 1) -> None:
-        """File the time of some steps of the log, and whether the planner was called in them."""
+        """Add the wall time of some steps of the log, and whether they called the planner."""
         self.chunks += [spent / steps] * steps
         self.planning += [planning] * steps
 
     def speed(self, last: int = 0) -> float:
-        """Simulated time per time on the clock, of the whole run or its last steps."""
+        """Simulated time per wall time, of the whole run or its last steps."""
         chunks = self.chunks[-last:]
         return len(chunks) * self.dt / max(sum(chunks), 1e-9)
 
     def summary(self) -> dict[str, float | str | None]:
-        """Who stepped, seconds of compilation, real-time factor, planner's time a call (ms)."""
+        """Engine, compilation time (s), real-time factor, planner's time per call (ms)."""
         spent, planning = 1e3 * np.array(self.chunks), np.array(self.planning, bool)
         rest = spent[~planning]
         calls = spent[planning] - (np.median(rest) if rest.size else 0.0)
@@ -67,7 +67,7 @@ class Timing:
 
 
 class Run(NamedTuple):
-    """What came of a scenario."""
+    """The result of a scenario."""
 
     scenario: Scenario
     log: RunLog
@@ -76,22 +76,22 @@ class Run(NamedTuple):
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engine = "auto") -> Run:
-    """Fly a scenario to its end. The same scenario gives the same log, bit for bit.
+    """Simulate a scenario to its end. The same scenario gives the same log, bit for bit.
 
-    Drake steps the diagram, or one compiled loop does (`systems.compiled.simulator`), some times as
-    fast; but for rounding they give the same run. By default the loop is taken if it can be, and if
-    the run may last long enough to repay its compilation.
+    Drake steps the diagram, or one compiled loop does (`systems.compiled.simulator`), which is
+    several times as fast and differs by rounding only. By default the loop is used if the diagram
+    can be compiled and the run may last long enough to repay the compilation.
 
-    Ctrl-C ends the flight after the sample at hand with the outcome `interrupted`; what was flown
-    until then is returned. A second one, or one before the flight, interrupts at once.
+    Ctrl-C ends the run after the current sample with the outcome `interrupted`; the run up to then
+    is returned. A second Ctrl-C, or one before the first step, interrupts at once.
 
-    Where no way to the goal keeps to the allowed risk, a planner holds the vehicle's place, and the
-    outcome is `no safe plan`.
+    If no path to the goal satisfies the allowed risk, a planner holds the vehicle's start pose, and
+    the outcome is `no safe plan`.
 
     Raises:
         UserError: start or goal are in an obstacle, the scenario names what can't be read, its
-            controller lacks a port, tells no plan though `FollowPath` judges by it or puts out no
-            finite wrench at t = 0, or the engine is to be `compiled` and can't.
+            controller lacks a port, has no plan though `FollowPath` needs one or has no finite
+            wrench at t = 0, or the engine `compiled` is given and the diagram can't be compiled.
     """
     return next(simulate_seeds(scenario, [scenario.seed], progress, engine))
 
@@ -102,13 +102,13 @@ def simulate_seeds(
     progress: Progress | None = None,
     engine: Engine = "auto",
 ) -> Iterator[Run]:
-    """Fly a scenario with one seed after the other: the runs of `simulate`, one diagram for all.
+    """Simulate a scenario with one seed after the other, as `simulate`, with one diagram for all.
 
-    Building, tracing and compiling takes longer than many a flight. After Ctrl-C the run at hand is
+    Building, tracing and compiling takes longer than many a run. After Ctrl-C the current run is
     the last.
 
     Raises:
-        UserError: as `simulate`, when the first run is asked for.
+        UserError: as `simulate`, when the first run is requested.
     """
     tell = progress or (lambda fraction, remark: None)
     tell(0.0, "building")
@@ -150,9 +150,9 @@ def _check_plan(diagram: Diagram, scenario: Scenario) -> None:
 def _check_start(
     diagram: Diagram, context: Context, period: float, error: FloatingPointError
 ) -> None:
-    """Blame what was not finite from the start on: there is no flight to tell of.
+    """Raise a UserError if a signal was not finite from the start on, so that there is no run.
 
-    What a controller puts out at t = 0 acts at once or a `period` of the plant (s) later.
+    A controller's output at t = 0 acts at once or one `period` of the plant (s) later.
     """
     signals = logged(diagram, context)
     acting = signals["F_acting"]
@@ -175,7 +175,7 @@ def _one(
     tell: Progress,
     passage: Passage | None,
 ) -> Run:
-    """Fly a diagram once, in a fresh context; `warm` says that its programs are compiled."""
+    """Simulate a diagram once, in a new context; `warm` says that its programs are compiled."""
     context = simulator.get_mutable_context()
     seeded(diagram, context, scenario.seed)
     vehicle = scenario.station.load_vehicle()
@@ -202,7 +202,7 @@ def _one(
 def _simulator(
     diagram: Diagram, scenario: Scenario, engine: Engine
 ) -> Simulator | CompiledSimulator:
-    """Who steps a diagram."""
+    """The simulator that steps a diagram."""
     if engine == "drake" or (engine == "auto" and scenario.duration < _WORTH_A_LOOP):
         return Simulator(diagram)
     try:
@@ -258,9 +258,9 @@ def _fly(
                 tell(done, f"{t:.0f} s, {timing.speed(200):.1f} × real time")
             if outcome is None and stopped.is_set():
                 outcome = Outcome("interrupted", t, f"Stopped by hand after {t:.1f} s.")
-        # on to the last sample's row: what the updates of its time make of it
+        # complete the row of the last sample with the updates at its time
         simulator.AdvanceTo(k * dt + scenario.station.period)
-    except FloatingPointError as error:  # it names what was not finite
+    except FloatingPointError as error:  # its message names the signal that was not finite
         log = sinks[0].FindLog(context)
         last = log.sample_times()[np.isfinite(log.data()).all(axis=0)][-1]
         _check_start(diagram, context, scenario.station.period, error)
@@ -269,7 +269,7 @@ def _fly(
 
 
 def _samples_at_once(simulator: Simulator | CompiledSimulator, tap: PlanTap, dt: float) -> int:
-    """How many samples of the log to advance by, so that no plan comes and goes unseen."""
+    """Number of log samples per advance, few enough to read every plan."""
     if isinstance(simulator, Simulator):
         return 1
     plans = getattr(tap.source, "period", _AT_ONCE)
@@ -277,16 +277,16 @@ def _samples_at_once(simulator: Simulator | CompiledSimulator, tap: PlanTap, dt:
 
 
 def _warm_up(diagram: Diagram, duration: float) -> None:
-    """Compile every event's function by a short flight in a context of its own."""
+    """Compile every event's function by a short run in a context of its own."""
     simulator = Simulator(diagram)
     seeded(diagram, simulator.get_mutable_context(), 0)
-    with suppress(FloatingPointError):  # the flight that counts will tell
+    with suppress(FloatingPointError):  # the actual run reports it
         simulator.AdvanceTo(duration)
 
 
 @contextmanager
 def _ticking(tell: Progress, remark: str) -> Iterator[None]:
-    """Report every second that nothing is finished yet, while the block runs."""
+    """Report progress 0 every second while the block runs."""
     over = threading.Event()
 
     def tick() -> None:
@@ -304,7 +304,7 @@ def _ticking(tell: Progress, remark: str) -> Iterator[None]:
 
 @contextmanager
 def _few_collections() -> Iterator[None]:
-    """Leave what exists out of Python's garbage collections: they took 5 % of a flight's time."""
+    """Exclude existing objects from garbage collection, which would take 5 % of a run's time."""
     gc.freeze()
     try:
         yield

@@ -1,4 +1,4 @@
-"""A run in numbers: from its log alone, so the same log gives the same numbers."""
+"""Metrics of a run, from its log alone: the same log gives the same numbers."""
 
 import math
 from typing import Any
@@ -23,7 +23,7 @@ from .estimate import (
 )
 from .log import RunLog
 
-SETTLED = 2.0  # s: what happens before is the start, not the tracking
+SETTLED = 2.0  # s: initial transient that is not counted as tracking error
 _SATURATED = 5.0  # µs from the end of the range
 _PWM = (1100.0, 1900.0)
 
@@ -82,7 +82,7 @@ def clearance(
 
 
 def tracking_error(log: RunLog) -> tuple[np.ndarray, np.ndarray] | None:
-    """Plan minus truth over time: log(X_WB⁻¹ X_plan) (N, 6) and twist (N, 6), NaN without plan."""
+    """Plan minus truth over time: log(X_WB⁻¹ X_plan) (N, 6), twist (N, 6); NaN without a plan."""
     if "X_WB_plan" not in log or not np.any(log["plan_valid"] > 0.5):
         return None
     valid = (log["plan_valid"] > 0.5)[:, None]
@@ -144,9 +144,9 @@ def _largest(values: np.ndarray) -> float:
 def _estimate(log: RunLog) -> dict[str, Any]:
     """RMS errors, their share within 3σ of each axis, and NEES of each block over the run.
 
-    NEES is 3 on average for a filter whose covariance is right. Errors of one run correlate over
-    its time: the bounds are those of a single moment, and its mean over the run lies within them
-    more often than 95 %. Runs of many seeds tell more (`spinndrift check estimator`).
+    NEES is 3 on average for a consistent filter. The errors of one run are correlated over time:
+    the bounds are those of a single instant, and the mean over the run lies within them in more
+    than 95 % of runs. Many seeds give a sharper test (`spinndrift check estimator`).
     """
     known = estimate_error(log)
     if known is None:
@@ -162,7 +162,7 @@ def _estimate(log: RunLog) -> dict[str, Any]:
     squares = nees(log)
     for i, name in enumerate(BLOCKS):
         part, own = slice(3 * i, 3 * i + 3), squares[:, i]
-        claimed = bool(np.isfinite(std[:, part]).all())  # a filter of one's own may not say
+        claimed = bool(np.isfinite(std[:, part]).all())  # a user's filter may have none
         found[f"{name}_within_3_sigma"] = float(inside[:, part].mean()) if claimed else math.nan
         found[f"{name}_nees"] = float(np.nanmean(own)) if np.isfinite(own).any() else math.nan
     low, high = average_bound(3)
@@ -221,7 +221,7 @@ def _planner(log: RunLog) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """JSON without NaN: what is not a finite number becomes None."""
+    """JSON has no NaN: numbers that are not finite become None."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, float):

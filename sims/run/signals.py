@@ -1,4 +1,4 @@
-"""From a flown diagram's signals to one log on a uniform grid."""
+"""From a simulated diagram's signals to one log on a uniform grid."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -19,7 +19,7 @@ from ...systems.planning.plan import PlanLayout
 from ..scenarios.scenario import Scenario
 from .log import FUSED, Plans, RunLog
 
-_PLAN_STEP = 0.2  # s between the states of a plan that are kept
+_PLAN_STEP = 0.2  # s between the stored states of a plan
 _NOTES = (
     "X_WB and V_WB_B are the simulation's truth, not an estimate.",
     "F_Bo_B is the mean over each step of the wrench commanded of the thrusters; their lag is not "
@@ -42,15 +42,15 @@ _RATED = (
 
 
 def log_periods(scenario: Scenario) -> dict[str, float]:
-    """How often each port of station and controller is logged (s)."""
+    """Logging period of each port of station and controller (s)."""
     return dict.fromkeys(_RATED, 1 / scenario.log.rate)
 
 
 def log_commands(scenario: Scenario) -> Callable[[DiagramBuilder, System, System], None]:
-    """Adds to a diagram what a recording has of the commands: those that act on the plant.
+    """Adds logs of the commands that act on the plant to a diagram.
 
-    The plant moves on from t under the commands that were there before the updates of t. The wrench
-    is logged at the plant's own events, where Drake's order says just that.
+    The plant advances from t under the commands from before the updates at t. The wrench is logged
+    at the plant's own events, where Drake publishes this value.
     """
 
     def extend(builder: DiagramBuilder, station: System, controller: System) -> None:
@@ -62,7 +62,7 @@ def log_commands(scenario: Scenario) -> Callable[[DiagramBuilder, System, System
 
 
 def plan_source(diagram: Diagram) -> Any:
-    """The system whose port `plan` a closed loop's controller follows, None if it tells of none.
+    """The system with the port `plan` that a closed loop's controller follows; None without one.
 
     It is the controller or its subsystem `source`, and has the plan's `PlanLayout` as `layout`.
     """
@@ -76,9 +76,9 @@ def plan_source(diagram: Diagram) -> Any:
 
 
 class PlanTap:
-    """Keeps every plan that a controller makes, and what its planner sampled for it.
+    """Keeps every plan of a controller, with its planner's samples and figures.
 
-    Of a controller that makes none (`plan_source`) nothing is kept.
+    It keeps nothing for a controller without plans (`plan_source`).
     """
 
     def __init__(self, diagram: Diagram, root: Context, samples: bool = True):
@@ -93,12 +93,12 @@ class PlanTap:
 
     @property
     def period(self) -> float | None:
-        """How often a planner is called (s), None where there is none."""
+        """Period of the planner's calls (s), None without a planner."""
         planner = getattr(self.source, "planner", None)
         return None if planner is None else float(planner.config.period)
 
     def read(self, t: float) -> None:
-        """Keep the plan at hand if it is a new one; `t` (s) is the last time it may be of."""
+        """Keep the present plan if it is new; `t` (s) is its time if it is not valid."""
         if self.source is None:
             return
         plan: np.ndarray = self._ports["plan"].Eval(self._context)
@@ -111,7 +111,7 @@ class PlanTap:
     def setpoints(self, grid: Float[np.ndarray, " n"]) -> dict[str, np.ndarray]:
         """The plan at every time of the grid, as the tracking controller reads it.
 
-        A plan made at t is there for those who read after t.
+        A plan made at t is available to reads after t.
         """
         if self.source is None:
             return {}
@@ -131,7 +131,7 @@ class PlanTap:
         return {"X_WB_plan": X, "V_WB_B_plan": V, "plan_valid": valid}
 
     def plans(self, end: float) -> Plans | None:
-        """Every valid plan made before `end` (s), thinned."""
+        """Every valid plan made before `end` (s), decimated in time."""
         calls = [call for call in self.kept if call["valid"] and call["time"] < end + 1e-9]
         if not calls:
             return None
@@ -199,7 +199,7 @@ def collect(
 def mean_over(
     signal: Signal, grid: Float[np.ndarray, " n"], dt: float
 ) -> Float[np.ndarray, "n size"]:
-    """Mean of what is finite of a finer signal over [t, t + dt) for every t of the grid."""
+    """Mean of the finite samples of a faster signal over [t, t + dt) for every t of the grid."""
     index = np.clip(np.floor(signal.time / dt + 1e-6).astype(int), 0, None)
     inside = (index < grid.size) & np.all(np.isfinite(signal.value), axis=1)
     total = np.zeros((grid.size, signal.value.shape[1]))

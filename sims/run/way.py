@@ -1,4 +1,4 @@
-"""What is judged before a scenario flies: whether start and goal are free, and the way between."""
+"""Checks before a scenario runs: free start and goal, and a safe path between them."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from ..scenarios.scenario import Scenario
 
 
 def check_free(scenario: Scenario) -> None:
-    """Check that nothing stands where the vehicle starts and where it is to go.
+    """Check that start and goal are free of obstacles.
 
     Raises:
         UserError: the hull touches a pylon there.
@@ -32,9 +32,9 @@ def check_free(scenario: Scenario) -> None:
 
 
 def find_passage(scenario: Scenario) -> Passage | None:
-    """The widest way to the goal, by the planner's own measure of risk; None without a goal.
+    """The widest path to the goal, with the planner's measure of risk; None without a goal.
 
-    Where nothing is planned with a risk, a way is safe if the vehicle fits through.
+    Without a planner that has one, a path is safe if the vehicle fits through.
     """
     if not isinstance(scenario.success, ReachGoal) or scenario.goal is None:
         return None
@@ -55,7 +55,7 @@ def find_passage(scenario: Scenario) -> Passage | None:
 
 
 def holding(scenario: Scenario) -> ControllerKind:
-    """The scenario's controller, a planner with the start as its goal: to stay where it is."""
+    """The scenario's controller; a planner gets the start pose as its goal, to hold it."""
     controller = scenario.controller
     if not isinstance(controller, MppiImpedance):
         return controller
@@ -63,7 +63,7 @@ def holding(scenario: Scenario) -> ControllerKind:
 
 
 def no_safe_plan(scenario: Scenario, passage: Passage) -> str:
-    """The sentences that say so."""
+    """The sentences on the outcome `no safe plan`."""
     held = " The vehicle held its place." if isinstance(scenario.controller, MppiImpedance) else ""
     risk = f"has a collision risk of {_percent(passage.risk)} or more"
     if passage.allowed is None:

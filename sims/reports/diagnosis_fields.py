@@ -32,7 +32,7 @@ def tables() -> str:
 
 
 def _is(rule: dict[str, Any]) -> str:
-    """What a rule of the schema asks for, in words."""
+    """The type of a rule of the schema, in words."""
     if "$ref" in rule:
         name = rule["$ref"].split("/")[-1]
         return f"[{name}](#{name.lower()})"
@@ -51,7 +51,7 @@ def _is(rule: dict[str, Any]) -> str:
 
 
 def page(old: str) -> str:
-    """A page with the tables in place of what stands between its two marks.
+    """A page with the tables in place of the text between its two marks.
 
     Raises:
         UserError: the page lacks them.

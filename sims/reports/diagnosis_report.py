@@ -66,7 +66,7 @@ _WORDS = {
 
 
 def diagnosis_page(finding: Finding, title: str) -> Page:
-    """Verdict, causes, where the error lives, gain, data."""
+    """The page of a diagnosis: verdict, causes, localisation of the error, gain, data."""
     d = finding.diagnosis
     shared = in_one_noise(finding)
     page = Page(
@@ -243,7 +243,7 @@ def _valued(v: Value) -> str:
 
 
 def _gains(d: Diagnosis) -> list[tuple[str, ...]]:
-    """A row a model: scores, and bands at the longest horizon."""
+    """One row per model: scores, and bands at the longest horizon."""
     rows = []
     for name, g in d.gain.items():
         last = list(g.energy_score)[-1]

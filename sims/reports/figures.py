@@ -1,4 +1,4 @@
-"""What the figures of all reports share: colours, type, axes."""
+"""Shared style of the figures of all reports: colours, fonts, axes."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -19,8 +19,8 @@ INK, QUIET, GRID = "#1c2733", "#5b6b7a", "#e6ebef"
 AXES = ("#c4473a", "#3b8a4a", "#2f6fb5")  # x, y, z
 WIDTH = 9.6  # in: the width of a page's text
 _SPAN, _LONG = 5.0, 300.0
-"""Ratio of values from which on a logarithmic axis has two of 1, 2 and 5 on it, and ratio of its
-ends from which on these would be too many."""
+"""Ratio of values from which an axis is logarithmic (two of 1, 2 and 5 are then on it), and ratio
+of its ends from which only powers of ten are labelled."""
 
 _STYLE = {
     "axes.axisbelow": True,
@@ -53,7 +53,7 @@ _STYLE = {
 
 
 def styled(draw: Callable[P, F]) -> Callable[P, F]:
-    """Draw a figure in the reports' style, leaving matplotlib's settings as they were."""
+    """Draw a figure in the reports' style, without changing matplotlib's settings."""
 
     @wraps(draw)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> F:
@@ -79,13 +79,13 @@ def lines(
 
 
 def at_least(axes: Axes, half: float) -> None:
-    """Let the vertical axis span ± `half` at least, so that small noise looks small."""
+    """Let the vertical axis span at least ± `half`, so that noise is not magnified."""
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, -half), max(high, half))
 
 
 def legend(axes: Axes, **options: Any) -> None:
-    """A legend in one row above the axes, at the right, where it hides nothing."""
+    """A legend in one row above the axes, at the right, where it covers no data."""
     handles, _ = axes.get_legend_handles_labels()
     settings = {
         "loc": "lower right",
@@ -100,7 +100,7 @@ def legend(axes: Axes, **options: Any) -> None:
 
 
 def common_legend(figure: Figure, axes: Axes) -> None:
-    """One row above all panels, at the right, of what one of them shows."""
+    """One legend row above all panels, at the right, from the axes of one of them."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside upper right", ncols=len(handles), frameon=False,
@@ -109,7 +109,7 @@ def common_legend(figure: Figure, axes: Axes) -> None:
 
 
 def plain_logs(axes: Axes) -> None:
-    """Numbers of a logarithmic axis as they are: 0.5, 2, 30; powers of ten alone if it is long."""
+    """Plain decimal labels on a logarithmic axis: 0.5, 2, 30; powers of ten alone if it is long."""
 
     def between(x: float, _: object) -> str:
         low, high = axes.get_ylim()
@@ -120,7 +120,7 @@ def plain_logs(axes: Axes) -> None:
 
 
 def scaled(ax: Axes, values: np.ndarray, bars: bool = False) -> None:
-    """A vertical axis with at least two numbers on it: logarithmic where values span much."""
+    """A vertical axis with at least two labels: logarithmic if values differ by `_SPAN` or more."""
     finite = values[np.isfinite(values) & (values > 0)]
     if len(finite) and finite.max() > _SPAN * finite.min():
         ax.set_yscale("log")

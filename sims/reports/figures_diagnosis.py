@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: what is wrong, which name explains it, what naming it wins."""
+"""Figures of a diagnosis: model errors, the causes that explain them, and their gain."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,15 +13,15 @@ CONTENDERS = {
     "base": "belief", "refitted": "refitted", "extended": "with the causes",
     "black_box": "black box",
 }  # fmt: skip
-"""Models that are judged, as the page calls them."""
+"""The models' names on the page."""
 _FAR, _APART, _ROOM = 2.5, 10.0, 1.15
-"""Times the larger error of belief and causes that a panel shows of other models, times the smaller
-that it shows of the larger, and room above."""
+"""Limits of a panel: for other models relative to the larger error of belief and causes, for the
+larger relative to the smaller of these two, and margin above."""
 
 
 @styled
 def names_figure(finding: Finding, most: int = 14) -> Figure:
-    """Held-out gain of the best names tried alone, and the line that noise stays below."""
+    """Held-out gain of the best single causes, and the threshold for noise."""
     order = sorted(finding.fits.items(), key=lambda item: -item[1].heldout_gain)[:most][::-1]
     named = {(c.name, c.where) for c in finding.diagnosis.causes}
     figure, axes = panels(1, 1, 0.6 + 0.26 * len(order))
@@ -66,7 +66,7 @@ def residual_figure(finding: Finding) -> Figure:
 
 @styled
 def experiments_figure(diagnosis: Diagnosis) -> Figure | None:
-    """What each maneuver of the set is expected to tell about each cause; None if it makes none."""
+    """Expected information of each maneuver on each cause; None without experiments."""
     causes = [c for c in diagnosis.causes if c.experiments]
     if not causes:
         return None
@@ -87,9 +87,9 @@ def experiments_figure(diagnosis: Diagnosis) -> Figure | None:
 
 @styled
 def horizon_figure(diagnosis: Diagnosis) -> Figure:
-    """Errors and scores of simulations against their horizon, on data left out, with 95 %.
+    """Errors and scores of simulations against their horizon, held out, with 95 % intervals.
 
-    Of models whose errors are far beyond the others' the largest stands at the top, as a number.
+    The largest error of a model far beyond the others is written as a number at the top.
     """
     figure, axes = panels(1, 4, 2.9)
     titles = ("position / m", "rotation / rad", "velocity / (m/s)", "energy score")
@@ -119,7 +119,7 @@ def horizon_figure(diagnosis: Diagnosis) -> Figure:
 
 
 def panel_top(errors: dict[str, np.ndarray]) -> float:
-    """How high a panel reaches: to belief and causes, and to others unless they are far beyond."""
+    """Upper limit of a panel: belief and causes fit, and others unless they are far beyond."""
     largest = {n: float(np.max(np.where(np.isnan(e), np.inf, e))) for n, e in errors.items()}
     own = [e for n, e in largest.items() if n in ("base", "extended") and np.isfinite(e)]
     own = own or [e for e in largest.values() if np.isfinite(e)] or [1.0]
@@ -128,7 +128,7 @@ def panel_top(errors: dict[str, np.ndarray]) -> float:
 
 
 def _note_beyond(ax: Axes, errors: np.ndarray, row: int, name: str, color: str) -> None:
-    """Say at the top how large errors are that a panel does not show."""
+    """Write the size of errors beyond a panel's limit at its top."""
     finite = errors[np.isfinite(errors)]
     size = f"{finite.max():.2g}" if len(finite) == len(errors) else "diverged"
     ax.text(
@@ -143,7 +143,7 @@ def innovations_figure(finding: Finding) -> Figure:
     """Mean innovation over time in the scenario that the belief explains worst."""
     d = finding.data
     score = (finding.base.z**2).sum(axis=(0, 1))
-    there = np.unique(d.scenario)  # faulty runs are left out, and with them whole scenarios
+    there = np.unique(d.scenario)  # faulty runs are excluded: some scenarios are empty
     worst = int(there[np.argmax([score[d.scenario == s].mean() for s in there])])
     own = d.scenario == worst
     figure, axes = panels(2, 3, 3.9, sharex=True, sharey=True)

@@ -28,7 +28,7 @@ _COLORS = {"preset": PLANNED, "learned": FLOWN, "start": ESTIMATE}
 
 @styled
 def recording_figure(recording: Recording) -> Figure:
-    """Path from above, and depth, speed and body rates over time, one line a trajectory."""
+    """Path from above, and depth, speed and body rates over time, one line per trajectory."""
     figure, axes = panels(2, 2, 5.6)
     above, depth, speed, rate = axes.ravel()
     for number, trajectory in enumerate(recording.trajectories()):
@@ -58,10 +58,10 @@ def recording_figure(recording: Recording) -> Figure:
 def learning_figure(
     metrics: dict[str, np.ndarray], refits: tuple[int, ...] = (), taken: int | None = None
 ) -> Figure:
-    """Training and validation loss and their parts over the steps done.
+    """Training and validation loss and their parts over the steps.
 
-    Curves are parted at `refits`, after which losses are of another scale; a ring marks the
-    validation of the step `taken`.
+    Curves are split at `refits`, after which losses have another scale; a ring marks the validation
+    loss of the selected step `taken`.
     """
     figure, axes = panels(1, 2, 3.0)
     done = metrics["step"] + 1
@@ -69,7 +69,7 @@ def learning_figure(
     known = {"step", "loss", "gradient_norm", "rate", "ok", "validation", "seconds"}
     parts = {name: f"C{i}" for i, name in enumerate(sorted(set(metrics) - known))}
     for number, part in enumerate(stretches(metrics["step"], refits)):
-        first = "" if number == 0 else "_"  # what starts so stands in no legend
+        first = "" if number == 0 else "_"  # an underscore hides a label from the legend
         left.plot(done[part], _smooth(metrics["loss"][part]), color=FLOWN, label=f"{first}training")
         values = metrics["validation"][part]
         known_at = np.isfinite(values)
@@ -98,14 +98,14 @@ def learning_figure(
 
 
 def stretches(step: np.ndarray, refits: tuple[int, ...]) -> list[np.ndarray]:
-    """Which rows of the metrics lie between one refit and the next, as masks."""
+    """Masks of the rows of the metrics between one refit and the next."""
     edges = [-np.inf, *refits, np.inf]
     masks = [(step >= low) & (step < high) for low, high in itertools.pairwise(edges)]
     return [mask for mask in masks if mask.any()]
 
 
 def _smooth(values: np.ndarray, width: int = 15) -> np.ndarray:
-    """A running median, which a single odd batch does not move."""
+    """A running median, robust to single outlying batches."""
     half = width // 2
     return np.array(
         [np.nanmedian(values[max(0, i - half) : i + half + 1]) for i in range(len(values))]
@@ -131,7 +131,7 @@ def error_figure(evaluation: Evaluation) -> Figure:
 
 @styled
 def coverage_figure(evaluation: Evaluation) -> Figure:
-    """Share of held-out motion inside the 50 % and 90 % bands by axis; dashes: its due."""
+    """Coverage of held-out motion by the 50 % and 90 % bands, by axis; dashes: nominal."""
     d = evaluation.dataset
     models = [str(m) for m in d["model"].to_numpy()]
     figure, axes = panels(1, 2, 2.8, sharey=True)
@@ -162,8 +162,8 @@ def bands_figure(
 ) -> Figure:
     """One held-out window: measured motion, 50 % and 90 % bands of the learned law, the preset.
 
-    Displacements are seen from the learned model's noise-free motion, so that the width of a band
-    and the distance of the measurement from it can be compared by eye.
+    Displacements are relative to the learned model's noise-free motion, so that the width of a band
+    and the error of the measurement are comparable.
     """
     one = Batch.of(windows.take(np.array([index])))
 

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: where the error lives, axis by axis against states and commands."""
+"""Figures of a diagnosis: dependence of the error on states and commands, axis by axis."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -26,15 +26,15 @@ _UNITS = {
 }  # fmt: skip
 _BINS = 12
 _EQUAL = 1e-9
-"""Relative difference below which values are the same."""
+"""Relative difference below which values are equal."""
 _UNKNOWN = "#d3dae0"
-"""Of cells whose variable did not vary."""
+"""Colour of cells whose variable did not vary."""
 
 
 def in_one_noise(finding: Finding) -> Finding:
-    """The same with the belief's innovations in units of the noise estimated with the causes.
+    """The finding with the belief's innovations whitened by the noise estimated with the causes.
 
-    Each model's own noise takes up some of its errors, so that by it a wrong one looks like noise.
+    The noise estimated with a wrong model absorbs some of its errors and would hide them.
     """
     d, look, noise = finding.data, finding.base, finding.final.noise
     here = d.weight[:, None] > 0
@@ -48,7 +48,7 @@ def in_one_noise(finding: Finding) -> Finding:
 
 
 def run_times(d: Data) -> Float[np.ndarray, "M R"]:
-    """Times of the samples since the first that is predicted of each run (s)."""
+    """Times of the samples since the first predicted one of each run (s)."""
     lasts, starts = (d.step * d.weight).sum(axis=0), np.zeros(len(d.run))
     for run in np.unique(d.run):
         own = np.flatnonzero(d.run == run)
@@ -57,10 +57,10 @@ def run_times(d: Data) -> Float[np.ndarray, "M R"]:
 
 
 def variables(finding: Finding) -> dict[str, Float[np.ndarray, "N R"]]:
-    """What errors may depend on where each step begins, in the units of `labelled`.
+    """Variables at the start of each step that errors may depend on, in the units of `labelled`.
 
-    States, the command of each thruster or of each axis of a wrench, in recordings' words, the sum
-    of thrusters' absolute forces, voltage, time in the run, and the run.
+    States, the command of each thruster or of each axis of a wrench, named as in recordings, the
+    sum of thrusters' absolute forces, voltage, time in the run, and the run.
     """
     d = finding.data
     qw, qx, qy, qz = (d.X[:-1, i] for i in range(4))
@@ -94,14 +94,14 @@ def labelled(name: str) -> str:
 
 
 def binned(values: Float[np.ndarray, " n"], most: int = _BINS) -> np.ndarray | None:
-    """Bins from 0 on of about equal counts, one a value where these are few; None if all equal."""
+    """Bin indices of about equal counts, one bin per value if these are few; None if all equal."""
     if np.ptp(values) <= _EQUAL * max(float(np.abs(values).max()), 1e-3):
         return None
     distinct, bins = np.unique(values, return_inverse=True)
     if len(distinct) <= most:
         return bins
     edges = np.unique(np.quantile(values, np.linspace(0, 1, most + 1)))
-    if len(edges) < min(4, most + 1):  # nearly all are one value
+    if len(edges) < min(4, most + 1):  # nearly all values are equal
         return np.unique(np.sign(values - np.median(values)), return_inverse=True)[1]
     return np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
 
@@ -109,10 +109,10 @@ def binned(values: Float[np.ndarray, " n"], most: int = _BINS) -> np.ndarray | N
 def error_map(
     z: Float[np.ndarray, "n a"], variables: Mapping[str, Float[np.ndarray, " n"]], most: int = _BINS
 ) -> Float[np.ndarray, "a k"]:
-    """Nats by axis and variable: ½ Σ n m² of means m in bins of equal counts, less the bins.
+    """Nats by axis and variable: ½ Σ n m² of means m in bins of equal counts, less half the bins.
 
-    White errors of unit variance give about zero; what depends on a variable gives much. Not a
-    number where a variable did not vary.
+    White errors of unit variance give about zero, errors that depend on a variable give more. NaN
+    where a variable did not vary.
     """
     found = np.full((z.shape[1], len(variables)), np.nan)
     for k, values in enumerate(variables.values()):
@@ -155,19 +155,19 @@ def draw_map(
 
 
 def innovations_of(finding: Finding, look: Look) -> Float[np.ndarray, "n 6"]:
-    """Whitened innovations of the twist at all steps that exist."""
+    """Whitened innovations of the twist at all existing steps."""
     return look.z[:, 6:].swapaxes(1, 2)[finding.data.weight > 0].astype(float)
 
 
 def where_they_are(finding: Finding) -> dict[str, Float[np.ndarray, " n"]]:
-    """What innovations may depend on, at all steps that exist."""
+    """The `variables` at all existing steps."""
     exists = finding.data.weight > 0
     return {name: values[exists] for name, values in variables(finding).items()}
 
 
 @styled
 def map_figure(finding: Finding) -> Figure:
-    """Where the error lives: axis against state and input, belief and explained."""
+    """Dependence of the error on state and input by axis, for belief and explained model."""
     known = where_they_are(finding)
     looks = (finding.base, finding.final)
     maps = [error_map(innovations_of(finding, look), known) for look in looks]

@@ -1,4 +1,4 @@
-"""Pictures of a run in space: where it went among the obstacles, and what the planner tried."""
+"""Figures of a run in space: its path among the obstacles, and the planner's samples."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ from ..run.log import Plans, RunLog
 from .figures import ESTIMATE, FLOWN, GOAL, INK, OBSTACLE, PLANNED, QUIET, WATER, panels, styled
 
 _FOOTPRINTS = 9
-_SPACE = 0.7  # m around what is drawn
+_SPACE = 0.7  # m of margin around the drawn objects
 _DENSITY = LinearSegmentedColormap.from_list(
     "density", ["#ffffff", "#f6d9bd", "#d9772b", "#7d3b0c"]
 )
@@ -25,7 +25,7 @@ _DENSITY = LinearSegmentedColormap.from_list(
 
 @dataclass(frozen=True)
 class Scene:
-    """What stands around the vehicle, and its size.
+    """The surroundings of the vehicle, and its size.
 
     Attributes:
         size: length, width, height of the vehicle (m).
@@ -79,7 +79,7 @@ def path_figure(log: RunLog, scene: Scene) -> Figure:
 
 @styled
 def samples_figure(log: RunLog, scene: Scene, moments: int = 6) -> Figure | None:
-    """What the planner looked at, at several moments: dark where many samples pass; its plan.
+    """The density of the planner's samples and its plan, at several times.
 
     After the contour maps of the paper's field experiments. None without samples.
     """
@@ -172,7 +172,7 @@ def _footprint(
     ax: Axes, X_WB: Float[np.ndarray, "7"], size: tuple[float, float, float], alpha: float
 ) -> None:
     half = np.array(size) / 2
-    # the bow comes to a blunt point so that the heading can be seen
+    # the bow is tapered to show the heading
     x = np.array([1.0, 0.55, -1.0, -1.0, 0.55, 1.0]) * half[0]
     y = np.array([0.45, 1.0, 1.0, -1.0, -1.0, -0.45]) * half[1]
     corners = jnp.asarray(np.stack([x, y, np.zeros(6)]))
@@ -195,14 +195,14 @@ def _density(ax: Axes, plans: Plans, k: int, low: np.ndarray, high: np.ndarray) 
 
 
 def _moments(t: np.ndarray, p: np.ndarray, count: int) -> np.ndarray:
-    """Indices that are spread evenly, half by time and half by the way gone."""
+    """Indices spread evenly in the mean of time and distance travelled, both normalised."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
     measure = (t - t[0]) / max(t[-1] - t[0], 1e-9) + way / max(way[-1], 1e-9)
     return np.unique(np.searchsorted(measure, np.linspace(0, measure[-1], count) - 1e-9))
 
 
 def _box(log: RunLog, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of what the pictures show (m)."""
+    """Corners of the region in the figures (m)."""
     points = [log["X_WB"][:, 4:]]
     if scene.goal is not None:
         goal = np.array(scene.goal)

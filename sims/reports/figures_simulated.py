@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: simulations beside what was recorded."""
+"""Figures of a diagnosis: simulations compared with records."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,9 +16,9 @@ from .figures_maps import draw_map, error_map, variables
 NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
 _UNITS = ("m", "m", "m", "°", "°", "°", "m/s", "m/s", "m/s", "°/s", "°/s", "°/s")
 _BAND, _LOST = 0.9, 1e6
-"""Share of simulations in a band; size of an error beyond which one has diverged."""
+"""Share of simulations in a band; size of an error beyond which a simulation has diverged."""
 _SCALE = np.array([1, 1, 1, *3 * (180 / np.pi,)] * 2)
-"""From SI to the units shown."""
+"""From SI to the units in figures."""
 MODELS = {"base": ("belief", PLANNED), "extended": ("with the causes", FLOWN)}
 
 
@@ -33,7 +33,7 @@ def shown(
 ) -> Float[np.ndarray, "N 12 *s"]:
     """Position (m), roll, pitch and yaw (°), velocity (m/s) and turning rate (°/s).
 
-    Of a simulation that has diverged attitudes are not a number.
+    Attitudes of a diverged simulation are NaN.
     """
     q = np.moveaxis(X[:, [1, 2, 3, 0]], 1, -1)
     lost = np.asarray(~np.isfinite(q).all(axis=-1))
@@ -45,7 +45,7 @@ def shown(
 
 
 def _bounded(values: np.ndarray) -> np.ndarray:
-    """The same with what diverged at ±`_LOST`."""
+    """The values, with diverged ones replaced by ±`_LOST`."""
     return np.clip(np.nan_to_num(values, nan=_LOST, posinf=_LOST, neginf=-_LOST), -_LOST, _LOST)
 
 
@@ -61,7 +61,7 @@ def _typical(finding: Finding, simulated: Simulated) -> int:
 
 @styled
 def bands_figure(finding: Finding) -> Figure:
-    """A recorded run in the 90 % bands of simulations, which start anew from records."""
+    """A recorded run in the 90 % bands of simulations, which restart from records."""
     data, first = finding.data, contenders(finding)[0][0]
     k = _typical(finding, first)
     piece = int(first.pieces[k])
@@ -131,9 +131,9 @@ def axes_figure(finding: Finding) -> Figure:
 def at_ends(
     finding: Finding, simulated: Simulated, noise: Simulated | None = None
 ) -> tuple[Float[np.ndarray, "k 12"], dict[str, Float[np.ndarray, " k"]], np.ndarray]:
-    """Errors at the ends of windows in units of the simulated spread (of other simulations of the
-    same windows, `noise`, where these are given), the means over each window of what they may
-    depend on, and the piece of each.
+    """Errors at the ends of windows in units of the simulated spread (that of `noise`, other
+    simulations of the same windows, if given), the means over each window of the `variables`, and
+    the piece of each.
     """
     every, data = simulated.every, finding.data
     e = simulated.errors.astype(float)
@@ -153,7 +153,7 @@ def at_ends(
 
 @styled
 def simulated_map_figure(finding: Finding) -> Figure:
-    """What the errors at the ends of simulations depend on, axis by axis."""
+    """Dependence of the errors at the ends of simulations on the `variables`, axis by axis."""
     maps, names, last = [], [], contenders(finding)[-1][0]
     for simulated, name, _ in contenders(finding):
         z, means, _ = at_ends(finding, simulated, last)
@@ -165,7 +165,7 @@ def simulated_map_figure(finding: Finding) -> Figure:
 
 @styled
 def runs_figure(finding: Finding) -> Figure:
-    """Errors run by run, of one step and of whole simulations, in units of what noise explains."""
+    """Errors run by run, of one step and of whole simulations, in units of the expected noise."""
     data = finding.data
     figure, axes = panels(2, 1, 4.0, sharex=True)
     order = np.lexsort((data.run, data.scenario))

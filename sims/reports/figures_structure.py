@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: what innovations remember, what repeats, where in state space it is."""
+"""Figures of a diagnosis: the innovations' correlation, repeatability and place in state space."""
 
 import numpy as np
 from jaxtyping import Float
@@ -12,7 +12,7 @@ from .figures_maps import TWIST, error_map, innovations_of, labelled, where_they
 from .figures_simulated import MODELS
 
 _LONGEST = 2.0
-"""Lags (s) of the autocorrelation."""
+"""Longest lag (s) of the autocorrelation."""
 _CELLS, _PANELS = 14, 3
 
 
@@ -49,7 +49,7 @@ def memory_figure(finding: Finding) -> Figure:
 def _spectrum(
     z: Float[np.ndarray, "N R"], d: Data
 ) -> tuple[Float[np.ndarray, " f"], Float[np.ndarray, " f"]]:
-    """Mean periodogram of unit white noise's 1, of neighbouring frequencies together."""
+    """Mean periodogram, 1 for unit white noise, averaged over neighbouring frequencies."""
     power = (np.abs(np.fft.rfft(z, axis=0)) ** 2).sum(axis=1) / max(d.weight.sum(), 1)
     f = np.fft.rfftfreq(len(z), d.dt)
     each = max(1, len(f) // 60)
@@ -59,7 +59,7 @@ def _spectrum(
 
 @styled
 def repeats_figure(finding: Finding) -> Figure:
-    """What repeats from run to run is error, what doesn't is noise."""
+    """Repeatable part of the innovations (model error) and the rest (noise)."""
     d = finding.data
     by_model = [shares(look.z[:, 6:].astype(float), d) for look in (finding.base, finding.final)]
     figure, axes = panels(1, 3, 2.7, sharey=True)
@@ -80,9 +80,9 @@ def repeats_figure(finding: Finding) -> Figure:
 
 
 def most_telling(finding: Finding) -> list[tuple[int, str, str]]:
-    """Axes with most structure in the belief's innovations, each with its two telling variables."""
+    """Axes with most structure in the belief's innovations, each with its two main variables."""
     known = where_they_are(finding)
-    known.pop("run")  # no place in state space
+    known.pop("run")  # not a coordinate of state space
     nats = np.nan_to_num(error_map(innovations_of(finding, finding.base), known))
     names = list(known)
     order = np.argsort(-nats.max(axis=1))[:_PANELS]
@@ -95,7 +95,7 @@ def most_telling(finding: Finding) -> list[tuple[int, str, str]]:
 
 @styled
 def state_space_figure(finding: Finding) -> Figure:
-    """Mean innovations over the two variables that tell most, of the worst axes."""
+    """Mean innovations of the worst axes over their two most informative variables."""
     known = where_they_are(finding)
     chosen = most_telling(finding)
     figure, axes = panels(2, len(chosen), 5.2, sharex="col", sharey="col")
@@ -122,6 +122,6 @@ def state_space_figure(finding: Finding) -> Figure:
 
 
 def _edges(values: np.ndarray) -> Float[np.ndarray, " e"]:
-    """Of cells between the 1st and the 99th percentile."""
+    """Edges of cells between the 1st and the 99th percentile."""
     low, high = np.quantile(values, (0.01, 0.99))
     return np.linspace(low, max(high, low + 1e-9), _CELLS + 1)

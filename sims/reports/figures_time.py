@@ -1,4 +1,4 @@
-"""Pictures of a run over time: errors, estimates, commands, disturbances, the planner."""
+"""Figures of a run over time: errors, estimates, commands, disturbances, the planner."""
 
 import numpy as np
 from jaxtyping import Float
@@ -55,9 +55,9 @@ def tracking_figure(log: RunLog) -> Figure | None:
 
 @styled
 def estimate_figure(log: RunLog) -> Figure | None:
-    """The filter's error with the ± 3σ it claims; None without estimates.
+    """The filter's error with its estimated ± 3σ; None without estimates.
 
-    A strip at the foot of each panel has the colour of the filter's health, if that was logged.
+    A strip at the bottom of each panel is coloured by the filter's health, if that was logged.
     """
     known = estimate_error(log)
     if known is None:
@@ -88,7 +88,7 @@ _HEALTH = (GOAL, PLANNED, LIMIT)  # good, degraded, lost
 
 
 def _health_strip(ax: Axes, log: RunLog) -> None:
-    """A strip along the axis of time, coloured by the filter's health."""
+    """A strip along the time axis, coloured by the filter's health."""
     state = np.clip(np.nan_to_num(log["health"][:, 0], nan=2.0), 0, 2)
     begins = np.flatnonzero(np.diff(state, prepend=-1))
     ends = np.append(begins[1:], state.size)
@@ -107,7 +107,7 @@ def _health_strip(ax: Axes, log: RunLog) -> None:
 
 @styled
 def wrench_figure(log: RunLog, limits: Float[np.ndarray, "6"] | None = None) -> Figure:
-    """The commanded wrench; dashed what each axis alone can give."""
+    """The commanded wrench; dashed: the limit of each axis alone."""
     figure, axes = panels(2, 3, 3.7, sharex=True)
     names = ("X, forward", "Y, left", "Z, up", "K, roll", "M, pitch", "N, yaw")
     for c, (ax, name) in enumerate(zip(axes.flat, names, strict=True)):
@@ -154,7 +154,7 @@ def pwm_figure(log: RunLog, dead_band: tuple[float, float] = (1475.0, 1525.0)) -
 
 @styled
 def disturbance_figure(log: RunLog) -> Figure | None:
-    """The water's motion at the vehicle, and the wrench besides; None if not logged."""
+    """The flow at the vehicle, and the disturbance wrench; None if not logged."""
     if "flow_W" not in log and "F_disturbance_Bo_B" not in log:
         return None
     figure, axes = panels(3, 1, 5.2, sharex=True)
@@ -208,7 +208,7 @@ def progress_figure(
 
 @styled
 def planner_figure(log: RunLog) -> Figure | None:
-    """How sure the planner was: cost, risk beside the risk allowed, clearance it expected."""
+    """The planner's cost, collision risk with the allowed risk, and expected clearance."""
     plans = log.plans
     if plans is None or plans.figures is None or plans.time.size < 2:
         return None

@@ -1,4 +1,4 @@
-"""What training found, as sections of a page."""
+"""Results of training, as sections of a page."""
 
 from collections.abc import Sequence
 
@@ -25,7 +25,7 @@ AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
 
 def add_data(page: Page, recording: Recording) -> Page:
-    """What the recording holds, and lacks."""
+    """Contents and gaps of the recording."""
     minutes = recording.duration / 60
     page.section(
         "The data",
@@ -39,7 +39,7 @@ def add_data(page: Page, recording: Recording) -> Page:
 
 
 def add_training(page: Page, learned: Learned) -> Page:
-    """Learning curves, what the data changed in the coefficients, and what went wrong."""
+    """Learning curves, changes of the coefficients, and problems during training."""
     result, parts = learned.result, learned.parts
     validation = 0 if parts.validation is None else len(parts.validation)
     page.section(
@@ -102,7 +102,7 @@ def add_evaluation(page: Page, learned: Learned, window: int | None = None) -> P
 
 
 def taken_words(result: TrainingResult, validation: int) -> str:
-    """Which step's model was taken and why; `validation` is the number of windows that chose."""
+    """The selected step and the reason; `validation` is the number of validation windows."""
     windows = f"{validation} validation window{'s' * (validation != 1)}"
     step, last = result.best_step, max(result.refits, default=0)
     if validation == 0:
@@ -119,7 +119,7 @@ def taken_words(result: TrainingResult, validation: int) -> str:
 
 
 def scale_words(rows: Sequence[tuple[object, ...]]) -> str:
-    """What mass and drag have in common with thrust, whose scale motion alone doesn't tell."""
+    """Common scale of mass, drag and thrust, which motion alone does not identify."""
     table = np.array([[float(str(cell)) for cell in row[1:]] for row in rows])
     mass = float(np.median(table[:, 1] / table[:, 0]))
     drag = [table[:, 2 + k] + _SPEED * table[:, 4 + k] for k in (0, 1)]

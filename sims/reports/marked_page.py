@@ -1,4 +1,4 @@
-"""Pages of the documentation with a measured part; what people wrote around it stays."""
+"""Pages of the documentation with a generated part between two marks; other text is kept."""
 
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -29,7 +29,7 @@ def held_page(path: Path) -> AbstractContextManager[Path]:
 
 
 def write_measured(path: Path, text: str) -> None:
-    """Write `text` between two marks of a page; where there is none, a page of it alone.
+    """Write `text` between the two marks of a page; create a page if there is none.
 
     Raises:
         UserError: the page lacks the marks.

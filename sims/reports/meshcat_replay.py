@@ -1,4 +1,4 @@
-"""A run as a 3-D scene that plays in a browser: one HTML file, nothing to install or to serve."""
+"""A run as an animated 3-D scene in one self-contained HTML file."""
 
 import logging
 import os
@@ -27,7 +27,7 @@ from ..run.log import Plans, RunLog
 from .figures_path import Scene
 
 FRAMES = 20  # per second
-_PIECE = 0.5  # s of flown path that appear at once
+_PIECE = 0.5  # s of path that appear at once
 _PLANS = 120  # shown at most
 _PATHS, _STEPS = 20, 10  # of the sampled ones
 
@@ -40,10 +40,10 @@ _TUBE, _RING = Rgba(0.80, 0.82, 0.85, 1.0), Rgba(0.07, 0.07, 0.08, 1.0)
 
 
 def write_replay(path: str | os.PathLike[str], log: RunLog, scene: Scene, vehicle: Vehicle) -> Path:
-    """Write the replay of a run as one HTML file (some 3 MB); it appears whole or not at all.
+    """Write the replay of a run as one HTML file (about 3 MB), atomically.
 
-    To be seen: water, bed, pylons, goal, the vehicle with its thrusters, the path as it is flown,
-    and at every moment the plan and the sampled paths it was chosen from.
+    It shows water, bed, pylons, goal, the vehicle with its thrusters, the path so far, and at every
+    time the plan and the sampled paths it was chosen from.
     """
     with _quiet():
         meshcat = Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
@@ -63,7 +63,7 @@ def write_replay(path: str | os.PathLike[str], log: RunLog, scene: Scene, vehicl
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep Drake from announcing a server that nobody is meant to visit."""
+    """Suppress Drake's message about its local server, which is not used."""
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.WARNING)
@@ -107,7 +107,7 @@ def _surroundings(meshcat: Meshcat, log: RunLog, scene: Scene) -> None:
         _add(meshcat, f"pylons/{i}", Cylinder(pylon.diameter / 2, length), _PYLON, centre)
     if scene.goal is not None:
         _add(meshcat, "goal", Sphere(scene.goal_radius), _GOAL, np.array(scene.goal))
-    # from behind the left shoulder of the way to go, above the surface
+    # camera behind and left of the direction of travel, above the surface
     way = (points[-1] - p[0])[:2]
     norm = float(np.linalg.norm(way))
     ahead = way / norm if norm > 0.5 else np.array([1.0, 0.0])
@@ -147,7 +147,7 @@ def _motion(meshcat: Meshcat, log: RunLog) -> None:
 
 
 def _flown(meshcat: Meshcat, log: RunLog) -> None:
-    """The path, piece by piece as it is flown."""
+    """The path, piece by piece over time."""
     p = log["X_WB"][:, 4:]
     size = max(1, round(_PIECE / log.dt))
     for k in range(0, max(len(p) - 1, 0), size):
@@ -173,7 +173,7 @@ def _planned(meshcat: Meshcat, plans: Plans, end: float) -> None:
 
 
 def _tube(meshcat: Meshcat, path: str, p: np.ndarray, radius: float, rgba: Rgba) -> None:
-    """A polyline (n, 3) as a square tube: browsers draw lines one pixel thin."""
+    """A polyline (n, 3) as a square tube, since browsers draw lines one pixel wide."""
     if len(p) < 2:
         p = np.repeat(p, 2, axis=0) + np.array([[0.0, 0, 0], [1e-4, 0, 0]])
     along = np.gradient(p, axis=0)
@@ -191,7 +191,7 @@ def _tube(meshcat: Meshcat, path: str, p: np.ndarray, radius: float, rgba: Rgba)
 
 
 def _segments(p: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the pieces of sampled paths (steps, 3, paths), thinned: two arrays (3, n)."""
+    """Ends of the segments of decimated sampled paths (steps, 3, paths): two arrays (3, n)."""
     p = p[:, :, :: max(1, p.shape[2] // _PATHS)]
     step = max(1, p.shape[0] // _STEPS)
     origin = np.broadcast_to(start[None, :, None], (1, 3, p.shape[2]))

@@ -1,4 +1,4 @@
-"""Pages for people: sections of text, figures and tables in one self-contained HTML file.
+"""Report pages: sections of text, figures and tables in one self-contained HTML file.
 
     Page("A dive").verdict("The goal was reached.", good=True)
         .section("Path", "Seen from above.").figure(fig, "Planned and flown.")
@@ -27,8 +27,8 @@ from ...models.config.errors import UserError
 from ...models.files.atomic import atomic_path
 
 _TEMPLATES = Path(__file__).resolve().parent / "templates"
-_LARGE_SVG = 600_000  # bytes; above it a picture of pixels is smaller and opens faster
-_PIXELS = 200  # dpi of those: twice the size shown
+_LARGE_SVG = 600_000  # bytes; above it a PNG is smaller and opens faster
+_PIXELS = 200  # dpi of PNGs: twice the displayed size
 _MARKS = (
     (re.compile(r"`([^`]+)`"), r"<code>\1</code>"),
     (re.compile(r"\*\*([^*]+)\*\*"), r"<strong>\1</strong>"),
@@ -45,7 +45,7 @@ class Text:
 
     @property
     def paragraphs(self) -> list[Markup]:
-        """One piece of HTML a paragraph."""
+        """One piece of HTML per paragraph."""
         return [marked(part) for part in re.split(r"\n\s*\n", self.text.strip()) if part]
 
 
@@ -67,7 +67,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells; numbers stand right-aligned."""
+    """Rows of cells; numbers are right-aligned."""
 
     rows: Sequence[Sequence[object]]
     header: Sequence[str] = ()
@@ -122,7 +122,7 @@ class Section:
 class Page:
     """Builds a page from top to bottom; every method returns the page.
 
-    What comes before the first `section` stands under the title.
+    Content added before the first `section` is placed under the title.
     """
 
     def __init__(self, title: str, subtitle: str = ""):
@@ -132,13 +132,13 @@ class Page:
         self._footer: list[Markup] = []
 
     def verdict(self, text: str, good: bool | None = None) -> "Page":
-        """Say in one line what came out; `good` colours it green or red, None leaves it grey."""
+        """Set the one-line result; `good` colours it green or red, None leaves it grey."""
         mood = {True: "good", False: "bad", None: "neutral"}[good]
         self._verdict = (marked(text), mood)
         return self
 
     def section(self, title: str, text: str = "") -> "Page":
-        """Begin a section; what follows goes into it."""
+        """Begin a section; later content is added to it."""
         self.sections.append(Section(title))
         return self.text(text) if text else self
 
@@ -154,10 +154,10 @@ class Page:
         width: Literal["full", "half"] = "full",
         pixels: bool | None = None,
     ) -> "Page":
-        """Add a matplotlib figure, or a picture file (.svg, .png, .jpg), into the page itself.
+        """Embed a matplotlib figure, or a picture file (.svg, .png, .jpg), in the page.
 
-        A plot goes in as SVG, or at twice its size in pixels where that is the smaller file;
-        `pixels` decides it. Two neighbours of half width stand side by side.
+        A plot is embedded as SVG, or as PNG of twice its size if that is the smaller file; `pixels`
+        forces the choice. Two neighbours of half width are placed side by side.
 
         Raises:
             UserError: the file is missing or of another kind.
@@ -212,7 +212,7 @@ class Page:
         )
 
     def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write the page; it appears whole or not at all."""
+        """Write the page atomically."""
         with atomic_path(path) as partial:
             partial.write_text(self.html(), encoding="utf-8")
         return Path(path)
@@ -227,7 +227,7 @@ def marked(text: str) -> Markup:
 
 
 def shown(value: object) -> str:
-    """A value as a table shows it: four digits, a dash for what is missing."""
+    """A value as text for a table: four digits, a dash for a missing value."""
     match value:
         case None:
             return "–"

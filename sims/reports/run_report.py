@@ -1,4 +1,4 @@
-"""The page that tells a run: one HTML file for people who look."""
+"""The report of a run: one HTML page."""
 
 import platform
 from importlib import metadata
@@ -64,13 +64,13 @@ def run_page(
     """The page of a run.
 
     Args:
-        log: what happened.
+        log: of the run.
         values: its metrics (`sims.run.metrics.metrics`), with or without a `timing` block.
         scene: obstacles, goal, size of the vehicle.
         title: of the page.
         description: a sentence below it.
         scenario_text: the resolved scenario.
-        limits: most wrench along each axis alone.
+        limits: largest wrench along each axis alone.
         clearance: of the hull to the nearest obstacle over the log's time (m).
         replay: address of the 3-D replay.
     """
@@ -138,7 +138,7 @@ def _path_section(
 
 
 def _risk(planner: dict[str, Any]) -> str:
-    """Whether the chance constraint was kept."""
+    """Sentences on whether the chance constraint was satisfied."""
     allowed = planner.get("allowed_collision_probability")
     beyond = planner.get("plans_beyond_allowed")
     if allowed is None:

@@ -1,7 +1,7 @@
-"""The paper's claims about simulation, each held against the table of runs.
+"""The paper's claims about simulation, each tested on the table of runs.
 
 A claim is a function of the rows (`table.collect`) alone: `reproduced`, `not reproduced`, or `not
-tested` where the runs that it speaks of are lacking. Margins are stated with each claim.
+tested` if the runs that it needs are missing. Margins are stated with each claim.
 """
 
 import math
@@ -28,7 +28,7 @@ ALIKE = 0.1
 
 @dataclass(frozen=True)
 class Verdict:
-    """A claim, what came out, and the numbers it rests on."""
+    """A claim, its state, and the numbers that it is based on."""
 
     claim: str
     state: State
@@ -49,7 +49,7 @@ class _Mean:
 
 
 def verdicts(rows: Sequence[Row]) -> list[Verdict]:
-    """What became of every claim."""
+    """The verdict on every claim."""
     claims: tuple[Callable[[Sequence[Row]], Verdict], ...] = (
         fdm_is_best,
         errors_are_competitive,
@@ -139,7 +139,7 @@ def moments_collapse(rows: Sequence[Row]) -> Verdict:
 
 
 def distance_aware_collapses(rows: Sequence[Row]) -> Verdict:
-    """Likewise for the distance-aware objective."""
+    """The same for the distance-aware objective."""
     text = "So does the distance-aware objective."
     return _collapse(rows, ("euclidean-distance-aware",), text)
 
@@ -202,11 +202,11 @@ def kernels_are_alike(rows: Sequence[Row]) -> Verdict:
     return _verdict(text, good, told, bool(good))
 
 
-# ----------------------------------------------------------------------------- what was asked for
+# ---------------------------------------------------------------------------------------- targets
 
 
 def targets(rows: Sequence[Row], method: str = "fdm-geodesic") -> list[Verdict]:
-    """The project's own aims for sparse data: `reproduced` means that every run meets them."""
+    """The project's own targets for sparse data: `reproduced` means that every run meets them."""
     runs = _runs(rows, "sparse", method)
 
     def each(text: str, name: str, low: float, high: float) -> Verdict:

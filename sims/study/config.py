@@ -1,4 +1,4 @@
-"""What a study consists of: a true vehicle, a belief to start from, regimes of data, sizes."""
+"""Configuration of a study: true vehicle, initial belief, regimes of data, sizes."""
 
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, TypeVar, get_args
@@ -21,13 +21,13 @@ class TruthConfig:
     """The law to be learned: a preset with a constant diagonal diffusion b (N√s, N·m√s).
 
     With the default b and efforts every scenario's law stays within the logarithm's domain about
-    its mean for ten seconds, as the paper's geodesic kernel asks for.
+    its mean for ten seconds, as the paper's geodesic kernel requires.
     """
 
     vehicle: str = "bluerov2_heavy"
     diffusion: Vector6 = (1.0, 1.0, 1.0, 0.05, 0.05, 0.05)
     substeps: int = 10
-    """Integration steps a sample."""
+    """Integration steps per sample."""
 
     def __post_init__(self) -> None:
         check_numbers(self)
@@ -43,9 +43,9 @@ class RegimeConfig:
     trajectories: int = 20
     """Trajectories of each maneuver."""
     duration: float = 10.0
-    """Seconds of each, and of the motions that laws are compared over."""
+    """Duration of each (s), and of the motions on which laws are compared."""
     rate: float = 20.0
-    """Samples a second."""
+    """Samples per second."""
     effort: float = 0.3
     """Share of the largest wrench in each maneuver's direction."""
 
@@ -65,25 +65,24 @@ class RegimeConfig:
 
 @dataclass(frozen=True)
 class SizeConfig:
-    """What a study sets alike in every method's training; null leaves the method's own."""
+    """Training settings common to all methods of a study; null keeps the method's own."""
 
     substeps: int | None = 3
-    """Integration steps a sample: with two of 25 ms the inertia about yaw is learned a tenth too
-    small."""
+    """Integration steps per sample: with two of 25 ms the learned yaw inertia is 10 % too small."""
     steps: int | None = 600
     batch: int | None = None
     samples: int | None = None
-    """Predicted motions of each window, where the objective has them."""
+    """Predicted motions per window, for objectives that use them."""
     width: int | None = None
     depth: int | None = None
     pretrain_steps: int | None = None
     drift_iterations: int | None = None
-    """0 starts from the belief, whose coefficients no data have touched yet."""
+    """0 starts from the belief, whose coefficients have not been fitted to data."""
     learning_rate: float | None = None
     head_decay: float | None = None
     refit_at: tuple[float, ...] | None = None
     length_s: float | None = None
-    """Seconds of each window."""
+    """Length of each window (s)."""
     stride_s: float | None = None
 
     def apply(self, config: TrainingConfig, seed: int) -> TrainingConfig:
@@ -116,27 +115,27 @@ class SizeConfig:
 
 
 def _given(value: T | None, own: T) -> T:
-    """A study's value, or a method's own where it has none."""
+    """A study's value, or the method's own if it is None."""
     return own if value is None else value
 
 
 def _changed(part: Any, values: dict[str, Any]) -> Any:
-    """The dataclass `part` with those of the values that it has and that are not None."""
+    """The dataclass `part` with the given values of its fields, except those that are None."""
     known = {field.name for field in fields(part)}
     return replace(part, **{k: v for k, v in values.items() if v is not None and k in known})
 
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """How learned laws are compared with the true one."""
+    """Settings of the comparison of learned laws with the true one."""
 
     samples: int = 350
-    """Motions a scenario, from the true and from the learned law."""
+    """Motions per scenario, from the true and from the learned law."""
     times: int = 50
     """Evenly spaced times of the horizon at which laws are compared."""
     metric: GroundMetric = field(default_factory=GroundMetric)
     shown: tuple[str, ...] = ("surge-forward", "surge-yaw-left", "surge-sway-heave")
-    """Scenarios whose laws are drawn (those that the regime has)."""
+    """Scenarios whose laws are plotted (those that the regime has)."""
     shown_samples: int = 750
 
     def __post_init__(self) -> None:
@@ -148,11 +147,11 @@ class EvaluationConfig:
 
 @dataclass(frozen=True)
 class StudyConfig:
-    """All settings of an ablation study but which part of it is to be run."""
+    """All settings of an ablation study, except the part of it that is run."""
 
     truth: TruthConfig = field(default_factory=TruthConfig)
     belief: str = "bluerov2_heavy_ng"
-    """The preset (or YAML file) that networks are pre-trained to; not the true one."""
+    """The preset (or YAML file) on which networks are pre-trained; not the true one."""
     rich: RegimeConfig = field(
         default_factory=lambda: RegimeConfig(maneuvers=("surge-forward",), trajectories=100)
     )
@@ -160,7 +159,7 @@ class StudyConfig:
     size: SizeConfig = field(default_factory=SizeConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     validation: float = 0.15
-    """Share of the trajectories that choose a run's best step; none of them is learned from."""
+    """Share of the trajectories held out of training, on which a run's best step is selected."""
 
     def __post_init__(self) -> None:
         require(0 < self.validation < 1, self, "validation", "give a fraction between 0 and 1")
@@ -179,10 +178,10 @@ class StudyConfig:
 
 
 def from_belief(study: StudyConfig) -> StudyConfig:
-    """The study whose methods start from the belief alone, whose coefficients no data have touched.
+    """The study whose methods start from the belief alone, without a fit of its coefficients.
 
-    They have farther to go: 10/3 of the steps, at a larger rate with less decay, and bandwidths
-    that are fitted anew as they come nearer.
+    The start is farther from the truth, so training takes 10/3 of the steps, a larger learning rate
+    with less decay, and refits of the bandwidths on the way.
     """
     steps = study.size.steps
     size = replace(
@@ -208,7 +207,7 @@ def asked_for(study: StudyConfig) -> str:
 
 
 def scaled(scale: Scale) -> StudyConfig:
-    """The study in full, in small (a look in minutes a run) or tiny (a test of its machinery)."""
+    """The study in full, small (minutes per run) or tiny (a test of the code)."""
     if scale == "full":
         return StudyConfig()
     if scale == "small":

@@ -1,4 +1,4 @@
-"""Figures of a study: the paper's two, and what stands behind them."""
+"""Figures of a study: the paper's two, and supporting ones."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -35,7 +35,7 @@ def color(method: str) -> str:
 
 
 def ordered(methods: Sequence[str]) -> list[str]:
-    """Methods by family, then as they come."""
+    """Methods by family, then in their given order."""
     names = list(dict.fromkeys(methods))
     prefixes = [prefix for prefix, _, _ in _FAMILIES]
 
@@ -47,10 +47,10 @@ def ordered(methods: Sequence[str]) -> list[str]:
 
 @styled
 def results_figure(rows: Sequence[Row]) -> Figure:
-    """Errors and W₂ of every method with the floor, and how many of its runs succeeded.
+    """Errors and W₂ of every method with the floor, and its number of successful runs.
 
-    Small dots are seeds, large ones their mean, bars one standard deviation. Runs that failed have
-    no dot; the share at the left tells of them.
+    Small dots are seeds, large ones their mean, bars one standard deviation. Failed runs have no
+    dot; the labels at the left show the share of successful runs.
     """
     regimes = [r for r in REGIMES if any(row["regime"] == r for row in rows)]
     methods = ordered([row["method"] for row in rows])
@@ -108,7 +108,7 @@ def _dots(ax: Axes, rows: Sequence[Row], methods: Sequence[str], name: str) -> N
 
 @styled
 def distributions_figure(motions: Mapping[str, xr.Dataset], scenario: str) -> Figure:
-    """Where the true and every learned law carry the vehicle, seen from above, at four times."""
+    """Positions under the true and every learned law, seen from above, at four times."""
     methods = ordered(list(motions))
     columns = min(4, len(methods))
     lines = -(-len(methods) // columns)
@@ -129,7 +129,7 @@ def distributions_figure(motions: Mapping[str, xr.Dataset], scenario: str) -> Fi
         ax.set_aspect("equal", adjustable="box")
     for ax in axes.ravel()[len(methods) :]:
         ax.set_visible(False)
-    # the true law alone sets the view, so that one that runs away doesn't shrink the others
+    # limits from the true law alone, so that a diverging law does not shrink the others
     true = np.concatenate(
         [m["position"].sel(scenario=scenario, law="true").to_numpy() for m in motions.values()]
     ).reshape(-1, 3)
@@ -156,7 +156,7 @@ def distributions_figure(motions: Mapping[str, xr.Dataset], scenario: str) -> Fi
 
 @styled
 def horizon_figure(metrics: Mapping[str, xr.Dataset]) -> Figure:
-    """W₂ over the floor's against time, one line a method; means over seeds and scenarios."""
+    """W₂ over that of the floor against time, one line per method; mean over seeds and scenarios."""
     figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
     axes = figure.subplots(1, len(metrics), squeeze=False, sharey=True)[0]
     for ax, (regime, d) in zip(axes, metrics.items(), strict=True):
@@ -181,9 +181,9 @@ def horizon_figure(metrics: Mapping[str, xr.Dataset]) -> Figure:
 
 @styled
 def curves_figure(curves: Mapping[tuple[str, str], list[tuple[np.ndarray, np.ndarray]]]) -> Figure:
-    """Training loss against steps, a panel a method, a line a seed; scales differ by method.
+    """Training loss against steps, a panel per method, a line per seed; scales differ by method.
 
-    Faint is what the steps' batches gave, bold the mean over a tenth of the run.
+    Faint lines are the losses of single batches, bold lines their mean over a tenth of the run.
     """
     methods = ordered([method for _, method in curves])
     columns = min(4, len(methods))
@@ -217,7 +217,7 @@ def _smoothed(step: np.ndarray, loss: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 @styled
 def diffusion_figure(rows: Sequence[Row]) -> Figure:
-    """Learned over true diffusion by axis, one row of panels a regime; the band is ± 20 %."""
+    """Learned over true diffusion by axis, one panel per regime; the band is ± 20 %."""
     regimes = [r for r in REGIMES if any(row["regime"] == r for row in rows)]
     methods = ordered([r["method"] for r in rows if r["success"]])
     figure = Figure(figsize=(WIDTH, 2.8 * len(regimes) + 0.4), layout="constrained")
@@ -249,7 +249,7 @@ def diffusion_figure(rows: Sequence[Row]) -> Figure:
 
 
 def thinned_curve(path: Path, points: int = 150) -> tuple[np.ndarray, np.ndarray] | None:
-    """Steps and loss of a metrics.csv, medians of equal pieces; None where there is no step."""
+    """Steps and loss of a metrics.csv, medians of equal pieces; None without steps."""
     if not path.exists():
         return None
     table = np.genfromtxt(path, delimiter=",", names=True, usecols=("step", "loss"), ndmin=1)

@@ -1,4 +1,4 @@
-"""A learned law against the true one: ten-second motions of every scenario, and the diffusion."""
+"""Comparison of a learned law with the true one: motions of every scenario, and the diffusion."""
 
 from collections.abc import Iterator
 
@@ -118,8 +118,8 @@ def diffusions(
 ) -> dict[str, dict[str, float]]:
     """Diffusion by axis, learned, true and their ratio: medians over these velocities.
 
-    `b_<axis>` is b itself (N√s, N·m√s), where the model has a diagonal one; `noise_<axis>` the size
-    of M⁻¹ b (m/s and rad/s by √s), which the motion tells of directly.
+    `b_<axis>` is b itself (N√s, N·m√s), if the model has a diagonal one; `noise_<axis>` is the norm
+    of the axis' row of M⁻¹ b (m/s/√s and rad/s/√s), which the motion determines directly.
     """
     found = {}
     sides = [_diffusion(m, jnp.asarray(V_WB_B, m.rigid_inertia.dtype)) for m in (model, truth)]
@@ -144,7 +144,7 @@ def _diffusion(model: Dynamics, V: Float[Array, "6 N"]) -> dict[str, Float[Array
 def shown_motions(
     model: Dynamics, study: StudyConfig, regime: Regime, seed: int, substeps: int
 ) -> xr.Dataset | None:
-    """Positions over time from the true and the learned law, for pictures; None without scenario.
+    """Positions over time from the true and the learned law, for figures; None without scenario.
 
     `position` (scenario, law, sample, time, axis) in m; a deterministic law's path is repeated.
     """
@@ -181,7 +181,7 @@ def shown_motions(
 
 
 def check_vehicles(study: StudyConfig) -> None:
-    """Refuse a belief that is the truth, and vehicles that can't be loaded.
+    """Check that the vehicles can be loaded and that the belief is not the truth.
 
     Raises:
         UserError: with field and remedy.

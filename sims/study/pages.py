@@ -1,4 +1,4 @@
-"""The study told: report.html, and ablation.md for the documentation."""
+"""The study's pages: report.html, and ablation.md for the documentation."""
 
 import glob
 import math
@@ -65,10 +65,10 @@ def is_page(path: Path) -> bool:
 
 
 def check_shown(docs: Path) -> None:
-    """Refuse a page whose figures would replace others than those it shows.
+    """Check that a page's figures replace no other files than its own figures.
 
     Raises:
-        UserError: naming such a figure.
+        UserError: naming such a file.
     """
     shown = docs.read_text(encoding="utf-8") if docs.exists() else ""
     for at in sorted(docs.parent.glob(f"{glob.escape(docs.stem)}-*.png")):
@@ -83,10 +83,10 @@ def check_shown(docs: Path) -> None:
 def render(out: str | os.PathLike[str], docs: str | os.PathLike[str] | None = None) -> list[Row]:
     """Write every table, figure and page of the runs in `out`; return the runs.
 
-    Into `out`: table.csv (a row a run), summary.csv (a row a method), rich.nc and sparse.nc (all
-    metrics over scenarios and time), results.png, diffusion.png, training.png,
-    distributions-<scenario>.png, report.html and ablation.md. With `docs`, ablation.md also goes
-    there, with the figures that it shows beside it.
+    Into `out`: table.csv (one row per run), summary.csv (one row per method), rich.nc and sparse.nc
+    (all metrics over scenarios and time), results.png, diffusion.png, training.png,
+    distributions-<scenario>.png, report.html and ablation.md. With `docs`, ablation.md is also
+    written there, with its figures in the same folder.
 
     Raises:
         UserError: there is no finished run, or one is damaged.
@@ -123,7 +123,7 @@ def _settings(out: Path) -> StudyConfig | None:
 
 
 def _distributions(out: Path) -> dict[str, Figure]:
-    """The paper's distributions figure for each scenario shown, on sparse data where there are."""
+    """The paper's distributions figure for each shown scenario, on sparse data if available."""
     for regime in reversed(REGIMES):
         motions: dict[str, xr.Dataset] = {}
         for folder in done_runs(out):
@@ -203,7 +203,7 @@ def _told(rows: Sequence[Row]) -> str:
 
 
 def _command(rows: Sequence[Row], study: StudyConfig | None, docs: str) -> str:
-    """What to type for the same runs."""
+    """The command for the same runs."""
     regimes = [r for r in REGIMES if any(row["regime"] == r for row in rows)]
     methods = list(dict.fromkeys(row["method"] for row in rows))
     words = ["spinndrift study ablation"]
@@ -243,7 +243,7 @@ def ablation_text(
     names: dict[str, str] | None = None,
     docs: str = "ablation.md",
 ) -> str:
-    """A page in docs/ with verdicts, aims and numbers, all computed from the rows."""
+    """A page for docs/ with verdicts, targets and numbers, all computed from the rows."""
     files = {name: f"{name}.png" for name in figures} | (names or {})
     lines = [
         _TITLE,

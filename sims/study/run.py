@@ -30,12 +30,12 @@ STUDY = FolderKind(
         "ablation.md",
     ),
 )
-"""What a study writes beside the folders of its runs."""
+"""Files that a study writes in addition to the folders of its runs."""
 
 
 @dataclass(frozen=True)
 class StudyWork:
-    """What a worker is sent: the study's settings and folder; called with a task, it does it."""
+    """The function sent to workers: the study's settings and folder; a call runs a task."""
 
     study: StudyConfig
     out: str
@@ -55,10 +55,10 @@ def run_study(
     cluster: str | None = None,
     workers: int = 0,
 ) -> list[Failed]:
-    """Do all tasks that are not done yet, and return those that raised.
+    """Run all tasks that are not done yet, and return those that raised.
 
     In this process one by one; with `workers` in as many processes of this machine; with `cluster`
-    on the workers of the scheduler at this address. The settings go into `study.yaml`.
+    on the workers of the scheduler at this address. The settings are written to `study.yaml`.
 
     Raises:
         UserError: settings are wrong, or `out` holds runs of other settings.

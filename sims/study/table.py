@@ -1,4 +1,4 @@
-"""The results of a study as tables: one row a run, one row a method, and all of it as NetCDF."""
+"""The results of a study as tables, one row per run or one row per method, and as NetCDF."""
 
 import csv
 import json
@@ -17,7 +17,7 @@ from ...models.files.netcdf import save_netcdf
 from .config import REGIMES
 
 Row = dict[str, Any]
-"""One run: regime, method, seed, success, …, and numbers by name; NaN where there is none."""
+"""One run: regime, method, seed, success, …, and numbers by name; NaN for missing ones."""
 QUANTITIES = (
     "w2",
     "w2_debiased",
@@ -38,7 +38,7 @@ _TIMES = ("data", "training", "judging")
 
 
 def done_runs(out: str | os.PathLike[str]) -> list[Path]:
-    """Folders of all runs that are done, in a fixed order.
+    """Folders of all finished runs, in a fixed order.
 
     Raises:
         UserError: there is none.
@@ -100,10 +100,10 @@ def numeric(rows: Sequence[Row]) -> list[str]:
 
 
 def summarise(rows: Sequence[Row]) -> list[Row]:
-    """One row a regime and method: runs, how many succeeded, mean and std over those.
+    """One row per regime and method: number of runs, of successful runs, mean and std over those.
 
-    The std is that of a sample (n - 1), NaN for a single run. A method none of whose runs succeeded
-    has no numbers.
+    The std is the sample standard deviation (n - 1), NaN for a single run. A method without a
+    successful run has no numbers.
     """
     found = []
     for regime in REGIMES:

@@ -1,4 +1,4 @@
-"""One task of a study and its folders: whole or absent, never run twice at once, resumable."""
+"""One task of a study and its folders: complete or absent, locked while running, resumable."""
 
 import json
 import os
@@ -22,7 +22,7 @@ SEED = FolderKind("run of a study", ("settings.yaml", "result.json", "metrics.nc
 
 @dataclass(frozen=True)
 class Task:
-    """The runs of one method on one regime for some seeds, which one worker does together."""
+    """The runs of one method on one regime for some seeds, processed together by one worker."""
 
     regime: Regime
     method: str
@@ -33,7 +33,7 @@ class Task:
         return f"{self.regime} {self.method} seed{'s' * (len(self.seeds) > 1)} {seeds}"
 
     def runs(self, study: StudyConfig, out: str | os.PathLike[str]) -> "list[RunPath]":
-        """Where its runs lie.
+        """The paths of its runs.
 
         Raises:
             UserError: there is no such method.
@@ -44,7 +44,7 @@ class Task:
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What decides the numbers of one run; written beside them as settings.yaml."""
+    """All settings that determine the results of one run; stored with them as settings.yaml."""
 
     regime: Regime
     method: str
@@ -89,7 +89,7 @@ def make_tasks(
 
 
 class RunPath:
-    """Where one run lies: `final` once it is done, `partial` until then.
+    """The folders of one run: `final` once it is done, `partial` until then.
 
     `final` holds settings.yaml, result.json, metrics.nc, motions.nc (first seed) and training/.
     """
@@ -103,11 +103,11 @@ class RunPath:
 
     @property
     def done(self) -> bool:
-        """Whether all of the run is there."""
+        """Whether the run is complete."""
         return (self.final / "result.json").exists()
 
     def check(self) -> None:
-        """Refuse what other settings left here, and what this package did not write.
+        """Check that the folders hold no results of other settings and no foreign files.
 
         Raises:
             UserError: naming the folder, and the first setting that differs.
@@ -128,16 +128,16 @@ class RunPath:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep other processes off this run; waits while one that is alive holds it."""
+        """Lock this run against other processes; waits while a live process holds it."""
         self._lock.parent.mkdir(parents=True, exist_ok=True)
         with locked(self._lock, None):
             yield
 
     def begin(self) -> Path:
-        """The folder to work in, with what an interrupted attempt left there.
+        """The working folder, with the files of an interrupted attempt.
 
         Raises:
-            UserError: other settings were at work here.
+            UserError: it holds files of other settings.
         """
         self.check()
         claim(self.partial, SEED)
@@ -163,7 +163,7 @@ def _difference(there: str, here: str) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """JSON knows no NaN: what is not finite becomes null."""
+    """JSON has no NaN: numbers that are not finite become null."""
     if isinstance(value, dict):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""The training stage of a task: every seed's data, start and fit, and whether it went well."""
+"""The training stage of a task: data, initial model and fit of every seed, and their success."""
 
 import time
 from collections.abc import Sequence
@@ -24,12 +24,12 @@ from ...training.fitting.start import starting_model
 from ..progress import Update
 from .task import RunSettings
 
-_DRIFT = 0.2  # of the time, about, for the start that fits the drift alone
+_DRIFT = 0.2  # approximate share of the time for the initial fit of the drift alone
 
 
 @dataclass(frozen=True)
 class Data:
-    """Windows to learn from, and of other trajectories to choose the best step by."""
+    """Training windows, and validation windows of other trajectories to select the best step."""
 
     learn: Windows
     validation: Windows
@@ -37,13 +37,13 @@ class Data:
 
 @dataclass(frozen=True)
 class Trained:
-    """What training ended with.
+    """The result of training.
 
     Attributes:
-        model: the best one on the validation windows; None if training was given up.
-        result: what `fit` returned.
-        failure: why it was given up, or empty.
-        finite: whether it went to its end with finite parameters.
+        model: the best one on the validation windows; None if training failed.
+        result: the result of `fit`.
+        failure: why training failed, or empty.
+        finite: whether training completed with finite parameters.
         converged: whether it is `finite` and the loss `descended`.
         seconds: wall time of the stage (of a resumed run, of the last attempt); runs of one batch
             share it equally.
@@ -58,12 +58,12 @@ class Trained:
 
 
 def descended(loss: np.ndarray, refit_at: tuple[float, ...] = ()) -> bool:
-    """Whether the loss at the end is no higher than at the start, but for its own scatter.
+    """Whether the loss at the end is no higher than at the start, within its scatter.
 
-    Compared are medians of the last and of the first tenth of the steps since the last fraction
+    It compares the medians of the last and of the first tenth of the steps since the last fraction
     of `refit_at` (where bandwidths, and so the loss' scale, changed); the end may be higher by the
-    scatter (median absolute deviation) of that first tenth. Steps that were not finite don't count,
-    unless more than half of them were not.
+    scatter (median absolute deviation) of that first tenth. Steps with a loss that is not finite
+    are left out; if they are more than half, the result is False.
     """
     first = round(max(refit_at, default=0.0) * len(loss))
     kept = loss[first:]
@@ -108,7 +108,7 @@ def train_seeds(
     """Train the runs of one task, several seeds in one batched program
     (`training.fitting.ensemble`).
 
-    Each resumes from the start and the checkpoint in its folder. Starts are made one by one.
+    Each resumes from the initial model and checkpoint in its folder; those are made sequentially.
     """
     belief = load_vehicle(settings[0].study.belief)
     began, count = time.monotonic(), len(settings)
@@ -152,7 +152,7 @@ def _fit(
     metadata: dict[str, Any],
     progress: Progress,
 ) -> list[TrainingResult | str]:
-    """Results, or why training was given up: that a method can't be trained is a finding."""
+    """Results, or why training failed: that a method can't be trained is a result too."""
     if len(runs) > 1:
         configs, models, data, folders = zip(*runs, strict=True)
         try:
@@ -169,7 +169,7 @@ def _fit(
             )
             return [str(end) if isinstance(end, TrainingError) else end for end in found]
         except UserError:
-            pass  # one of them is at fault: the runs one by one tell which
+            pass  # one of them is at fault: run them one by one to find it
     ends: list[TrainingResult | str] = []
     for config, model, windows, folder in runs:
         try:

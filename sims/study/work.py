@@ -1,4 +1,4 @@
-"""What a worker does with one task: data, training, verdict, all on disk in the end."""
+"""A worker's processing of one task: data, training, evaluation, results on disk."""
 
 import time
 from contextlib import ExitStack
@@ -17,7 +17,7 @@ from .judge import judge, shown_motions
 from .task import RunPath, Task
 from .train import Data, Trained, make_data, train_seeds
 
-_DATA, _TRAINING = 0.03, 0.82  # of the time, about, until data and training are done
+_DATA, _TRAINING = 0.03, 0.82  # approximate share of the time until data and training are done
 
 
 def run_task(
@@ -26,22 +26,22 @@ def run_task(
     out: str,
     progress: Update = lambda fraction, remark="", /: None,
 ) -> None:
-    """Do what is left of a task; returns when every run of it has its folder.
+    """Complete a task; returns when every run of it has its folder.
 
-    A run that is done is left alone; an interrupted one goes on from its last checkpoint. Training
-    that fails is a result too.
+    Finished runs are kept; an interrupted one resumes from its last checkpoint. A failed training
+    is a result too.
 
     Raises:
-        UserError: other settings left something in the folders.
+        UserError: the folders hold files of other settings.
     """
-    jax.config.update("jax_enable_x64", True)  # a cluster's worker has no start of its own
+    jax.config.update("jax_enable_x64", True)  # a cluster's worker does not run the CLI's start-up
     keep_compiled()
     runs = [run for run in task.runs(study, out) if not run.done]
     with ExitStack() as stack:
         for run in runs:
             stack.enter_context(run.held())
             run.check()
-        runs = [run for run in runs if not run.done]  # another process may just have been at it
+        runs = [run for run in runs if not run.done]  # another process may have done some
         if not runs:
             return
         began = time.monotonic()
@@ -74,7 +74,7 @@ def _finish(
     seconds: dict[str, float],
     progress: Update,
 ) -> None:
-    """Judge what was learned, write it, and give the folder its name."""
+    """Evaluate the learned model, write the results, and give the folder its final name."""
     settings, began = run.settings, time.monotonic()
     study, substeps = settings.study, settings.training.objective.substeps
     metrics: dict[str, Any] = {}

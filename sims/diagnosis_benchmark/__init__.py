@@ -1,1 +1,1 @@
-"""Checks of what a command promises, on cases whose answer is known."""
+"""The benchmark of `diagnose` on cases with a known answer."""

@@ -1,7 +1,7 @@
-"""Cases whose answer is known: a folder each, with data, sealed answer and the true model's view.
+"""Cases with a known answer: one folder each, with data, the truth and the true model's forecasts.
 
-docs/blind-cases.md describes the form; a case is drawn and simulated by code that shares nothing
-with this package.
+docs/blind-cases.md describes the format; cases are drawn and simulated by code that is independent
+of this package.
 """
 
 import os
@@ -21,20 +21,20 @@ from ...models.effects.unknown import Unknown
 from ...training.diagnosis.findings.result import Verdict
 
 USUAL = "usual"
-"""Data recorded as most cases are."""
+"""Data recorded like those of most cases."""
 Kind = Literal["null", "single", "pair", "triple", "unknown", "fault"]
 
 
 @dataclass(frozen=True)
 class HiddenCause:
-    """One cause that is hidden.
+    """One hidden cause.
 
     Attributes:
         name: of the cause, or `unknown`.
-        where: as a diagnosis says it; empty if that is not judged.
+        where: in the words of a diagnosis; empty if it is not judged.
         parameters: in the definitions and units of the effect of that name; only these are judged.
-        tolerance: share of a parameter by which definitions may differ, before errors count.
-        twins: names that such data can't tell apart from it for physical reasons.
+        tolerance: relative difference of a parameter due to different definitions, not an error.
+        twins: names that are not distinguishable from it on such data for physical reasons.
         variables: of an unknown: inputs that it depends on.
     """
 
@@ -57,20 +57,20 @@ class HiddenCause:
 
 @dataclass(frozen=True)
 class Truth:
-    """`truth.yaml`: what is hidden in a case.
+    """`truth.yaml`: the truth of a case.
 
     Attributes:
-        kind: which table a case belongs to.
-        label: what is counted together; by default the hidden names.
-        size: times a realistic size.
-        data: how they were recorded, where not as usual; such cases are counted apart.
-        verdict: what a diagnosis should say.
-        causes: what is hidden.
-        vehicle: the belief; empty for what the data name.
-        diffusion: that is believed (N√s, N·m√s); empty for none.
-        every: samples of a window of the forecasts in `oracle/`.
-        problems: words of which each must be in what is said about faults of the data.
-        limits: words of which each must be in what is said not to be identifiable.
+        kind: the table that the case belongs to.
+        label: the group in which it is counted; by default the hidden names.
+        size: relative to a realistic size.
+        data: how they were recorded, if not as usual; such cases are counted separately.
+        verdict: the right verdict.
+        causes: the hidden causes.
+        vehicle: the belief; empty for the one that the data name.
+        diffusion: of the belief (N√s, N·m√s); empty for none.
+        every: samples per window of the forecasts in `oracle/`.
+        problems: words that must all be in the reported faults of the data.
+        limits: words that must all be in the reported limits of identifiability.
     """
 
     kind: Kind
@@ -93,7 +93,7 @@ class Truth:
 
     @property
     def called(self) -> str:
-        """What the case is counted under."""
+        """The group in which the case is counted."""
         return self.label or " + ".join(cause.name for cause in self.causes) or self.kind
 
 
@@ -106,7 +106,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Of the folder."""
+        """The name of the folder."""
         return self.folder.name
 
     def __str__(self) -> str:
@@ -114,12 +114,12 @@ class Case:
 
     @property
     def has_oracle(self) -> bool:
-        """Whether there are data that no diagnosis sees, with the true model's forecasts."""
+        """Whether there are held-out data with the true model's forecasts."""
         return (self.folder / "oracle").is_dir() and (self.folder / "fresh").is_dir()
 
 
 def find_cases(folder: str | os.PathLike[str], only: Sequence[str] = ()) -> list[Case]:
-    """The cases in a folder, by name; `only` are patterns of names, or labels.
+    """The cases in a folder, in the order of names; `only` are patterns of names or labels.
 
     Raises:
         UserError: there is none, or a truth can't be read.

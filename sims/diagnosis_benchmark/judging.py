@@ -1,4 +1,4 @@
-"""One case judged: names, parameters, gain against the true model's."""
+"""Judges one case: names, parameters, and gain relative to the true model's."""
 
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -26,21 +26,21 @@ CLOSE = 3.0
 
 @dataclass(frozen=True)
 class Judgement:
-    """How a diagnosis compares with the truth.
+    """Comparison of a diagnosis with the truth.
 
     Attributes:
-        case, kind, label, size, data: which.
-        verdict, verdict_right: what was said, and whether it is so.
-        hidden, named: names, as drawn and as told.
-        first_right: the first name is hidden, or the twin of one that is.
-        declared: it is, or what is hidden is told to be indistinguishable from the first name.
-        place_right: so is the place of the first one; None where it is not judged.
-        recalled, spurious: hidden causes that were named, names that are not hidden.
+        case, kind, label, size, data: of the case.
+        verdict, verdict_right: the verdict, and whether it is right.
+        hidden, named: names of the hidden causes and of the reported ones.
+        first_right: the first reported cause is a hidden one, or a twin of one.
+        declared: `first_right`, or a hidden cause is reported as indistinguishable from the first.
+        place_right: the place of the first cause is right; None if it is not judged.
+        recalled, spurious: numbers of hidden causes that were named and of wrong names.
         z: deviation of each judged parameter in standard errors, by cause and name.
         ratio: found over true value.
         gain: share of the true model's gain over the belief, by part of the state and over `all`
-            (m, rad, m/s and rad/s alike); 1 is as good as the true model.
-        told: whether each fault and limit of the data was told; None where there are none.
+            (m, rad, m/s and rad/s weighted equally); 1 is as good as the true model.
+        told: whether each fault and limit of the data was reported; None if there are none.
         seconds: of the diagnosis.
     """
 
@@ -70,7 +70,7 @@ class Judgement:
 
 
 def fits(hidden: HiddenCause, found: Cause) -> bool:
-    """Whether a named cause is the hidden one or can't be told from it."""
+    """Whether a named cause is the hidden one or one of its twins."""
     if hidden.name == "unknown":
         if found.name != "unknown":
             return False
@@ -80,7 +80,7 @@ def fits(hidden: HiddenCause, found: Cause) -> bool:
 
 
 def compare(truth: Truth, d: Diagnosis) -> dict[str, Any]:
-    """Everything but the gain."""
+    """All fields of a `Judgement` that depend on the truth, except the gain."""
     causes = d.causes
     first = causes[0] if causes else None
     matched = [h for h in truth.causes if first is not None and fits(h, first)]
@@ -101,7 +101,7 @@ def compare(truth: Truth, d: Diagnosis) -> dict[str, Any]:
                 continue
             error = (value.interval95[1] - value.interval95[0]) / 3.92
             if not np.isfinite(error):
-                continue  # said not to be known
+                continue  # reported as not identified
             off = max(abs(value.value - true) - h.tolerance * abs(true), 0.0)
             key = f"{h.name}.{name}"
             z[key] = float(np.copysign(off / max(error, 1e-300), value.value - true))
@@ -130,8 +130,8 @@ def compare(truth: Truth, d: Diagnosis) -> dict[str, Any]:
 def gain_of(case: Case, base: Extended, extended: Extended, vehicle: Vehicle) -> dict[str, float]:
     """1 - |extended - oracle|² / |base - oracle|² over all windows of the fresh runs.
 
-    The recorded noise cancels: forecasts are compared with those of the true model, and all three
-    start from the same records.
+    The recorded noise cancels, because forecasts are compared with those of the true model and all
+    three start from the same records.
     """
     return share_of_gain(case, vehicle, (base, None), (extended, None))
 
@@ -142,7 +142,7 @@ def share_of_gain(
     base: tuple[Extended, Learned | None],
     better: tuple[Extended, Learned | None],
 ) -> dict[str, float]:
-    """The same of models with a learned rest beside them."""
+    """As `gain_of`, for models with a learned residual."""
     fresh = read_csv(case.folder / "fresh", resample=False)
     data = make_data(fresh, vehicle, segment=10**9, remembered=0.0)
     truths = read_oracle(case.folder / "oracle")
@@ -154,7 +154,7 @@ def share_of_gain(
 
 
 def believed(truth: Truth, recording: Recording) -> tuple[Vehicle, Dynamics | None]:
-    """The vehicle that a case believes in, and its law where the case states one."""
+    """The vehicle of a case's belief, and its dynamics if the case states a diffusion."""
     vehicle = load_vehicle(truth.vehicle or recording.vehicle or "bluerov2_heavy")
     if not truth.diffusion:
         return vehicle, None
@@ -178,7 +178,7 @@ def _off(
 
 
 def judge(case: Case, alpha: float, progress: Update) -> tuple[Judgement, Finding]:
-    """Diagnose the data of a case, then open its truth.
+    """Diagnose the data of a case, then compare with its truth.
 
     Raises:
         UserError: the data can't be read.

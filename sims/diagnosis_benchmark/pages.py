@@ -1,4 +1,4 @@
-"""What a check found, as a page of the documentation."""
+"""The results of a benchmark, as a page of the documentation."""
 
 import platform
 from collections.abc import Sequence

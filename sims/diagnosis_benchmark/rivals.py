@@ -1,7 +1,7 @@
-"""Rival methods on the same cases: what they say of them and how much of the gain they get.
+"""Rival methods on the same cases: their terms and their share of the gain.
 
-Each learns what the belief lacks of dν/dt from the same one-step errors, and is judged by the same
-forecasts as the extended model. None of them knows of causes; sparse ones are told by their terms.
+Each learns the belief's error in dν/dt from the same one-step errors, and is judged by the same
+forecasts as the extended model. None of them names causes; sparse ones are reported by their terms.
 
 - `stlsq`: sequentially thresholded least squares (Brunton, Proctor and Kutz 2016) on the smoothed
   derivative of the summed errors, which is SINDy of a discrepancy (Kaheman et al. 2019);
@@ -10,7 +10,7 @@ forecasts as the extended model. None of them knows of causes; sparse ones are t
 
 Sparse regressions choose among constants, ν, |ν|ν, products of ν, the up direction, heading,
 position, thruster forces with those of the step before, their sizes, and their products with the
-water's axial speed, standardised. The threshold is the one that predicts scenarios left out best.
+axial flow speed, standardised. The threshold is the best one on held-out scenarios.
 """
 
 import functools
@@ -37,20 +37,20 @@ from .cases import Case
 from .judging import believed, share_of_gain
 
 THRESHOLDS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0)
-"""Shares of the residual's standard deviation, on standardised features; the last leaves none."""
+"""Shares of the residual's standard deviation, on standardised features; the last keeps none."""
 _SMOOTH = 11
-"""Samples of the smoothing filter before differentiation (pysindy's default)."""
+"""Window (samples) of the smoothing filter before differentiation (pysindy's default)."""
 _TESTED, _HALF = 60, 0.5
-"""Test functions a run, and half of their width (s)."""
+"""Test functions per run, and half of their width (s)."""
 
 
 @dataclass(frozen=True)
 class Rival:
-    """What one rival made of a case.
+    """The result of one rival on a case.
 
     Attributes:
-        gain: share of the true model's gain, as of the extended model; empty without an oracle.
-        terms: of a sparse regression, by axis, largest first; None of others.
+        gain: share of the true model's gain, as for the extended model; empty without an oracle.
+        terms: of a sparse regression, by axis, largest first; None for others.
     """
 
     gain: dict[str, float] = field(default_factory=dict)
@@ -78,7 +78,7 @@ class Sparse(eqx.Module):
     def acceleration(
         self, X: Float[Array, "7 *b"], V: Float[Array, "6 *b"], u: Array, before: Array
     ) -> Float[Array, "6 *b"]:
-        """What is added to dV/dt (m/s², rad/s²)."""
+        """The addition to dV/dt (m/s², rad/s²)."""
         return jnp.tensordot(self.weights.T, terms(self.directions, X, V, u, before), 1)
 
 
@@ -103,7 +103,7 @@ def terms(
 
 
 def labels(thrusters: int) -> list[str]:
-    """What the candidates are called."""
+    """The names of the candidates."""
     numbers = range(1, thrusters + 1)
     found = ["1", *TWIST, *(f"|{v}|{v}" for v in TWIST)]
     found += [f"{TWIST[i]} {TWIST[j]}" for i, j in _PAIRS]
@@ -117,7 +117,7 @@ def labels(thrusters: int) -> list[str]:
 
 
 def pysindy() -> Any:
-    """The library, which only this comparison needs.
+    """The pysindy library, an optional dependency of this comparison.
 
     Raises:
         UserError: it isn't installed.
@@ -133,7 +133,7 @@ def pysindy() -> Any:
 
 
 System = tuple[Float[np.ndarray, "n D"], Float[np.ndarray, "n 6"]]
-"""Rows of candidates and of what they explain, of one piece."""
+"""Rows of candidates and of regression targets, of one run."""
 
 
 def _derivatives(phi: np.ndarray, y: np.ndarray, t: np.ndarray, _: int) -> System:
@@ -142,7 +142,7 @@ def _derivatives(phi: np.ndarray, y: np.ndarray, t: np.ndarray, _: int) -> Syste
 
 
 def _weak(phi: np.ndarray, y: np.ndarray, t: np.ndarray, number: int) -> System:
-    """Integrals against test functions, the same ones on both sides."""
+    """Integrals against the same test functions on both sides of the equation."""
     sindy = pysindy()
     library = sindy.WeakPDELibrary(
         function_library=sindy.PolynomialLibrary(degree=1, include_bias=False),
@@ -150,7 +150,7 @@ def _weak(phi: np.ndarray, y: np.ndarray, t: np.ndarray, number: int) -> System:
         K=_TESTED,
         H_xt=[min(_HALF, (t[-1] - t[0]) / 4)],
     )
-    state = np.random.get_state()  # noqa: NPY002  pysindy places its test functions by this one
+    state = np.random.get_state()  # noqa: NPY002  pysindy draws its test functions from it
     np.random.seed(number)  # noqa: NPY002
     library.fit([phi])
     np.random.set_state(state)  # noqa: NPY002
@@ -163,7 +163,7 @@ _FORMS: dict[str, Callable[..., System]] = {"stlsq": _derivatives, "weak": _weak
 def sparse(
     form: str, errors: Float[np.ndarray, "N 12 R"], data: Data, directions: np.ndarray
 ) -> Sparse:
-    """Regression of what the belief lacks on the candidates, its threshold by cross-validation."""
+    """Regression of the belief's error on the candidates, its threshold by cross-validation."""
     phi = np.asarray(terms(jnp.asarray(directions), *arguments(data)))  # (D, N, R)
     exists = data.weight > 0
     centre, scale = phi[:, exists].mean(axis=1), phi[:, exists].std(axis=1)
@@ -171,21 +171,21 @@ def sparse(
     centre, scale = np.where(constant, 0.0, centre), np.where(constant, 1.0, scale)
     systems = []
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of unlabelled axes, and where no term is left
+        warnings.simplefilter("ignore")  # on unlabelled axes and empty models
         for r in range(len(data.fold)):
             n = int(data.weight[:, r].sum())
             if n <= _SMOOTH:
                 continue
             y = np.concatenate([np.zeros((1, 6)), np.cumsum(errors[:n, 6:, r], axis=0)])
             own = (phi[:, :n, r].T - centre) / scale
-            own = np.concatenate([own, own[-1:]])  # held to the last record
+            own = np.concatenate([own, own[-1:]])  # held until the last record
             systems.append((data.fold[r], *_FORMS[form](own, y, data.times[: n + 1, r], r)))
         weights = _chosen(systems, centre, scale)
     return Sparse(jnp.asarray(directions), jnp.asarray(weights))
 
 
 def _chosen(systems: list[tuple], centre: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Weights (D, 6) on the candidates as they are, each axis with its own best threshold."""
+    """Weights (D, 6) on unstandardised candidates, each axis with its own best threshold."""
     if not systems:
         return np.zeros((len(scale), 6))
     folds = np.concatenate([np.full(len(P), f) for f, P, _ in systems])
@@ -208,7 +208,7 @@ def _chosen(systems: list[tuple], centre: np.ndarray, scale: np.ndarray) -> np.n
 
 
 def _stlsq(P: np.ndarray, y: np.ndarray, threshold: float) -> np.ndarray:
-    """On P = Q R as on R: least squares and ridge see the rows by their products alone."""
+    """STLSQ on R of P = Q R: least squares and ridge depend on PᵀP and Pᵀy alone."""
     Q, P = np.linalg.qr(P)
     y = Q.T @ y / np.sqrt(len(Q))
     P = P / np.sqrt(len(Q))
@@ -222,7 +222,7 @@ def compete(case: Case) -> dict[str, Rival]:
     """All rivals on one case.
 
     Raises:
-        UserError: the data can't be read, or pysindy is not there.
+        UserError: the data can't be read, or pysindy is not installed.
     """
     pysindy()
     recording = read_csv(case.folder / "data", resample=False)

@@ -1,4 +1,4 @@
-"""All cases of a folder, one after the other or spread over processes; what is done stays done."""
+"""All cases of a folder, sequentially or distributed over processes; finished ones are kept."""
 
 import json
 import os
@@ -21,17 +21,17 @@ from .rivals import compete, pysindy
 
 _DONE, _RIVALS = "judged.json", "rivals.json"
 CHECK = FolderKind("check", ("diagnosis.md",), edited=("diagnosis.md",))
-"""What a check writes beside the folders of its cases."""
+"""Files that a check writes in addition to the folders of its cases."""
 _CASE = FolderKind("judged case", ("diagnosis.json", _DONE, _RIVALS))
 
 
 @dataclass(frozen=True)
 class JudgeCase:
-    """What is left to do of a case, on disk in the end.
+    """The remaining work on a case; results are written to disk.
 
     A case has a folder in `out` with `diagnosis.json` and `judged.json`; the second is written
-    last, so an interrupted case is done again. With `rivals` other methods are judged on the same
-    files (`rivals.json`); what is there already is kept.
+    last, so an interrupted case is repeated. With `rivals` other methods are judged on the same
+    files (`rivals.json`); existing results are kept.
     """
 
     out: str
@@ -50,7 +50,7 @@ class JudgeCase:
         Raises:
             UserError: the case can't be read.
         """
-        jax.config.update("jax_enable_x64", True)  # a cluster's worker has no start of its own
+        jax.config.update("jax_enable_x64", True)  # a worker does not run the CLI's start-up
         keep_compiled()
         give_back_programs()
         folder = Path(self.out) / case.name
@@ -74,19 +74,19 @@ def run_cases(
     rivals: bool = False,
     workers: int = 0,
 ) -> tuple[list[dict[str, Any]], list[Failed]]:
-    """Diagnose and judge the cases that are not judged yet; all judgements, and who raised.
+    """Diagnose and judge the cases that are not judged yet; all judgements, and failed cases.
 
     In this process one by one, or with `workers` in as many processes of this machine. `rivals` in
-    a judgement has theirs, if there are any.
+    a judgement has the rivals' results, if there are any.
 
     Raises:
-        UserError: a case can't be read, or was judged with another alpha; pysindy is not there.
+        UserError: a case can't be read, or was judged with another alpha; pysindy is not installed.
     """
     check_workers(None, workers)
     if rivals:
-        pysindy()  # now, not after the first case
+        pysindy()  # fails now, not after the first case
     work = JudgeCase(str(Path(out).absolute()), alpha, rivals)
-    for case in cases:  # what is in the way: now, not after the last case
+    for case in cases:  # fails on foreign files now, not after the last case
         check_folder(Path(work.out) / case.name, _CASE)
         _judgement(work, case)
     left = [case for case in cases if any(work.left(case))]
@@ -99,7 +99,7 @@ def run_cases(
 
 
 def _judgement(work: JudgeCase, case: Case) -> dict[str, Any] | None:
-    """What is on disk of a case."""
+    """The stored judgement of a case, if any."""
     at = Path(work.out) / case.name / _DONE
     if not at.exists():
         return None
@@ -123,7 +123,7 @@ def read_judgement(path: Path) -> dict[str, Any]:
     """A judgement as written.
 
     Raises:
-        UserError: the file is no such thing.
+        UserError: the file is not a judgement.
     """
     try:
         row = json.loads(path.read_text(encoding="utf-8"))

@@ -27,10 +27,10 @@ class Ekf(LeafSystem):
     if a sensor reads faster) it predicts over the new samples, fuses DVL, depth and compass
     `config.horizon` in the past in the order of their times of validity
     (`systems.estimation.delayed`), and predicts the present state with the buffered samples. The
-    order and frame of the error are those of
-    `systems.estimation.error_state`: `covariance` is the 18 × 18 matrix by rows, whose first six
-    rows and columns belong to [δp, δθ] in body axes. Horizontal position is dead reckoning: its
-    variance grows. `status` has the components `STATUS`, `health` those of `HEALTH`.
+    order and frame of the error are those of `systems.estimation.error_state`: `covariance` is the
+    18 × 18 matrix by rows, whose first six rows and columns belong to [δp, δθ] in body axes.
+    Horizontal position is dead reckoning: its variance grows. `status` has the components
+    `STATUS`, `health` those of `HEALTH`.
 
     The estimate starts at the given pose and twist. With `initial_noise` connected (a simulation)
     it starts with an error drawn from `config`'s standard deviations: δp, δθ, δv.

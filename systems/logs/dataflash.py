@@ -1,7 +1,7 @@
-"""ArduPilot DataFlash (.BIN) into arrays: one pass over the record heads, then NumPy decodes.
+"""Reads ArduPilot DataFlash (.BIN) into arrays: one pass over the headers, then NumPy decodes.
 
-A file of 44 MB takes about a second, where pymavlink's reader needs half a minute. Names, widths
-and field types of the records come from the file's own FMT records (ArduPilot, AP_Logger).
+A file of 44 MB takes about a second; pymavlink's reader takes half a minute. Names, widths and
+field types of the records come from the file's own FMT records (ArduPilot, AP_Logger).
 """
 
 from collections.abc import Collection, Mapping

@@ -125,7 +125,7 @@ def _primary_core(tables: Mapping[str, Table]) -> int:
 
 
 def _of(table: Table, column: str, value: int) -> Table:
-    """Rows of one instance, or of the first if it is absent; all if there is no such column."""
+    """Rows of one instance, or of the first if it is absent; all if the log has no such column."""
     if column not in table:
         return table
     rows = table[column] == value

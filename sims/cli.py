@@ -47,9 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 @contextmanager
 def _interrupted_between_imports(home: FrameType) -> Iterator[None]:
-    """Let Ctrl-C wait until an import is done: extension modules swallow it or raise another.
+    """Defer Ctrl-C until an import is done: extension modules swallow it or raise another error.
 
-    `home` is the frame below which imports count.
+    `home` is the outermost frame that is searched for imports.
     """
     again: threading.Timer | None = None
 
@@ -88,7 +88,7 @@ def _run(given: list[str]) -> None:
     if given == ["--version"]:
         from importlib.metadata import version
 
-        print(version("spinndrift"))  # noqa: T201 - the answer asked for
+        print(version("spinndrift"))  # noqa: T201 - the output of `--version`
         return
     command = _parsed(given)
     import jax
@@ -99,9 +99,9 @@ def _run(given: list[str]) -> None:
     check_options(command)
     keep_compiled()
     jax.config.update("jax_enable_x64", True)
-    # Small programs then run in line: a call from a diagram costs 10 µs instead of up to 40.
+    # Small programs then run inline: a call from a diagram costs 10 µs instead of up to 40.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
-    place = getattr(command, "place", nullcontext)  # those without choose a name as they run
+    place = getattr(command, "place", nullcontext)  # the others choose a folder in `run`
     with place():
         command.run()
 

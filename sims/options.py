@@ -1,4 +1,4 @@
-"""Numbers among the options of a command, checked in one place before anything is computed."""
+"""Checks of a command's numeric options, before anything is computed."""
 
 import dataclasses
 import itertools
@@ -14,7 +14,7 @@ _KINDS = {"FLOAT": "a number", "INT": "a whole number"}
 
 
 def check_options(command: Any) -> None:
-    """Refuse numbers of a command's options that are not finite, or beyond what the option takes.
+    """Check that the numbers of a command's options are finite and in the option's range.
 
     Raises:
         UserError: naming option, value and remedy.
@@ -40,9 +40,9 @@ def check_options(command: Any) -> None:
 
 
 def misread(given: Sequence[str], told: str) -> str:
-    """One sentence of what the parser of options told about what was given."""
+    """One sentence from the option parser's error message `told` for the arguments `given`."""
     lines = _inside(told)
-    lines = [re.sub(r" \(applied to [^)]*\)", "", line) for line in lines]  # it stands in `see`
+    lines = [re.sub(r" \(applied to [^)]*\)", "", line) for line in lines]  # `see` has it
     text = " ".join(lines).replace("{None}|", "")
     command = given[0] if given and not given[0].startswith("-") else "COMMAND"
     see = f"see spinndrift {command} --help"
@@ -64,6 +64,6 @@ def misread(given: Sequence[str], told: str) -> str:
 
 
 def _inside(told: str) -> list[str]:
-    """Lines of a message without the box around it, whose sides may lack; empty for its rules."""
+    """Lines of a message without the box around it, whose sides may be missing; rules are empty."""
     plain = [re.sub(r"^\s*[│|+╭╰]?\s*|\s*[│|+╮╯]?\s*$", "", line) for line in told.splitlines()]
     return ["" if re.search(r"[─-]{4}$", line) else line for line in plain]

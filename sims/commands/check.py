@@ -1,4 +1,4 @@
-"""`spinndrift check`: promises of this package, on cases whose answer is known."""
+"""`spinndrift check`: the accuracy of this package on cases with a known answer."""
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -16,10 +16,10 @@ from .check_estimator import CheckEstimator
 
 @dataclass(frozen=True)
 class CheckDiagnosis:
-    """Diagnose cases of hidden effects, judge what was said by the sealed answers, tell the result.
+    """Diagnose cases of hidden effects, compare with the hidden answers, report the result.
 
-    A case is a folder with CSV data and the answer; docs/blind-cases.md describes the form. Each is
-    judged once: the same command goes on where it was interrupted.
+    A case is a folder with CSV data and the answer; docs/blind-cases.md describes the format. Each
+    is judged once: the same command resumes an interrupted check.
     """
 
     cases: Path = Path("runs/blind")
@@ -27,14 +27,14 @@ class CheckDiagnosis:
     only: tuple[str, ...] = ()
     """Patterns of the names of cases or of causes to take (`'lag-*' net_buoyancy`)."""
     alpha: Annotated[float, RATE_OF_ALARMS] = 0.01
-    """Rate of false alarms that is promised."""
+    """Rate of false alarms of the diagnosis."""
     workers: Annotated[int, WORKERS] = 0
-    """Worker processes on this machine; 0 judges all cases in this one."""
+    """Worker processes on this machine; 0 judges all cases in this process."""
     rivals: bool = False
     """Judge sparse regression (pysindy: STLSQ and weak form) and random features on the same files
     too."""
     out: Path = Path("runs/check")
-    """Folder for what was found in each case."""
+    """Folder for the results of each case."""
     docs: Path | None = None
     """Markdown file to write the tables into, such as docs/diagnosis.md."""
 
@@ -52,7 +52,7 @@ class CheckDiagnosis:
             yield
 
     def run(self) -> None:
-        """Diagnose, judge, tell."""
+        """Diagnose, judge, report."""
         from ..diagnosis_benchmark.cases import find_cases
         from ..diagnosis_benchmark.pages import write_page
         from ..diagnosis_benchmark.run import run_cases
@@ -79,7 +79,7 @@ class CheckDiagnosis:
 
 @dataclass(frozen=True)
 class Check:
-    """Measure what this package promises, on cases whose answer is known."""
+    """Measure the accuracy of this package on cases with a known answer."""
 
     EXAMPLES: ClassVar = (
         "spinndrift check estimator --only calm --runs 2 --seconds 10",
@@ -97,5 +97,5 @@ class Check:
         return self.what.place()
 
     def run(self) -> None:
-        """Measure, judge, tell."""
+        """Measure, judge, report."""
         self.what.run()

@@ -1,4 +1,4 @@
-"""`spinndrift check estimator`: is the filter's covariance right, also when sensors fail?"""
+"""`spinndrift check estimator`: consistency of the filter, with and without sensor faults."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -16,31 +16,30 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CheckEstimator:
-    """Fly many seeds of several waters, plants and starts, and of every fault of the sensors.
+    """Simulate many seeds of several waters, plants and starts, and of every fault of the sensors.
 
-    The first tables compare errors and innovations with the covariance that the filter claims (NEES
-    and NIS with their bounds), the last one tells what it makes of failing sensors. Each setting is
-    flown once: the same command goes on where it was interrupted. docs/estimator.md explains the
-    tables.
+    The first tables compare errors and innovations with the filter's covariance (NEES and NIS with
+    their bounds), the last one shows the effect of sensor faults. Each setting is simulated once:
+    the same command resumes an interrupted check. docs/estimator.md explains the tables.
     """
 
     only: tuple[str, ...] = ()
-    """Patterns of the names of settings to fly (`calm 'dvl_*'`), or `consistency` or `faults` for
+    """Patterns of the names of settings to simulate (`calm 'dvl_*'`), `consistency` or `faults` for
     all of one kind; by default both."""
     runs: Annotated[int, Within(1, 10_000)] = 60
     """Runs of each setting with healthy sensors."""
     seconds: Annotated[float, Within(1, 86400)] = 60.0
-    """Time of each of these runs."""
+    """Duration of each of these runs (s)."""
     fault_runs: Annotated[int, Within(1, 10_000)] = 50
     """Runs of each fault."""
     fault_seconds: Annotated[float, Within(1, 86400)] = 30.0
-    """Time of each of these runs; the fault begins after a third of it."""
+    """Duration of each of these runs (s); the fault begins after a third of it."""
     model: Path | None = None
-    """Learned model (.spinn) to fly as the plant; by default the demo's, which is trained first."""
+    """Learned model (.spinn) of the plant; by default the demo's, which is trained first."""
     workers: Annotated[int, WORKERS] = 0
-    """Worker processes on this machine; 0 flies all settings in this one."""
+    """Worker processes on this machine; 0 simulates all settings in this process."""
     out: Path = Path("runs/estimator")
-    """Folder for what was found in each setting."""
+    """Folder for the results of each setting."""
     docs: Path | None = None
     """Markdown file to write the tables into, such as docs/estimator.md."""
 
@@ -58,7 +57,7 @@ class CheckEstimator:
             yield
 
     def run(self) -> None:
-        """Fly, judge, tell."""
+        """Simulate, judge, report."""
         from ..diagnosis_benchmark.tables import print_tables
         from ..estimator_check.pages import page_text
         from ..estimator_check.run import run_settings
@@ -89,7 +88,7 @@ class CheckEstimator:
             raise UserError(f"--docs {self.docs}: end the name in .md")
 
     def _settings(self) -> list["Setting"]:
-        """What is to be flown; the model is trained first if one is needed and none is named."""
+        """The settings to simulate; the model is trained first if it is needed but not given."""
         from ..cores import share_cores
         from ..estimator_check.model import demo_model
         from ..estimator_check.settings import (

@@ -1,4 +1,4 @@
-"""`spinndrift demo`: the main job from end to end."""
+"""`spinndrift demo`: from a log to a closed-loop dive with the learned model."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,11 +9,11 @@ from ...models.config.checks import COUNT
 
 @dataclass(frozen=True)
 class Demo:
-    """A log goes in, a learned vehicle comes out and flies a closed-loop dive.
+    """Learn a vehicle from a log and run a closed-loop dive with the learned model.
 
-    Imports the log, trains a SPINN from a preset, compares both on the part of the log that was
-    held out, flies the pylon crossing with MPPI on the learned model, and tells it all in one
-    report.html. An interrupted demo goes on where it was.
+    Imports the log, trains a SPINN from a preset, compares both on the held-out part of the log,
+    simulates the pylon crossing with MPPI on the learned model, and writes one report.html. The
+    same command resumes an interrupted demo.
     """
 
     EXAMPLES: ClassVar = (
@@ -22,17 +22,16 @@ class Demo:
     )
 
     log: Path | None = None
-    """Your own log (.tlog, .BIN), recording (.nc) or CSV folder; by default the one that comes
-    along."""
+    """Your own log (.tlog, .BIN), recording (.nc) or CSV folder; by default the shipped log."""
     out: Path | None = None
-    """Folder for everything that is made; by default runs/demo, or runs/demo-2 and so on where that
-    holds something else."""
+    """Folder for all results; by default runs/demo, or runs/demo-2 and so on if that holds
+    something else."""
     vehicle: str | None = None
     """Preset name or YAML file to start from; by default what the data name, or bluerov2_heavy."""
     scenario: str = "pylon_crossing_calm"
-    """The dive to fly: a shipped scenario's name or a YAML file."""
+    """Scenario of the dive: a shipped scenario's name or a YAML file."""
     steps: Annotated[int | None, COUNT] = None
-    """Training steps, for a shorter or a longer look."""
+    """Training steps, for a shorter or a longer demo."""
 
     def run(self) -> None:
         """Run the demo and print its summary."""

@@ -1,4 +1,4 @@
-"""`spinndrift diagnose`: what a simulation gets wrong, by name."""
+"""`spinndrift diagnose`: the causes of a simulation's errors, by name."""
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ DIAGNOSIS = FolderKind(
 )
 _USUAL = "bluerov2_heavy"
 _STATE_VEHICLES = (".nc", ".nc4", ".h5", ".yaml", ".yml")
-"""Endings of files that can state their vehicle; logs can't."""
+"""Suffixes of files that can state their vehicle; logs can't."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Diagnose:
     """Model file (.spinn) to believe instead of the preset."""
     diffusion: Annotated[Vector6 | None, Within(0, 1e6)] = None
     """Disturbance that is believed with a preset: b of surge, sway, heave (N√s), roll, pitch, yaw
-    (N·m√s). Without it a level other than believed can't be told."""
+    (N·m√s). Without it a wrong level of the disturbance can't be found."""
     alpha: Annotated[float, RATE_OF_ALARMS] = 0.01
     """Rate of false alarms over all names together."""
     refit: Literal["auto", "none", "scales", "linear", "command", "all"] = "auto"
@@ -50,9 +50,9 @@ class Diagnose:
     (`scales`), added mass, drag and buoyancy (`linear`), drag, buoyancy and the scale of each axis'
     command, where commands pass through gains that are not known (`command`), or all of a grey box
     (these, the thrusters' curve, dead band and levers, restoring moment), for a belief that is
-    wrong in most of them. `auto` fits none, and all where that tells clearly more than names."""
+    wrong in most of them. `auto` fits none, or all if that explains clearly more than names."""
     water_density: Annotated[float | None, WATER_DENSITY] = None
-    """kg/m³, where a log's autopilot took the sea for fresh water (as of `spinndrift import`)."""
+    """kg/m³, if a log's autopilot assumed fresh water in the sea (as in `spinndrift import`)."""
     out: Path = Path("diagnosis")
     """Folder to write."""
 
@@ -79,7 +79,7 @@ class Diagnose:
         base, metadata = (None, {}) if self.model is None else load_model(self.model, dtype=float)
         named = metadata.get("vehicle")
         if self.vehicle is not None:
-            load_vehicle(self.vehicle)  # now, not after the data are read
+            load_vehicle(self.vehicle)  # fails now, not after the data are read
         with progress_bar(f"reading {self.data.name}") as update:
             recording = load_data(
                 self.data,
@@ -109,18 +109,18 @@ class Diagnose:
         shown.print(finding.diagnosis.sentence)
         for cause in finding.diagnosis.causes:
             told = ", ".join(f"{k} {v.value:.4g} {v.unit}" for k, v in cause.parameters.items())
-            if cause.structure is not None:  # its coefficients stand in diagnosis.json
+            if cause.structure is not None:  # its coefficients are in diagnosis.json
                 told = cause.structure.description
             shown.print(f"  {cause.name} ({cause.where}): {told}")
         shown.print(f"wrote {self.out}")
 
     def _check(self) -> None:
-        """Refuse options that can't be meant, before anything is read."""
+        """Check for contradicting options, before anything is read."""
         if self.diffusion is not None and self.model is not None:
             raise UserError("--diffusion: the model of --model has its own; leave one out")
 
     def _vehicle(self, recorded: str, named: str | None) -> str:
-        """The vehicle given, that the data state or a model names; or the usual, which is told."""
+        """The vehicle given, or that of the data or the model; else the default, with a message."""
         stated = self.vehicle or ("" if self._is_log() else recorded) or named
         if not stated:
             told = f"{self.data.name} states no vehicle, so {_USUAL} is assumed; name another with "

@@ -1,4 +1,4 @@
-"""`spinndrift evaluate`: a model against data it has not seen."""
+"""`spinndrift evaluate`: errors of a model on data that it was not trained on."""
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class Evaluate:
     """Compare a learned model and the preset it came from with data.
 
     Prints errors, coverage of the 50 % and 90 % bands and energy scores over all horizons, and
-    writes them against the horizon. All of DATA is used: give data that training has not seen.
+    writes them against the horizon. All of DATA is used: give data not used in training.
     """
 
     EXAMPLES: ClassVar = (
@@ -32,7 +32,7 @@ class Evaluate:
     out: Path | None = None
     """File for the results: .csv (tidy), .json (overall) or .nc."""
     length: Annotated[float, SECONDS] = 4.0
-    """Seconds of each window."""
+    """Length of each window (s)."""
     vehicle: str | None = None
     """Preset name or YAML file to compare with; by default what the model names."""
 

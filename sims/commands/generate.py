@@ -14,10 +14,10 @@ from ..progress import console, progress_bar
 
 @dataclass(frozen=True)
 class Settings(GenerateConfig):
-    """What to simulate."""
+    """Settings of the simulation."""
 
     def __post_init__(self) -> None:
-        """Leave it to `sims.options`, which names options as they are given."""
+        """No checks here: `sims.options` does them and names the options as they are given."""
 
 
 @dataclass(frozen=True)

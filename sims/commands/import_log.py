@@ -1,4 +1,4 @@
-"""`spinndrift import`: a log or a CSV folder becomes a Recording."""
+"""`spinndrift import`: a log or a CSV folder to a Recording."""
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from ..progress import console, progress_bar
 
 @dataclass(frozen=True)
 class Import:
-    """Turn a log into a Recording that every other command takes.
+    """Convert a log to a Recording, the input of the other commands.
 
     Reads ArduPilot DataFlash logs (.BIN), MAVLink telemetry logs (.tlog), both also as .gz or .xz,
     and folders of CSV files (docs/recording.md). Clocks are aligned, everything is resampled to one
@@ -31,20 +31,20 @@ class Import:
     out: Path | None = None
     """File to write (.nc); by default the log's name in the current folder."""
     rate: Annotated[float, Within(1, 400)] = 20.0
-    """Samples a second."""
+    """Samples per second."""
     vehicle: str | None = None
     """Preset name or YAML file of the vehicle; by default what the data name, or bluerov2_heavy."""
 
     minimum: Annotated[float, Within(0.5, 3600)] = 5.0
     """Shortest stretch of a log that is kept (s)."""
     gap: Annotated[float, Within(0.01, 60)] = 0.5
-    """Longest pause between samples of one of a log's signals (s); a longer one parts a stretch."""
+    """Longest pause between samples of one of a log's signals (s); a longer one ends a stretch."""
     water_density: Annotated[float | None, WATER_DENSITY] = None
-    """kg/m³, where a log's autopilot took the sea for fresh water: corrects depth and climb."""
+    """kg/m³, if a log's autopilot assumed fresh water in the sea: corrects depth and climb."""
     disarmed: Annotated[bool, FlagCreatePairsOff] = False
     """Keep a log's disarmed stretches too."""
     system: Annotated[int | None, Within(1, 255)] = None
-    """MAVLink system id, where a log holds several autopilots."""
+    """MAVLink system id, if a log holds several autopilots."""
 
     def place(self) -> AbstractContextManager[Path]:
         """Hold what is to be written."""
@@ -76,7 +76,7 @@ class Import:
 
 
 def stem(path: Path) -> str:
-    """A file's name without the endings of its format and compression."""
+    """A file's name without the suffixes of its format and compression."""
     name = path.name
     for ending in (".xz", ".gz"):
         name = name.removesuffix(ending)

@@ -1,4 +1,4 @@
-"""`spinndrift run`: a scenario is flown in closed loop."""
+"""`spinndrift run`: the closed-loop simulation of a scenario."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,18 +12,18 @@ from ..progress import console, progress_bar, tell_code
 
 @dataclass(frozen=True)
 class Run:
-    """Fly a scenario: plant, water, sensors, filter, planner and controller in one loop.
+    """Simulate a scenario: plant, water, sensors, filter, planner and controller in closed loop.
 
-    SCENARIO is the path of a YAML file, or the name of a scenario that is shipped: station_keeping,
+    SCENARIO is the path of a YAML file, or the name of a shipped scenario: station_keeping,
     trajectory_tracking or pylon_crossing, each with the ending _calm or _harbour.
 
-    Writes a folder: report.html (look at this first), meshcat.html (3-D replay), log.nc (a
-    Recording of all that happened), metrics.json, and scenario.yaml with every default written out,
-    which can be changed and run again. The same scenario and seed give the same run. After Ctrl-C
-    the folder holds what was flown until then.
+    Writes a folder: report.html (read this first), meshcat.html (3-D replay), log.nc (a Recording
+    of the run), metrics.json, and scenario.yaml with every default written out, which can be
+    changed and run again. The same scenario and seed give the same run. After Ctrl-C the folder
+    holds the run up to then.
 
-    A scenario with !Own or !OwnFilter runs the Python code that it names, which is said before:
-    look at that code first if the file comes from elsewhere.
+    A scenario with !Own or !OwnFilter runs the Python code that it names, which is printed before:
+    review that code first if the file is not your own.
     """
 
     EXAMPLES: ClassVar = (
@@ -38,12 +38,12 @@ class Run:
     out: Path | None = None
     """Folder to write, which must not exist yet; by default runs/<name>-<seed>."""
     scenario_text: str = ""
-    """YAML laid over the scenario, such as 'station: {disturbance_set: calm}'."""
+    """YAML that overrides the scenario, such as 'station: {disturbance_set: calm}'."""
     model: Path | None = None
-    """Learned model (.spinn) for the planner; by default what the scenario says."""
+    """Learned model (.spinn) for the planner; by default that of the scenario."""
     engine: Literal["auto", "drake", "compiled"] = "auto"
-    """Who steps the diagram: Drake, or one compiled loop, which is faster but needs systems that
-    tell what they compute (no planner, no system of one's own without `pure`)."""
+    """Engine that steps the diagram: Drake, or one compiled loop, which is faster but needs systems
+    with pure functions (no planner, no user-defined system without `pure`)."""
     duration: Annotated[float | None, SECONDS] = None
     """Longest simulated time (s); by default that of the scenario."""
     report: bool = True

@@ -1,4 +1,4 @@
-"""`spinndrift study`: the paper's simulation study, rerun."""
+"""`spinndrift study`: the paper's simulation study, reproduced."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,10 +15,10 @@ from ..progress import console, progress_bar
 
 @dataclass(frozen=True)
 class Study:
-    """Train every method on simulated data of a known law, compare what they learned with it.
+    """Train every method on simulated data of a known law, and compare the learned laws with it.
 
-    Each run (method, seed) has its folder under `--out` and is done once: the same command goes on
-    where it was interrupted, and more seeds or methods are added to what is there. In the end
+    Each run (method, seed) has its folder under `--out` and is done once: the same command resumes
+    an interrupted study, and more seeds or methods are added to finished runs. At the end
     report.html, ablation.md, figures and tables are written from all runs found.
     """
 
@@ -37,23 +37,23 @@ class Study:
     methods: tuple[str, ...] = ()
     """Methods to train, by name; by default all."""
     scale: Literal["full", "small", "tiny"] = "full"
-    """How much of everything: `full` as in the paper, `small` for a look, `tiny` for a test."""
+    """Size of the study: `full` as in the paper, `small` for a first result, `tiny` for a test."""
     start: Literal["fit", "belief"] = "fit"
-    """Where training starts: at the most likely constants of the data (`fit`), or, with more steps,
-    at a wrong `belief`, as in the paper: then the objective has to find everything."""
+    """Start of training: the maximum-likelihood constants of the data (`fit`), or, with more steps,
+    a wrong `belief`, as in the paper: the objective alone then fits all coefficients."""
     config: Path | None = None
-    """Settings of the study (YAML) in place of `--scale` and `--start`; `study.yaml` in `--out`
-    shows all."""
+    """Settings of the study (YAML) instead of `--scale` and `--start`; `study.yaml` in `--out`
+    has all of them."""
     out: Path = Path("runs/ablation")
     """Folder of all runs, tables and pages."""
     workers: Annotated[int, WORKERS] = 0
-    """Worker processes on this machine; 0 runs all in this one."""
+    """Worker processes on this machine; 0 runs all in this process."""
     cluster: str | None = None
     """Address of a Dask scheduler (tcp://host:port) whose workers see `--out` too."""
     together: Annotated[int, Within(1, 10_000)] = 1
     """Seeds that one task trains."""
     docs: Path | None = None
-    """Markdown file to write the verdicts into as well, such as docs/ablation.md."""
+    """Markdown file that also receives the verdicts, such as docs/ablation.md."""
     render_only: Annotated[
         bool, FlagCreatePairsOff, arg(help="Run nothing, write tables and pages anew.")
     ] = False
@@ -73,7 +73,7 @@ class Study:
             yield
 
     def run(self) -> None:
-        """Train, judge, tell."""
+        """Train, judge, report."""
         from ...models.config.typed_yaml import load
         from ...training.methods import METHODS
         from ..cores import share_cores

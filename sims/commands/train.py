@@ -16,9 +16,9 @@ from ..progress import console, progress_bar
 class Train:
     """Learn a stochastic model of a vehicle from data, starting at a preset or another model.
 
-    The last part of the data (or whole runs, where a scenario has several) is held out; the
-    summary and report.html compare preset and learned model on it. Ctrl-C leaves a checkpoint;
-    the same command with `--resume` goes on to the same bits.
+    The last part of the data (or whole runs, if a scenario has several) is held out; the summary
+    and report.html compare preset and learned model on it. Ctrl-C leaves a checkpoint; the same
+    command with `--resume` continues to a bit-identical result.
     """
 
     EXAMPLES: ClassVar = (
@@ -33,21 +33,21 @@ class Train:
     method: str | None = None
     """Method of training by name: fdm-geodesic, fdm-chordal, moments (each also with +mse), pinn;
     baselines in position and Euler angles: euclidean-fdm, euclidean-moments,
-    euclidean-distance-aware, euclidean-unconstrained. By default what `--config` says, else
+    euclidean-distance-aware, euclidean-unconstrained. By default that of `--config`, else
     fdm-geodesic+mse."""
     config: Path | None = None
-    """Training settings (YAML); the run's own config.yaml shows all of them with their defaults.
-    With `--method` they are laid over the method's, and may not contradict what makes it."""
+    """Training settings (YAML); the run's own config.yaml has all of them with their defaults. With
+    `--method` they override the method's, but may not contradict those that define it."""
     vehicle: str | None = None
     """Preset name or YAML file to start from; by default what the data name."""
     model: Path | None = None
-    """Model file (.spinn) to start from in place of the preset: what `spinndrift diagnose` wrote as
-    extended/model.spinn, whose effects stay as they are while a SPINN learns the rest, or a trained
-    model, which is trained on. Of a trained one the architecture stays."""
+    """Model file (.spinn) to start from instead of the preset: extended/model.spinn of `spinndrift
+    diagnose`, whose effects stay fixed while a SPINN learns the rest, or a trained model, whose
+    training is continued with its architecture."""
     steps: Annotated[int | None, COUNT] = None
-    """Number of training steps, instead of the settings' own."""
+    """Number of training steps, instead of that of the settings."""
     seed: Annotated[int | None, SEED] = None
-    """Seed of the start and of all noise, instead of the settings' own."""
+    """Seed of the initial networks and of all noise, instead of that of the settings."""
     resume: bool = False
     """Continue the run in `--out`."""
 
@@ -83,7 +83,7 @@ class Train:
                 "another folder"
             )
         if self.vehicle is not None:
-            load_vehicle(self.vehicle)  # now, not after the data are read
+            load_vehicle(self.vehicle)  # fails now, not after the data are read
         start, metadata = (None, {}) if self.model is None else Start.read(self.model)
         with progress_bar(f"reading {self.data.name}") as update:
             recording = load_data(self.data, vehicle=self.vehicle, progress=update)

@@ -1,1 +1,1 @@
-"""Whether the estimator's covariance is right, and what it makes of failing sensors."""
+"""The check of the estimator: consistency of its covariance, and its response to sensor faults."""

@@ -1,4 +1,4 @@
-"""The learned model that the check flies if none is named: the demo's."""
+"""The default learned model of the check: the demo's."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from ..progress import Update
 
 
 def demo_model(folder: Path, progress: Update) -> Path:
-    """The path of the model, which is trained in `folder` unless it is there.
+    """The path of the model, which is trained in `folder` unless it exists.
 
     Raises:
         UserError: the folder holds another training.

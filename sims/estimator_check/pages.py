@@ -1,4 +1,4 @@
-"""What was found of the estimator, as the measured part of a page."""
+"""The results of the check, as the generated part of a page."""
 
 import platform
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from .tables import tables
 
 
 def page_text(results: Sequence[Result]) -> str:
-    """All tables, with the machine and the revision that flew them."""
+    """All tables, with the machine and the revision that made them."""
     flown = sorted({result.revision[:12] for result in results if result.revision})
     by = f", revision {', '.join(f'`{r}`' for r in flown)}" if flown else ""
     head = f"{len(results)} settings, on {platform.machine()}{by}.\n\n"

@@ -1,4 +1,4 @@
-"""All settings, one after the other or spread over processes; what is done stays done."""
+"""All settings, sequentially or distributed over processes; finished ones are kept."""
 
 import hashlib
 import json
@@ -26,12 +26,12 @@ from .settings import Setting, setting_files
 ESTIMATOR = FolderKind(
     "check of the estimator", ("estimator.md", *setting_files()), edited=("estimator.md",)
 )
-"""What a check writes, beside the folder of the demo's model."""
+"""Files that a check writes, in addition to the folder of the demo's model."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What came of a setting: scores of all its runs, and the revision that flew them."""
+    """The result of a setting: scores of all its runs, and the revision that made them."""
 
     setting: Setting
     scores: Scores
@@ -40,13 +40,13 @@ class Result:
 
 @dataclass(frozen=True)
 class FlySetting:
-    """Flies a setting with the seeds 0, 1, …; its scores are on disk in the end, or nothing is.
+    """Simulates a setting with the seeds 0, 1, …, and writes its scores atomically.
 
     Attributes:
         out: folder; the file is `<table>/<name>.npz`.
         runs: of each setting, by its table.
         revision: of the sources.
-        engine: as `sims.run.loop.simulate` has it.
+        engine: as in `sims.run.loop.simulate`.
     """
 
     out: str
@@ -61,15 +61,15 @@ class FlySetting:
     def __call__(
         self, setting: Setting, progress: Update = lambda fraction, remark="", /: None
     ) -> None:
-        """Fly and score; one program for all seeds."""
-        jax.config.update("jax_enable_x64", True)  # a cluster's worker has no start of its own
+        """Simulate and score; one program for all seeds."""
+        jax.config.update("jax_enable_x64", True)  # a worker does not run the CLI's start-up
         jax.config.update("jax_cpu_enable_async_dispatch", False)
         keep_compiled()
         give_back_programs()
         count, found = self.runs[setting.table], []
 
         def report(fraction: float, remark: str) -> None:
-            # zero would say that all begins anew
+            # zero would mean a new start
             progress(max(1e-6, (len(found) + fraction) / count), f"{setting}: {remark}")
 
         for run in simulate_seeds(setting.scenario, range(count), report, self.engine):
@@ -82,10 +82,10 @@ class FlySetting:
             np.savez_compressed(file, **arrays)
 
     def result(self, setting: Setting) -> Result | None:
-        """What is on disk.
+        """The stored result, None if there is none.
 
         Raises:
-            UserError: the file is of other settings, or no such file.
+            UserError: the file is of other settings, or not a result.
         """
         at = self.path(setting)
         if not at.exists():
@@ -121,12 +121,12 @@ def run_settings(
     workers: int = 0,
     engine: Engine = "auto",
 ) -> tuple[list[Result], list[Failed]]:
-    """Fly the settings that are not on disk yet; all results, and who raised.
+    """Simulate the settings that have no stored result; all results, and failed settings.
 
     In this process one by one, or with `workers` in as many processes of this machine.
 
     Raises:
-        UserError: what is on disk is of other settings.
+        UserError: a stored result is of other settings.
     """
     work = FlySetting(str(Path(out).absolute()), runs, revision() or "", engine)
     left = [setting for setting in settings if work.result(setting) is None]

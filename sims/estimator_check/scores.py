@@ -1,4 +1,4 @@
-"""A run's estimator in numbers, and those of many runs together."""
+"""Scores of the estimator in a run, and over many runs."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from ..run.log import FUSED
 from ..run.loop import Run
 
 Scores = dict[str, np.ndarray]
-"""Arrays of one run, or of many with the runs first."""
+"""Arrays of one run, or of many runs with the run as the first axis."""
 
 FREEDOM = {"dvl": 3, "depth": 1, "compass": 1}
 """Components of a reading of each of `FUSED`."""
@@ -20,15 +20,15 @@ _THREE_SIGMA = float(chi2.ppf(0.9973, 3))
 
 
 def score(run: Run, start: float = 0.0) -> Scores:
-    """What is kept of a run; a row each sample, NaN where it had ended.
+    """The scores of a run; one row per sample, NaN after its end.
 
     - `nees` (n, 3): of position, attitude, velocity;
     - `nis` (n, 3): of the readings of `FUSED` that were fused at that time, NaN where none was;
-    - `taken`, `gated` (3): readings that were fused and that were rejected;
-    - `error` (9), `covariance` (27): at the end, NaN if the run broke off; `length`: of the path
-      (m); `finite`: 1 if the estimate was always finite and the run came to its end;
-    - `health` (n, 5), where the filter tells it, and `health_after` (6): the worst state after
-      `start` (s), 1 where a sensor was doubted after it, and the last state.
+    - `taken`, `gated` (3): numbers of readings that were fused and that were rejected;
+    - `error` (9), `covariance` (27): at the end, NaN if the run ended early; `length`: of the path
+      (m); `finite`: 1 if the estimate was always finite and the run did not end early;
+    - `health` (n, 5), if the filter has that port, and `health_after` (6): the worst state after
+      `start` (s), 1 where a sensor was not trusted after it, and the last state.
     """
     log, scenario = run.log, run.scenario
     n = round(scenario.duration * scenario.log.rate) + 1
@@ -59,21 +59,21 @@ def score(run: Run, start: float = 0.0) -> Scores:
 
 
 def stacked(scores: Sequence[Scores]) -> Scores:
-    """Scores of many runs, the runs first."""
+    """Scores of many runs, with the run as the first axis."""
     return {name: np.stack([one[name] for one in scores]) for name in scores[0]}
 
 
 class Average(NamedTuple):
-    """Average over runs at each time at which there is something, against its 95 % bounds."""
+    """Average over runs at each time with values, with its 95 % bounds."""
 
     values: Float[np.ndarray, " times"]
     inside: Bool[np.ndarray, " times"]
     bound: tuple[float, float]
-    """For all runs."""
+    """Of the average over all runs."""
 
     @classmethod
     def of(cls, squares: Float[np.ndarray, "runs times"], freedom: int) -> "Average":
-        """Of chi-square values, NaN where there is none."""
+        """The average of chi-square values; NaN marks missing ones."""
         counts = np.isfinite(squares).sum(axis=0)
         there = counts > 0
         mean = np.nansum(squares, axis=0)[there] / counts[there]
@@ -83,12 +83,12 @@ class Average(NamedTuple):
 
     @property
     def mean(self) -> float:
-        """Over all times; NaN if there is none."""
+        """Mean over all times; NaN if there is none."""
         return float(self.values.mean()) if self.values.size else float("nan")
 
     @property
     def share(self) -> float:
-        """Of the times inside."""
+        """Share of the times inside the bounds."""
         return float(self.inside.mean()) if self.inside.size else float("nan")
 
     def holds(self, value: float) -> bool:
@@ -97,32 +97,32 @@ class Average(NamedTuple):
 
 
 def average_nees(scores: Scores, block: int) -> Average:
-    """Of a block; three degrees of freedom."""
+    """NEES of a block; three degrees of freedom."""
     return Average.of(scores["nees"][:, :, block].astype(float), 3)
 
 
 def average_nis(scores: Scores, sensor: str) -> Average:
-    """Of a sensor's readings that were fused."""
+    """NIS of a sensor's fused readings."""
     column = FUSED.index(sensor)
     return Average.of(scores["nis"][:, :, column].astype(float), FREEDOM[sensor])
 
 
 def within_three_sigma(scores: Scores) -> Bool[np.ndarray, "runs 3"]:
-    """Whether the errors at the end lie in the ellipsoid that holds 99.73 %, as ± 3σ of one axis.
+    """Whether the final errors lie in the ellipsoid of 99.73 % probability, that of ± 3σ in 1-D.
 
-    That is δᵀ P⁻¹ δ ≤ 14.16 with three degrees of freedom. What is not finite lies outside.
+    That is δᵀ P⁻¹ δ ≤ 14.16 with three degrees of freedom. Errors that are not finite are outside.
     """
     squares = mahalanobis(scores["error"].astype(float), scores["covariance"].astype(float))
     return np.nan_to_num(squares, nan=np.inf) <= _THREE_SIGMA
 
 
 def _changed(values: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n 3"]:
-    """Where values differ from those before, at first from zero."""
+    """Where values differ from the previous ones; the first from zero."""
     return np.not_equal(values, np.vstack([np.zeros((1, 3)), values[:-1]]))
 
 
 def _to_length(values: np.ndarray, n: int) -> np.ndarray:
-    """A row each sample: cut, or filled with NaN."""
+    """Exactly n rows: truncated, or filled with NaN."""
     found = np.full((n, values.shape[1]), np.nan)
     found[: len(values)] = values[:n]
     return found

@@ -1,4 +1,4 @@
-"""What the estimator is judged in: waters, plants and starts, and faults of sensors."""
+"""Settings of the estimator's check: waters, plants, initial states, and sensor faults."""
 
 import math
 from collections.abc import Sequence
@@ -32,12 +32,12 @@ _WATERS = {
 
 @dataclass(frozen=True)
 class Setting:
-    """A scenario that is flown with many seeds.
+    """A scenario that is simulated with many seeds.
 
     Attributes:
-        table: that it is a row of.
+        table: the table that it is a row of.
         name: of its file.
-        words: for people.
+        words: its description in the table.
         scenario: its seed is replaced.
     """
 
@@ -52,7 +52,7 @@ class Setting:
 
 
 def chosen(only: Sequence[str]) -> list[str]:
-    """Names of the settings that fit a pattern, or whose table's name does; all without a pattern.
+    """Names of the settings that match a pattern or whose table does; all without a pattern.
 
     Raises:
         UserError: a pattern fits none.
@@ -72,13 +72,13 @@ def chosen(only: Sequence[str]) -> list[str]:
 
 
 def setting_files() -> tuple[str, ...]:
-    """Where the scores of all settings lie, from the folder of a check."""
+    """Paths of the scores of all settings, relative to the folder of a check."""
     faults = (f"faults/{name}.npz" for name, _, _ in _faults(0.0))
     return (*(f"consistency/{name}.npz" for name in _WATERS), *faults)
 
 
 def consistency_settings(names: Sequence[str], seconds: float, model: Path | None) -> list[Setting]:
-    """Healthy sensors in several waters; `model` is the learned plant, where that is chosen.
+    """Healthy sensors in several waters; `model` is the learned plant, if that setting is chosen.
 
     Raises:
         UserError: the model can't be read.
@@ -110,12 +110,12 @@ def fault_settings(names: Sequence[str], seconds: float) -> list[Setting]:
 
 
 def _lasting(scenario: Scenario, seconds: float) -> Scenario:
-    """The scenario over a time that nothing ends early: a vehicle that spins is a row, too."""
+    """The scenario with a fixed duration: a spinning vehicle does not end it early."""
     return replace(scenario, duration=seconds, safety=Safety(spin_rate=1e3))
 
 
 def _faults(t: float) -> list[tuple[str, str, list[SensorFault]]]:
-    """Name, words and faults from t (s) on; those without a duration stay."""
+    """Name, words and faults from t (s) on; faults without a duration last to the end."""
     one, short, long = 0.0, 1.0, 10.0
 
     def row(name: str, words: str, fault: Any, *given: Any, **more: Any) -> tuple:

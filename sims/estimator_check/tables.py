@@ -1,4 +1,4 @@
-"""What was found of the estimator, as tables."""
+"""The results of the check as tables."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from .run import Result
 from .scores import FREEDOM, Average, average_nees, average_nis, within_three_sigma
 
 PROMISED = 0.95
-"""Share of runs whose error at the end lies within three claimed standard deviations."""
+"""Required share of runs whose final error lies within three estimated standard deviations."""
 
 
 def tables(results: Sequence[Result]) -> list[Table]:
@@ -130,7 +130,7 @@ def _states(states: np.ndarray) -> str:
 
 
 def _lost(result: Result) -> str:
-    """Runs in which something was not finite."""
+    """Number of runs in which the estimate was not finite."""
     lost = int((result.scores["finite"] < 0.5).sum())
     return _marked(str(lost), lost == 0)
 

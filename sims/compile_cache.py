@@ -1,4 +1,4 @@
-"""Compiled programs kept on disk, so that the second run of a command starts at once."""
+"""A cache of compiled programs on disk, so that later runs of a command start faster."""
 
 import gc
 import hashlib
@@ -9,16 +9,16 @@ import jax
 from filelock import FileLock, Timeout
 from platformdirs import user_cache_path
 
-_LARGEST = 2**30  # bytes; what was used longest ago goes first
+_LARGEST = 2**30  # bytes; the least recently used programs are removed first
 _MAPS = Path("/proc/self/maps")
-_MOST_MAPS = 20_000  # Linux gives a process 65530, and a compiler that gets no more crashes
+_MOST_MAPS = 20_000  # Linux allows 65530 per process, and XLA's compiler crashes beyond
 
 
 def keep_compiled(folder: Path | None = None) -> None:
-    """Let JAX keep what it compiles in `folder`, by default the user's cache folder.
+    """Let JAX cache compiled programs in `folder`, by default the user's cache folder.
 
-    A folder chosen before (`JAX_COMPILATION_CACHE_DIR`) stays. A bounded size makes JAX take a file
-    lock around every read and write, so that processes may share it.
+    An earlier choice (`JAX_COMPILATION_CACHE_DIR`) is kept. With a bounded size JAX takes a file
+    lock for every read and write, so that processes can share the folder.
     """
     if compiled_folder() is not None:
         return
@@ -31,32 +31,32 @@ def keep_compiled(folder: Path | None = None) -> None:
 
 
 def mend(folder: Path) -> None:
-    """Remove programs that a process was killed in the middle of writing.
+    """Remove programs whose writing was interrupted by the end of a process.
 
-    JAX writes a program first and the time of its last use after it, and stores nothing more in a
-    folder where it meets a program without one; it says so at no log level.
+    JAX writes a program first and the time of its last use after it. If it finds a program without
+    such a time, it stores no further programs in the folder, without a log message.
     """
     if not folder.is_dir():
         return
     try:
-        with FileLock(folder / ".lockfile", timeout=10):  # JAX's own, held while it writes
+        with FileLock(folder / ".lockfile", timeout=10):  # JAX holds this lock while it writes
             for program in folder.glob("*-cache"):
                 if not program.with_name(f"{program.name.removesuffix('cache')}atime").exists():
                     program.unlink()
-    except (Timeout, OSError):  # another process is busy there, or the folder is not ours
+    except (Timeout, OSError):  # another process is writing, or no permission
         return
 
 
 def compiled_folder() -> str | None:
-    """The folder where JAX keeps compiled programs, if one was chosen."""
+    """The folder of JAX's cache of compiled programs, if one was chosen."""
     return jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def compiled_environment() -> dict[str, str]:
-    """Variables by which another process keeps its programs in the same folder, bounded alike.
+    """Environment variables for another process to share the cache with the same size limit.
 
-    One that knew the folder alone would store programs without the time of their last use, which
-    those that bound it can't read (`mend`). None where no folder was chosen.
+    Without the limit it would store programs without the time of their last use, which processes
+    with a limit can't read (`mend`). Empty if no folder was chosen.
     """
     folder = compiled_folder()
     if folder is None:
@@ -68,14 +68,14 @@ def compiled_environment() -> dict[str, str]:
 
 
 def give_back_programs() -> None:
-    """Forget compiled programs before their pages, several maps each, use up the process's."""
+    """Drop compiled programs before their memory maps reach the limit of the process."""
     if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MOST_MAPS:
         jax.clear_caches()
         gc.collect()
 
 
 def _processor() -> str:
-    """A short name of this processor: compiled code may use what another one lacks."""
+    """A hash of this processor's features, as compiled code may use instructions others lack."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else [platform.processor()]
     told = next((line for line in lines if line.startswith(("flags", "Features"))), lines[0])

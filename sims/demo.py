@@ -1,4 +1,4 @@
-"""The main job in one go: log, learned model, held-out error, closed-loop dive, one report."""
+"""The demo: log, learned model, held-out error, closed-loop dive, in one report."""
 
 import itertools
 import json
@@ -34,9 +34,9 @@ from .run.signals import log_periods
 from .scenarios.scenario import Scenario
 
 EMBEDDED = Path(__file__).with_name("data") / "sitl_dive.tlog.xz"
-"""The log that comes along."""
+"""The shipped log."""
 DEMO = FolderKind("demo", ("recording.nc", "report.html", "summary.json"))
-"""What a demo writes beside the folders of its training and its dive."""
+"""Files that a demo writes in addition to the folders of its training and its dive."""
 DEFAULT = Path("runs/demo")
 _USUAL = "bluerov2_heavy"
 _NORMS = ("position", "rotation", "linear_velocity", "angular_velocity")
@@ -50,11 +50,11 @@ def demo(
     config: TrainingConfig,
     vehicle_name: str | None = None,
 ) -> str:
-    """Do it all, write it into `out` and return the summary.
+    """Run the demo, write its files into `out` and return the summary.
 
     Files: recording.nc, training/ (as `spinndrift train`), dive/ (as `spinndrift run`),
-    report.html, summary.json. Training that an earlier demo of the same log began is continued.
-    `out` is held by the caller (`demo_folder`).
+    report.html, summary.json. An interrupted training on the same log is resumed. `out` is held by
+    the caller (`demo_folder`).
 
     Raises:
         UserError: the log or the scenario can't be used; the sentence says why.
@@ -92,7 +92,7 @@ def demo_folder(out: Path | None) -> Iterator[Path]:
     """Hold the folder of a demo, and those of its training and its dive.
 
     Args:
-        out: the folder; None takes runs/demo, or runs/demo-2 and so on where that is foreign.
+        out: the folder; None takes runs/demo, or runs/demo-2 and so on if that is foreign.
 
     Raises:
         UserError: as `run_folder`, of one of them.
@@ -114,11 +114,11 @@ def _own_or_free(held: ExitStack, first: Path) -> Path:
             return held.enter_context(run_folder(out, DEMO))
         except ForeignError:
             continue
-    raise AssertionError  # never: counting has no end
+    raise AssertionError  # unreachable
 
 
 def _check_flies(scenario: Scenario) -> None:
-    """Refuse a scenario that can't be flown, by building its loop about the untrained vehicle."""
+    """Check that a scenario can be run, by building its loop with the untrained vehicle."""
     controller = scenario.controller
     if not isinstance(controller, MppiImpedance):
         raise UserError(
@@ -132,7 +132,7 @@ def _check_flies(scenario: Scenario) -> None:
 def _learn(
     recording: Recording, vehicle: Vehicle, config: TrainingConfig, out: Path, update: Any
 ) -> Learned:
-    """Continue the training in `out` if it is one of these data and settings, else begin anew."""
+    """Resume the training in `out` if it is of the same data and settings, else start a new one."""
     try:
         return learn(recording, vehicle, config, out, resume=True, progress=update)
     except CheckpointError:
@@ -186,7 +186,7 @@ def _page(
 
 
 def _task(scenario: Scenario) -> str:
-    """Where from, where to, how often it is planned."""
+    """The task in words: start, goal, planning rate."""
 
     def place(p: Any) -> str:
         return f"({', '.join(f'{x:g}' for x in p)}) m"
@@ -198,7 +198,7 @@ def _task(scenario: Scenario) -> str:
 
 
 def _compared(overall: dict[str, dict[str, float]], norm: str, unit: str) -> str:
-    """A learned model's error beside the preset's, which it is a share of."""
+    """A learned model's error, and its share of the preset's error."""
     learned, preset = (overall[model][f"rmse_{norm}"] for model in ("learned", "preset"))
     share = f"{100 * learned / preset:.0f} % of the preset's {preset:.2f} {unit}"
     return f"{norm.replace('_', ' ')} error {learned:.2f} {unit}, {share}"

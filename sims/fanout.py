@@ -1,4 +1,4 @@
-"""Tasks one after the other in this process, or spread by Dask over processes and machines."""
+"""Tasks run sequentially in this process, or distributed by Dask over processes and machines."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ _ATTEMPTS = 3
 
 @dataclass(frozen=True)
 class Failed:
-    """A task that raised, or whose worker died, each time it was tried."""
+    """A task that raised, or whose worker died in every attempt."""
 
     task: Any
     reason: str
@@ -24,10 +24,10 @@ class Failed:
 def run_here(
     work: Callable[[T, Update], None], tasks: Sequence[T], progress: Update
 ) -> list[Failed]:
-    """Run tasks in this process, one by one; an error in one is kept and the next one begun.
+    """Run tasks in this process, one by one; an error is recorded and the next task started.
 
     Raises:
-        UserError: bad input; the tasks after it are not tried.
+        UserError: bad input; the later tasks are not run.
     """
     failed = []
     for number, task in enumerate(tasks):
@@ -40,13 +40,13 @@ def run_here(
             work(task, report)
         except UserError:
             raise
-        except Exception as error:  # noqa: BLE001 - whatever it was, other tasks don't depend on it
+        except Exception as error:  # noqa: BLE001 - other tasks don't depend on it
             failed.append(Failed(task, f"{type(error).__name__}: {error}"))
     return failed
 
 
 def check_workers(address: str | None, workers: int) -> None:
-    """Refuse workers that tasks can't be given to, before anything is written for them.
+    """Check that the workers are available, before any file is written.
 
     Raises:
         UserError: Dask is not installed, nothing answers at the address, a negative number, or both
@@ -73,9 +73,9 @@ def run_on_cluster(
 ) -> list[Failed]:
     """Run tasks on the scheduler at `address`, or on `workers` new processes of this machine.
 
-    A task whose worker dies is begun anew on another one, as often as the scheduler allows, three
-    times over; other tasks don't notice. `work` must be importable on the workers, which must see
-    the same files as this process.
+    A task whose worker dies is restarted on another one, as often as the scheduler allows, in three
+    attempts; other tasks are not affected. `work` must be importable on the workers, which need
+    access to the same files as this process.
 
     Raises:
         UserError: Dask is not installed, nothing answers at the address, or bad input.

@@ -1,4 +1,4 @@
-"""From a recording to a learned vehicle, judged on data it has not seen."""
+"""From a recording to a learned model, evaluated on held-out data."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -25,15 +25,15 @@ from ..training.fitting.run_folder import TRAINING
 from ..training.fitting.start import begun_with, estimate_diffusion, starting_model, with_diffusion
 
 FINE_SUBSTEPS = 5
-"""Steps a sample for models that were not trained at a step of their own, such as presets."""
+"""Steps per sample for models without a trained step of their own, such as presets."""
 _VALIDATION = 0.15
 _REMEMBERED = 10.0  # s of commands and motion before a window, at most
-_DRIFT = 0.2  # of the time, about, for the start that fits the drift alone
+_DRIFT = 0.2  # approximate share of the time for the initial fit of the drift alone
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Windows to train on, to choose the best step by, and held out for the verdict."""
+    """Windows for training, for selecting the best step, and held out for the evaluation."""
 
     learn: Windows
     validation: Windows | None
@@ -42,7 +42,7 @@ class Parts:
 
 @dataclass(frozen=True)
 class Learned:
-    """What training a recording's vehicle ends with."""
+    """The result of training on a recording."""
 
     model: Dynamics
     preset: Dynamics
@@ -50,16 +50,16 @@ class Learned:
     result: TrainingResult
     evaluation: Evaluation
     substeps: int
-    """Integration steps a sample that the model was trained with."""
+    """Integration steps per sample in training."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """A model that training starts from in place of the preset.
+    """A model that training starts from instead of the preset.
 
     Attributes:
-        model: a Fossen model, a SPINN, or either with effects about it.
-        substeps: integration steps a sample that suit it.
+        model: a Fossen model, a SPINN, or either with effects.
+        substeps: integration steps per sample for it.
     """
 
     model: Dynamics
@@ -70,14 +70,14 @@ class Start:
         """From a model file, with its metadata.
 
         Raises:
-            UserError: the file is no model.
+            UserError: the file is not a model.
         """
         model, metadata = load_model(path, dtype=jnp.float32)
         return cls(model, int(metadata.get("substeps", FINE_SUBSTEPS))), metadata
 
 
 def windowing(model: Dynamics | None, normalise: Normalisation) -> dict[str, Any]:
-    """What `make_windows` takes besides for a model; effects see the world and the thrusters."""
+    """Arguments of `make_windows` for a model; effects depend on world pose and thrusters."""
     if not isinstance(model, Extended):
         return {"normalise": normalise}
     return {"normalise": "none", "remembered": min(model.memory_duration, _REMEMBERED)}
@@ -86,12 +86,12 @@ def windowing(model: Dynamics | None, normalise: Normalisation) -> dict[str, Any
 def split_parts(
     recording: Recording, vehicle: Vehicle, config: WindowConfig, model: Dynamics | None = None
 ) -> Parts:
-    """Cut a recording into parts that share no moment of any run (`Recording.split`).
+    """Split a recording into parts that do not overlap in time in any run (`Recording.split`).
 
-    `model` is one to be trained or judged on them.
+    `model` is to be trained or evaluated on them.
 
     Raises:
-        UserError: it is too short for windows to learn from and others to hold out.
+        UserError: it is too short for training windows and held-out windows.
     """
 
     def cut(part: Recording, stride: float, name: str) -> Windows:
@@ -118,13 +118,13 @@ def split_parts(
     try:
         first, middle = rest.split(_VALIDATION, config.by, config.gap_s)
         validation = cut(middle, config.length_s, "validation")
-    except UserError:  # too little data to spare: the last step is taken instead of the best
+    except UserError:  # too little data for validation: the last step is taken, not the best
         first, validation = rest, None
     return Parts(cut(first, config.stride_s, "training"), validation, held_out)
 
 
 def compare(models: Mapping[str, tuple[Dynamics, int]], windows: Windows) -> Evaluation:
-    """Errors of models on the same windows, each with the substeps a sample that suit it."""
+    """Errors of models on the same windows, each with its own substeps per sample."""
     parts = [
         evaluate({name: model}, windows, substeps=substeps)
         for name, (model, substeps) in models.items()
@@ -135,9 +135,9 @@ def compare(models: Mapping[str, tuple[Dynamics, int]], windows: Windows) -> Eva
 
 
 def judged(model: Dynamics, windows: Windows) -> Dynamics:
-    """The model as it can be judged on windows: in their precision, at their steps, with a b.
+    """The model prepared for evaluation on windows: in their precision, at their step, with a b.
 
-    A Fossen model that states no diffusion gets the one that its own errors on them show.
+    A Fossen model without a diffusion gets the one estimated from its own errors on them.
     """
     dtype = windows.X.dtype
     model = cast(model, dtype)
@@ -159,15 +159,15 @@ def learn(
     resume: bool = False,
     progress: Callable[[float, str], None] = lambda fraction, remark: None,
 ) -> Learned:
-    """Train a SPINN from a preset, or another `start`, and judge them on the held-out part.
+    """Train a SPINN from a preset, or another `start`, and evaluate them on the held-out part.
 
-    Writes into `out` what `training.fitting.fit` writes, `evaluation.csv`, `evaluation.json`, the
+    Writes into `out` the files of `training.fitting.fit`, `evaluation.csv`, `evaluation.json`, the
     model that training starts from as `start.spinn`, and the preset with its estimated diffusion as
-    `preset.spinn`. With `resume` a run that has a checkpoint goes on from both.
+    `preset.spinn`. With `resume` a run with a checkpoint resumes from `start.spinn` and checkpoint.
 
     Raises:
-        UserError: the data don't suffice; the sentence says what is missing. Or `out` holds what
-            this package did not write.
+        UserError: the data don't suffice; the sentence says what is missing. Or `out` holds files
+            that this package did not write.
     """
     given = None if start is None else start.model
     config = begun_with(config, given)
@@ -189,7 +189,7 @@ def learn(
     preset = judged(vehicle.dynamics(), parts.learn)
     substeps = config.objective.substeps
     metadata: dict[str, Any] = {
-        "vehicle": recording.vehicle or vehicle.name,  # of a file its path: the name finds none
+        "vehicle": recording.vehicle or vehicle.name,  # a file's path; a name finds presets only
         "source": recording.dataset.attrs.get("source", ""),
         "dt": recording.dt,
         "substeps": substeps,

@@ -1,4 +1,4 @@
-"""Progress on the terminal: a bar with an estimate, silent for work of under two seconds."""
+"""Progress on the terminal: a bar with the remaining time, shown after two seconds."""
 
 import sys
 import threading
@@ -35,7 +35,7 @@ def console() -> Console:
 
 
 def tell_code(scenario: str, code: Iterable[str]) -> None:
-    """Say whose code a scenario is about to run: a file from elsewhere may name any."""
+    """Print which user code a scenario runs, because a scenario file can name any code."""
     for part in code:
         console().print(f"{scenario} runs the code of {part}", markup=False, soft_wrap=True)
 
@@ -44,7 +44,7 @@ def tell_code(scenario: str, code: Iterable[str]) -> None:
 def progress_bar(what: str, shown: Console | None = None) -> Iterator[Update]:
     """Yield a function that moves a bar labelled `what`; the bar appears after two seconds.
 
-    Without a terminal, one line is printed each ten per cent instead, so that logs stay short.
+    Without a terminal, one line is printed for each ten per cent instead, to keep logs short.
     """
     out = console() if shown is None else shown
     watch = _Terminal(what, out) if out.is_terminal else _Lines(what, out)
@@ -60,7 +60,7 @@ def progress_bar(what: str, shown: Console | None = None) -> Iterator[Update]:
 
 
 class _Terminal:
-    """A bar that redraws itself, so that it lives while nothing is reported (compilation, say)."""
+    """A bar that redraws itself, also while nothing is reported (during compilation, say)."""
 
     def __init__(self, what: str, out: Console):
         self._bar = Progress(
@@ -94,7 +94,7 @@ class _Terminal:
 
 
 class _Lines:
-    """A line each ten per cent; the estimate counts from the first report, not from the start."""
+    """A line for each ten per cent; the remaining time is extrapolated from the first report on."""
 
     def __init__(self, what: str, out: Console):
         self._what, self._out = what, out
@@ -106,7 +106,7 @@ class _Lines:
 
     def update(self, fraction: float, remark: str = "", /) -> None:
         fraction, now = min(max(fraction, 0.0), 1.0), time.monotonic()
-        if fraction <= 0:  # work begins, or begins again
+        if fraction <= 0:  # work starts or restarts
             self._tenth, self._first = 0, None
             if self._shown and remark:
                 self._out.print(f"{self._what}: {remark}")

@@ -45,7 +45,7 @@ def print_tables(shown: Console, tables: Sequence[Table]) -> None:
 
 
 def interval(hits: int, total: int, level: float = 0.95) -> tuple[float, float]:
-    """Of a share: Clopper and Pearson 1934, exact by the beta distribution."""
+    """Confidence interval of a share (Clopper and Pearson 1934), exact by the beta distribution."""
     tail = (1 - level) / 2
     low = 0.0 if hits == 0 else float(scipy.stats.beta.ppf(tail, hits, total - hits + 1))
     high = 1.0 if hits == total else float(scipy.stats.beta.ppf(1 - tail, hits + 1, total - hits))
@@ -77,7 +77,7 @@ def _middle(values: Sequence[float], digits: int = 2) -> str:
 
 
 def gain_share(row: Row) -> float | None:
-    """The share over all parts of the state; None where no gain was judged."""
+    """The share of the gain over all parts of the state; None if it was not judged."""
     return row["gain"].get("all")
 
 
@@ -224,7 +224,7 @@ def _varied(rows: Sequence[Row]) -> Table:
 
 
 def _misses(rows: Sequence[Row]) -> Table:
-    """What was said where the first name of data recorded in another way is wrong."""
+    """The reported names of cases with unusual data whose first name is wrong."""
     wrong = [r for r in _of(rows, "single") if r["data"] != USUAL and not r["first_right"]]
     lines = [(r["data"], r["label"], ", ".join(r["named"]) or "adequate") for r in wrong]
     caption = "Where the first name is wrong in other data than the usual."
@@ -232,7 +232,7 @@ def _misses(rows: Sequence[Row]) -> Table:
 
 
 def _rivals(rows: Sequence[Row]) -> Table:
-    """Gains of other methods on the same files, with the terms that sparse ones took."""
+    """Gains of other methods on the same files, with the number of terms of sparse ones."""
     chosen = [r for r in rows if r.get("rivals") and r["size"] == 1]
     chosen.sort(key=lambda r: (r["kind"] == "null", r["kind"] != "single", r["label"]))
     lines = []

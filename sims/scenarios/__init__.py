@@ -1,1 +1,1 @@
-"""Scenarios: all that decides a run, in one YAML file each; those that are shipped."""
+"""Scenarios: the complete settings of a run in one YAML file each; the shipped scenarios."""

@@ -1,4 +1,4 @@
-"""When a run ends, and whether it succeeded.
+"""Criteria for the end of a run and for its success.
 
 The rules for reaching a goal are those of Palmer et al., "Field Experiments": a trial succeeds
 within 0.5 m of the goal without a collision; it ends early for unsafe behaviour (uncontrolled
@@ -25,7 +25,7 @@ Reason = Literal[
 
 
 class Outcome(NamedTuple):
-    """How a run ended: why, when (s), and in words."""
+    """The end of a run: reason, time (s), and sentence."""
 
     reason: Reason
     time: float
@@ -34,14 +34,14 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True)
 class ReachGoal:
-    """Success is to come near a goal.
+    """Success is to reach a goal.
 
     Attributes:
-        goal: position in W (m); where the controller's own goal is if left out.
+        goal: position in W (m); that of the controller's own goal if left out.
         radius: of the goal, for Bo (m).
         near_radius: being nearer than this for `near_time` without reaching the goal ends the run.
-        near_time: (s), all visits added.
-        progress: by how much the distance has to fall within `progress_time` (m).
+        near_time: total time over all visits (s).
+        progress: required decrease of the distance within `progress_time` (m).
         progress_time: (s).
     """
 
@@ -62,11 +62,11 @@ class ReachGoal:
 
 @dataclass(frozen=True)
 class FollowPath:
-    """Success is to be near the reference until the time is over.
+    """Success is to stay near the reference for the whole duration.
 
     Attributes:
-        position_rms: highest root mean square of the distance to the reference (m).
-        settle: time at the start that doesn't count (s).
+        position_rms: largest allowed root mean square of the distance to the reference (m).
+        settle: initial time that doesn't count (s).
     """
 
     position_rms: float = 0.3
@@ -81,11 +81,11 @@ class FollowPath:
 
 @dataclass(frozen=True)
 class Safety:
-    """What ends any run.
+    """Limits that end any run.
 
     Attributes:
         spin_rate: |ω| (rad/s) above which the vehicle spins.
-        spin_time: for so long without a pause (s) that it is out of control.
+        spin_time: uninterrupted time of spinning (s) after which it is out of control.
     """
 
     spin_rate: float = 1.5
@@ -99,7 +99,7 @@ class Safety:
 
 
 class Monitor:
-    """Watches the true motion sample by sample, in order of time, and says when a run is over."""
+    """Checks the true motion sample by sample, in order of time, for the end of the run."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class Monitor:
         goal: Float[np.ndarray, "3"] | None,
         safety: Safety | None = None,
     ):
-        """`goal` (m, W) is what `ReachGoal` needs."""
+        """`goal` (m, W) is needed for `ReachGoal`."""
         self.obstacles, self.success, self.goal = obstacles, success, goal
         self.safety = safety or Safety()
         self._vehicle = vehicle
@@ -122,7 +122,7 @@ class Monitor:
     def check(
         self, t: float, X_WB: Float[np.ndarray, "7"], V_WB_B: Float[np.ndarray, "6"]
     ) -> Outcome | None:
-        """Judge the state at time t; None while the run may go on."""
+        """The outcome for the state at time t; None while the run continues."""
         if not (np.all(np.isfinite(X_WB)) and np.all(np.isfinite(V_WB_B))):
             return Outcome("not finite", t, f"The state was no longer finite at {t:.1f} s.")
         step = 0.0 if self._before is None else t - self._before
@@ -144,7 +144,7 @@ class Monitor:
 
     @property
     def progress(self) -> float:
-        """Part of the way to the goal that is behind the vehicle, 0 to 1; 0 without a goal."""
+        """Share of the distance to the goal that is covered, 0 to 1; 0 without a goal."""
         if not isinstance(self.success, ReachGoal) or not self._first > self.success.radius:
             return 0.0
         left = (self._nearest - self.success.radius) / (self._first - self.success.radius)
@@ -170,14 +170,14 @@ class Monitor:
 
 
 def clearance(vehicle: Vehicle, X_WB: Float[np.ndarray, "7"], pylon: Pylon) -> float:
-    """Distance (m) of the vehicle's box to a pylon, negative where they meet."""
+    """Signed distance (m) of the vehicle's box to a pylon, negative if they intersect."""
     p = np.array([pylon.x, pylon.y, pylon.diameter / 2, pylon.bottom, pylon.top])
     return float(_to_pylon(vehicle.size)(X_WB, p)[0][0])
 
 
 @cache
 def _to_pylon(size: tuple[float, float, float]) -> VectorFunction:
-    """The distance for one pose and one pylon: compiled once for all of them."""
+    """The distance for one pose and one pylon, compiled once per hull size."""
     hull = BoxHull.create(size)
 
     def distance(X: Array, p: Array) -> Array:

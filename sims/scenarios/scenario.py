@@ -1,4 +1,4 @@
-"""Scenarios: all that decides a run, in one YAML file."""
+"""Scenarios: the complete settings of a run, in one YAML file."""
 
 import re
 from dataclasses import dataclass, field, replace
@@ -22,11 +22,11 @@ _TEXT = "--scenario-text"
 
 @dataclass(frozen=True)
 class LogSettings:
-    """What a run's log holds.
+    """Settings of a run's log.
 
     Attributes:
         rate: samples per second; its period is a multiple of the station's.
-        samples: keep what the planner sampled, for pictures (a few MB a minute).
+        samples: keep the planner's samples, for figures (a few MB per minute).
     """
 
     rate: float = 20.0
@@ -40,17 +40,17 @@ class LogSettings:
 
 @dataclass(frozen=True)
 class Scenario:
-    """A run: who is where in which water, who steers, what counts as success.
+    """The settings of a run: station, controller, success criterion.
 
     Attributes:
         name: of the run's folder.
         description: a sentence for the report.
-        duration: the run ends at this time at the latest (s).
+        duration: longest simulated time (s).
         station: vehicle, water, obstacles, sensors, start, seed.
-        controller: who steers.
-        success: what counts as success.
-        safety: what ends any run.
-        log: what is kept.
+        controller: the controller.
+        success: the success criterion.
+        safety: limits that end any run.
+        log: settings of the log.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Scenario:
     log: LogSettings = field(default_factory=LogSettings)
 
     def __post_init__(self) -> None:
-        """Check what belongs together."""
+        """Check fields that depend on each other."""
         check_numbers(self)
         word = re.fullmatch(r"[A-Za-z0-9][\w.-]*", self.name)
         require(word is not None, self, "name", "give one word of letters, digits, _ . -")
@@ -87,7 +87,7 @@ class Scenario:
 
     @property
     def goal(self) -> Float[np.ndarray, "3"] | None:
-        """Where to go (m, W), None where there is no goal."""
+        """The goal position (m, W), None without a goal."""
         if isinstance(self.success, ReachGoal) and self.success.goal is not None:
             return np.array(self.success.goal)
         goal = getattr(self.controller, "goal", None)
@@ -95,7 +95,7 @@ class Scenario:
 
     @property
     def code(self) -> tuple[str, ...]:
-        """The code of one's own that runs with it: files or modules, with the class in them."""
+        """The user code that runs with it: files or modules, with the class in them."""
         parts = (self.controller, self.station.sensing.filter)
         return tuple(part.code for part in parts if isinstance(part, OwnSystem))
 
@@ -105,7 +105,7 @@ class Scenario:
         """The same scenario with another seed, duration or model to plan with.
 
         Raises:
-            UserError: a model is given, and the controller plans with none.
+            UserError: a model is given, and the controller does not plan with one.
         """
         changed = self
         if seed is not None:
@@ -123,18 +123,18 @@ class Scenario:
 
 
 def scenario_names() -> tuple[str, ...]:
-    """Names of the scenarios that are shipped."""
+    """Names of the shipped scenarios."""
     return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
 
 
 def load_scenario(name_or_path: str | Path, text: str = "") -> Scenario:
     """Read a shipped scenario by its name, or a YAML file by its path (anything with a suffix).
 
-    `text` is YAML laid over the file: mappings merge key by key, anything else replaces, and a
-    value with another `!Tag` than the file's replaces the whole of it.
+    `text` is YAML that overrides the file: mappings are merged key by key, other values replace the
+    file's, and so does a value with another `!Tag`.
 
     Raises:
-        UserError: there is no such scenario, or it is none, or it is none with `text`.
+        UserError: there is no such scenario, or it is not valid, with or without `text`.
     """
     path = Path(name_or_path)
     if not path.suffix:
@@ -149,16 +149,16 @@ def load_scenario(name_or_path: str | Path, text: str = "") -> Scenario:
 
 
 def overridden(base: Scenario | str, text: str) -> Scenario:
-    """A scenario (or the YAML text of one) with YAML `text` laid over it.
+    """A scenario (or the YAML text of one) overridden by YAML `text`.
 
     Raises:
-        UserError: the two together are no scenario.
+        UserError: the result is not a valid scenario.
     """
     scenario = typed_yaml.loads(Scenario, base, "scenario") if isinstance(base, str) else base
     if not isinstance(parse(text, _TEXT)[0], dict):
         raise UserError(f"{_TEXT}: give a mapping, such as 'duration: 5'")
     try:
         return typed_yaml.loads(Scenario, text, _TEXT, scenario)
-    except UserError as error:  # it is a line of the command: its parts have no numbers
+    except UserError as error:  # an option's text has no line numbers
         message = re.sub(rf"^{_TEXT}:\d+: ", f"{_TEXT}: ", str(error), flags=re.MULTILINE)
         raise UserError(message) from error

@@ -156,7 +156,7 @@ def distributions_figure(motions: Mapping[str, xr.Dataset], scenario: str) -> Fi
 
 @styled
 def horizon_figure(metrics: Mapping[str, xr.Dataset]) -> Figure:
-    """W₂ over that of the floor against time, one line per method; mean over seeds and scenarios."""
+    """W₂ over the floor's against time, one line per method; means over seeds and scenarios."""
     figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
     axes = figure.subplots(1, len(metrics), squeeze=False, sharey=True)[0]
     for ax, (regime, d) in zip(axes, metrics.items(), strict=True):

@@ -1,1 +1,1 @@
-"""The subcommands of `spinndrift`: one dataclass each, its fields the options, `run()` the work."""
+"""The subcommands of `spinndrift`: a dataclass each, with the options as fields and `run()`."""

@@ -40,7 +40,7 @@ class CheckDiagnosis:
 
     @contextmanager
     def place(self) -> Iterator[None]:
-        """Hold what is to be written."""
+        """Check and lock the outputs."""
         from ...models.files.owned import run_folder
         from ..diagnosis_benchmark.run import CHECK
         from ..reports.marked_page import held_page
@@ -93,7 +93,7 @@ class Check:
     ]
 
     def place(self) -> AbstractContextManager[None]:
-        """Hold what is to be written."""
+        """Check and lock the outputs."""
         return self.what.place()
 
     def run(self) -> None:

@@ -45,7 +45,7 @@ class CheckEstimator:
 
     @contextmanager
     def place(self) -> Iterator[None]:
-        """Hold what is to be written."""
+        """Check and lock the outputs."""
         from ...models.files.owned import run_folder
         from ..estimator_check.run import ESTIMATOR
         from ..reports.marked_page import held_page

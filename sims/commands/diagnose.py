@@ -57,7 +57,7 @@ class Diagnose:
     """Folder to write."""
 
     def place(self) -> AbstractContextManager[Path]:
-        """Hold what is to be written."""
+        """Check and lock the outputs."""
         return run_folder(self.out, DIAGNOSIS)
 
     def run(self) -> None:

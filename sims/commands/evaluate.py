@@ -14,7 +14,7 @@ from ..progress import console, progress_bar
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Compare a learned model and the preset it came from with data.
+    """Compare a learned model and its preset with data.
 
     Prints errors, coverage of the 50 % and 90 % bands and energy scores over all horizons, and
     writes them against the horizon. All of DATA is used: give data not used in training.
@@ -37,7 +37,7 @@ class Evaluate:
     """Preset name or YAML file to compare with; by default what the model names."""
 
     def place(self) -> AbstractContextManager[Path | None]:
-        """Hold what is to be written."""
+        """Check and lock the outputs."""
         from ...models.files.owned import output_file
         from ...training.evaluation.evaluate import is_evaluation
 

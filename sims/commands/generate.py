@@ -43,7 +43,7 @@ class Generate:
     config: Annotated[Settings, OmitArgPrefixes] = field(default_factory=Settings)
 
     def place(self) -> AbstractContextManager[Path]:
-        """Hold what is to be written."""
+        """Check and lock the outputs."""
         from ...models.files.owned import output_file
         from ...models.recordings.store import Recording
 

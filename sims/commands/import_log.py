@@ -47,7 +47,7 @@ class Import:
     """MAVLink system id, if a log holds several autopilots."""
 
     def place(self) -> AbstractContextManager[Path]:
-        """Hold what is to be written."""
+        """Check and lock the outputs."""
         from ...models.files.owned import output_file
         from ...models.recordings.store import Recording
 

@@ -60,7 +60,7 @@ class Study:
 
     @contextmanager
     def place(self) -> Iterator[None]:
-        """Hold what is to be written."""
+        """Check and lock the outputs."""
         from ...models.files.owned import output_file, run_folder
         from ..study.pages import check_shown, is_page
         from ..study.run import STUDY

@@ -52,7 +52,7 @@ class Train:
     """Continue the run in `--out`."""
 
     def place(self) -> AbstractContextManager[Path]:
-        """Hold what is to be written."""
+        """Check and lock the outputs."""
         from ...models.files.owned import run_folder
         from ...training.fitting.run_folder import TRAINING
 

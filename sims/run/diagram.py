@@ -17,7 +17,7 @@ from ..scenarios.scenario import load_scenario
 
 
 def draw(scenario: str = "pylon_crossing_harbour") -> str:
-    """Graphviz text of a scenario's diagram: station and controller with what is inside them."""
+    """Graphviz text of a scenario's diagram: station and controller with their subsystems."""
     chosen = load_scenario(scenario)
     diagram = build_diagram(chosen.station, chosen.controller, log_periods={})
     out = [
@@ -64,7 +64,7 @@ def _inner_edges(diagram: Diagram, edges: dict[tuple[str, str], list[str]]) -> N
 
 
 def _outer_edges(diagram: Diagram, edges: dict[tuple[str, str], list[str]]) -> None:
-    """Connections between subdiagrams, drawn from the block inside to the block inside."""
+    """Connections between subdiagrams, drawn between the blocks inside them."""
     for (target, index), (source, port) in diagram.connection_map().items():
         out_port = source.get_output_port(port)
         for from_node in _exporters(source, out_port.get_name()):

@@ -34,7 +34,7 @@ def check_free(scenario: Scenario) -> None:
 def find_passage(scenario: Scenario) -> Passage | None:
     """The widest path to the goal, with the planner's measure of risk; None without a goal.
 
-    Without a planner that has one, a path is safe if the vehicle fits through.
+    Without a planner that has a measure of risk, a path is safe if the vehicle fits through.
     """
     if not isinstance(scenario.success, ReachGoal) or scenario.goal is None:
         return None

@@ -1,1 +1,1 @@
-"""The simulation study: methods trained on the same laws, judged against them, told in pages."""
+"""The simulation study: methods trained on the same laws, compared with them, with its pages."""

@@ -196,7 +196,7 @@ def from_belief(study: StudyConfig) -> StudyConfig:
 
 
 def asked_for(study: StudyConfig) -> str:
-    """The options that give these settings; with `--config` if none does."""
+    """The command-line options of these settings; `--config` if no others give them."""
     for scale in get_args(Scale):
         option = "" if scale == "full" else f" --scale {scale}"
         if study == scaled(scale):

@@ -16,8 +16,8 @@ from pydrake.systems.primitives import LogVectorOutput, RandomSource
 from .jit import VectorFunction
 from .network import Network, Port, Ports, changed_by, places, simultaneous
 
-_STEPS = 32  # of one call
-_DRAWN = 500  # periods of noise at once
+_STEPS = 32  # per call
+_DRAWN = 500  # periods of noise drawn at once
 
 
 class CompiledSimulator:

@@ -179,7 +179,7 @@ class MppiImpedance(Controller):
         model: a checkpoint of the dynamics to plan with; physics if left out.
         vehicle: whose physics to plan with; the station's if left out.
         diffusion: b of the physics' process noise (N√s and N·m√s): the wrenches of waves, wake and
-            contacts as white noise. A wrench of standard deviation σ and time constant τ has
+            pushes as white noise. A wrench of standard deviation σ and time constant τ has
             b = σ √(2τ).
         tracking: settings of the tracking.
     """

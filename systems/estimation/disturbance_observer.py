@@ -1,4 +1,4 @@
-"""Observes the steady wrench that the model doesn't explain: a current, a tether, ballast."""
+"""Observes the steady wrench that is not in the model: a current, a tether, ballast."""
 
 from typing import Any
 
@@ -57,7 +57,7 @@ class MomentumObserver(eqx.Module):
         self.time_constant, self.limit = time_constant, limit
 
     def init(self, dtype: jnp.dtype | type = float) -> ObserverState:
-        """Nothing seen, no bias."""
+        """The state before the first call: zero bias."""
         zero = jnp.zeros(6, dtype)
         return ObserverState(zero, se3.identity(dtype), zero, zero, jnp.zeros((), dtype))
 

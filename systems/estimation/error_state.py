@@ -72,7 +72,7 @@ def sample_increment(
 ) -> Increment:
     """Increment of one sample: specific force (m/s²) and mean angular rate (rad/s) over `time`.
 
-    The force is taken in the axes at the end of the interval, which is where it is sampled.
+    The force is in the body axes at the end of the interval, when it is sampled.
     """
     X = se3.exp(jnp.concatenate([jnp.zeros_like(rate), rate * time[None]]))
     v = se3.rotate(X, force) * time[None]
@@ -117,7 +117,7 @@ def _chained(over: Callable, steps: Increment) -> Increment:
 
 
 def apply(nominal: Navigation, increment: Increment, gravity: float) -> Navigation:
-    """The nominal state after an increment: v_B and X_WB with gravity, the biases as they are."""
+    """The nominal state after an increment: v_B and X_WB with gravity, the biases unchanged."""
     T = increment.time
     g_B = se3.rotate_inverse(nominal.X_WB, _gravity(nominal.X_WB, gravity))
     start = increment.X[4:] + nominal.v_B * T + g_B * T * T / 2

@@ -148,7 +148,7 @@ class Update(NamedTuple):
     accepted: Bool[Array, " n"]
     """Whether a sensor's reading was used and passed its gate."""
     gain: Float[Array, "18 m"]
-    """K, with columns of zeros for what was not used."""
+    """K, with zero columns for readings that were not used."""
 
 
 def update(

@@ -164,7 +164,7 @@ def judged(
     patience: int,
     well: Bool[Array, "3"],
 ) -> tuple[Trust, Verdict]:
-    """Before an update: which sensors to leave out and which to follow whatever their NIS.
+    """Before an update: which sensors to leave out and which to follow regardless of their NIS.
 
     `used` says which readings came, `well` whether the IMU and another sensor are healthy.
     """
@@ -242,7 +242,7 @@ def suspected(
         stuck_at=jnp.where(stuck, time, trust.stuck_at),
     )
     alone = jnp.exp(-elapsed / jnp.asarray(_ALONE, pulled.dtype))[:, None]
-    # no sensor corrects a position error, so the DVL's pull on it does not decay
+    # no sensor corrects a horizontal position error: the DVL's pull on it does not decay
     fades = jnp.broadcast_to(jnp.where(accepted[:, None], alone, 1), pulled.shape)
     fades = fades.at[0, :3].set(1)
     of_others = jnp.where(came, 1 - 1 / _RECENT, 1)[:, None]

@@ -57,7 +57,7 @@ def cut_tlog(
     nearly these rates; `parameters` are kept wherever they were reported.
 
     Raises:
-        UserError: if the log has no message with the vehicle's time, or nothing falls in a span.
+        UserError: if the log has no message with the vehicle's time, or none in a span.
     """
     packets = scan(data)
     t = _vehicle_time(data, packets)

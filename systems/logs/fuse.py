@@ -1,4 +1,4 @@
-"""Signals of a log, cut and brought to one uniform grid: the trajectories of a recording.
+"""Cuts and resamples a log's signals to one uniform grid: the trajectories of a recording.
 
 Attitude is interpolated along the geodesic, position by the Hermite cubic with the estimated
 velocity as its slope, velocity linearly and then rotated into the body; rates and IMU are means
@@ -34,7 +34,7 @@ _STATES = {"disarmed": "disarmed", "pass-through": "passthrough", "outputs off":
 def fuse(
     signals: Signals, *, rate: float, minimum: float, gap: float, disarmed: bool
 ) -> tuple[list[Trajectory], list[str], list[str]]:
-    """Return trajectories at `rate` (Hz), a line on each, and sentences on what was left out.
+    """Return trajectories at `rate` (Hz), a line on each, and sentences on the omitted parts.
 
     Stretches shorter than `minimum` (s) are dropped, and so are disarmed ones unless wanted or
     unless there are no others.
@@ -90,7 +90,7 @@ def name_of(segment: Segment, number: int) -> str:
 
 
 def resample(signals: Signals, segment: Segment, number: int, dt: float) -> Trajectory:
-    """Bring one segment to the grid of step `dt` (s)."""
+    """Resample one segment to the grid of step `dt` (s)."""
     t = grid(segment.start, segment.stop - dt, dt)
     q = slerp(t, signals.attitude.t, signals.attitude.x)
     omega = _instants(signals.rates, t)

@@ -26,7 +26,7 @@ FIGURES = (
     "temperature",
     "valid",
 )
-"""What the output port `figures` holds, in this order."""
+"""Components of the output port `figures`, in this order."""
 
 
 def key_from_gaussians(w: Float[Array, "4"]) -> UInt32[Array, "2"]:
@@ -41,7 +41,7 @@ class Mppi(LeafSystem):
     `plan` is laid out by `layout` and `samples` by `samples`; both hold zeros before the first
     call, and `plan` whenever no finite plan was found (a state estimate of NaN, say), which the
     tracking controller reads as "no plan". `F_bias_Bo_W` is an observed wrench with the axes of
-    W, zero if not connected. `noise` is drawn anew for every call.
+    W, zero if not connected. `noise` is redrawn for every call.
 
     .. pydrake_system::
 

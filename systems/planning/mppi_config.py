@@ -170,7 +170,7 @@ class MppiConfig:
 
     @property
     def steps_of_model(self) -> int:
-        """Steps of the model in one of the plan."""
+        """Steps of the model per step of the plan."""
         return _SUBSTEPS if self.substeps is None else self.substeps
 
     @property

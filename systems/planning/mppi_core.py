@@ -90,9 +90,9 @@ class MppiPlanner(eqx.Module):
         d(g, ξ) = model,  P(g ∈ G over the horizon) ≥ 1 − α,
 
     by path integrals (Williams et al. 2016). Around the last plan, shifted by the elapsed time,
-    wrench sequences are sampled with smooth noise and projected to U. Every sequence is rolled out
+    wrench sequences are sampled with smooth noise and clipped to U. Every sequence is rolled out
     under the same `realisations` of the model's process noise (in antithetic pairs), as common
-    random numbers. Costs become weights and the weighted mean sequence is projected to U. The
+    random numbers. Costs become weights and the weighted mean sequence is clipped to U. The
     candidates are the mean, the best sample, the best sample that satisfies the chance constraint,
     and the last plan, since the mean of passing left and passing right of a pylon may collide. The
     candidate of least cost that satisfies the constraint is chosen, or else the one that violates
@@ -105,7 +105,7 @@ class MppiPlanner(eqx.Module):
     problem above, and the plan avoids gaps that the tracked vehicle passes safely.
 
     With `tracking` gains and `hold_attitude`, the sampled wrenches are added to a feedback with K_p
-    and K_d on the attitude alone, towards the goal's attitude; the sum is projected to U. The Munk
+    and K_d on the attitude alone, towards the goal's attitude; the sum is clipped to U. The Munk
     moment turns a moving hull broadside (Fossen 2011, section 6.3.1): hardly any open-loop sequence
     of wrenches keeps the attitude over the horizon, least of all in a current.
 
@@ -360,7 +360,7 @@ class MppiPlanner(eqx.Module):
         return self.tracking is not None and self.config.tracked
 
     def _turned(self, F: Array, X: Array, V: Array, n: int) -> Array:
-        """Wrenches of n sequences plus the feedback to the goal's attitude, projected to U.
+        """Wrenches of n sequences plus the feedback to the goal's attitude, clipped to U.
 
         Both paths of a pair get the feedback of their midpoint: the feedback to the midpoint is not
         part of the plan (`_pull`).
@@ -391,7 +391,7 @@ class MppiPlanner(eqx.Module):
         return [array.astype(self.V_goal.dtype) for array in arrays]
 
     def _cut(self, F: Array) -> Array:
-        """Wrenches (horizon, 6, …) projected to the feasible set."""
+        """Wrenches (horizon, 6, …) clipped to the feasible set."""
         return jnp.moveaxis(self.limits.clip(jnp.moveaxis(F, 1, 0)), 0, 1)
 
     def _state_cost(self, X: Array, V: Array) -> Array:

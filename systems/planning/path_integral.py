@@ -17,7 +17,7 @@ _LOG_TEMPERATURES = -40.0, 80.0  # beyond all cost differences that float32 reso
 def spline_basis(horizon: int, pieces: int) -> Float[np.ndarray, "horizon coefficients"]:
     """Cubic B-splines on uniform knots at the midpoints of `horizon` steps, rows of unit length.
 
-    Independent unit Gaussian coefficients then give a smooth process of variance one at every
+    Independent unit Gaussian coefficients then give a smooth process of unit variance at every
     step, correlated over about one of the `pieces` (pieces + 3 coefficients).
     """
     knots = np.arange(-3, pieces + 4, dtype=float)
@@ -29,7 +29,7 @@ def spline_basis(horizon: int, pieces: int) -> Float[np.ndarray, "horizon coeffi
 def combine_risk(
     cost: Float[Array, "r n"], risk: Literal["mean", "cvar", "worst"], part: float
 ) -> Float[Array, " n"]:
-    """One cost a sequence from those of its r realisations; NaN in any of them stays NaN."""
+    """One cost per sequence from those of its r realisations; NaN in any of them gives NaN."""
     if risk == "mean" or cost.shape[0] == 1:
         return jnp.mean(cost, axis=0)
     count = 1 if risk == "worst" else math.ceil(part * cost.shape[0])

@@ -1,4 +1,4 @@
-"""The vehicle's sensors as one system with a rate for each."""
+"""The vehicle's sensors as one system, each with its own rate."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -31,10 +31,10 @@ controller:
 """
 EXAMPLE = """
 from run_example import example_log
-from spinndrift.sims import run_loop
+from spinndrift.sims.run import loop
 from spinndrift.sims.scenarios.criteria import Outcome
-made = example_log(2.0, planned=False), Outcome("duration", 2.0, "over"), run_loop.Timing()
-run_loop.simulate = lambda scenario, *_, **__: run_loop.Run(scenario, *made)
+made = example_log(2.0, planned=False), Outcome("duration", 2.0, "over"), loop.Timing()
+loop.simulate = lambda scenario, *_, **__: loop.Run(scenario, *made)
 """
 HOLD = """
 name: hold

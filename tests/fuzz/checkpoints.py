@@ -82,9 +82,11 @@ def _packed(rng: Rng, arrays: dict[str, Any], members: dict[str, bytes]) -> byte
             if key not in members:
                 one = io.BytesIO()
                 np.lib.format.write_array(one, np.asarray(value), allow_pickle=True)
-                archive.writestr(f"{key}.npy", one.getvalue())
+                archive.writestr(
+                    zipfile.ZipInfo(f"{key}.npy"), one.getvalue(), form
+                )  # no time in it
         for key, raw in members.items():
-            archive.writestr(f"{key}.npy", raw)
+            archive.writestr(zipfile.ZipInfo(f"{key}.npy"), raw, form)
     return memory.getvalue()
 
 

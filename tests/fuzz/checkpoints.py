@@ -74,7 +74,7 @@ def _spoil(rng: Rng, folder: Path) -> Path:
 
 
 def _packed(rng: Rng, arrays: dict[str, Any], members: dict[str, bytes]) -> bytes:
-    """An archive of arrays; `members` are files that stand in it as they are."""
+    """An archive of arrays without times; `members` are files that stand in it as they are."""
     memory = io.BytesIO()
     form = zipfile.ZIP_DEFLATED if rng.random() < 0.5 else zipfile.ZIP_STORED
     with zipfile.ZipFile(memory, "w", form) as archive:

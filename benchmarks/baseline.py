@@ -1,22 +1,22 @@
-"""What the code does now, recorded, and a later state of the code compared with it.
+"""Records results of the code, and compares the results of a later revision with them.
 
 ```
 python benchmarks/baseline.py record before.json --work runs/baseline
 python benchmarks/baseline.py compare before.json --work runs/baseline --checkout ../changed
 ```
 
-Code is driven by its command line alone and judged by the files that its commands write, so that
-modules may move between the two. Parts (`--only`):
+It uses the command line and the files that commands write, and imports no module of the package, so
+that modules may move between the two revisions. Parts (`--only`):
 
 losses     loss and gradient of the first step of every training method, on generated data
 diagnosis  names, places, parameters and verdicts on blind cases: the first seed of every cause,
-           6 nulls, 4 pairs, 3 effects without a name
+           6 nulls, 4 pairs, 3 unmodelled structures
 demo       the table of the demo's held-out errors
 mppi       times of `bench_mppi.py` over its reference, in one run
 
-`--work` holds the data, made once, and all results by the code that gave them: the same command
-goes on where it was interrupted, and code that was changed starts anew. `compare` ends with 1 if
-anything is worse. Run both on one machine.
+`--work` holds the data, generated once, and the results by a fingerprint of the code: an
+interrupted command resumes, and changed code starts anew. `compare` exits with 1 if anything is
+worse. Run both on one machine.
 """
 
 import argparse

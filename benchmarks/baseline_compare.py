@@ -1,4 +1,4 @@
-"""What `baseline.py` recorded against what is found now: unchanged, better or worse, and why."""
+"""Compares recorded results with new ones: unchanged, better or worse, and why."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence

@@ -155,7 +155,7 @@ def take(
     far = (jnp.abs(step) > bound) & jnp.repeat(good, 3) & (memory.count > FEW)
     odd = jnp.where(far.any(), memory.odd + 1, 0.0).astype(dtype)
     refused = jnp.stack([far[:3].any(), far[3:].any()]) & (odd <= _ODD_RUN)
-    spike = (odd < 1) & (memory.odd > 0) & (memory.odd <= _ODD_RUN)  # and no motion
+    spike = (odd < 1) & (memory.odd > 0) & (memory.odd <= _ODD_RUN)  # the odd samples ended
     squares = jnp.stack([jnp.sum(step[:3] ** 2), jnp.sum(step[3:] ** 2)])
     believed = good & ~refused
 

@@ -43,8 +43,8 @@ _ALONE = (10.0, 60.0, 60.0)
 """Time (s) for which the IMU alone predicts velocity, depth and yaw accurately enough."""
 _BIASED = 0.8  # mean of normalised innovations: white ones have a deviation of 0.16 over `_RECENT`
 _OUTLIER = 2.0
-"""Bound on one normalised innovation in the mean. With 1 % outliers it exceeds `_BIASED` in one of
-25 000 minutes at 8 Hz, with 5 in one of 110 (`tests/test_trust.py`)."""
+"""Bound on each normalised innovation before it enters the mean. In ten hours of a DVL with 1 %
+outliers the mean stays below `_BIASED`; with a bound of 5 it does not (`tests/test_trust.py`)."""
 _MATCHED = 50.0  # readings over which NIS are averaged
 _CLIPPED = 8.0  # bound on one reading's NIS relative to the mean, against outliers
 _GROWTH = 1.05  # of the IMU's variances, per reading while several sensors scatter

@@ -20,7 +20,6 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from spinndrift.models.config.errors import UserError
-from spinndrift.models.effects.base import AXES
 from spinndrift.models.effects.library import Library, kind
 from spinndrift.models.effects.thrust import AxisThrust
 from spinndrift.models.frames import pose_to_enu, twist_frd_to_flu
@@ -29,6 +28,7 @@ from spinndrift.models.recordings.csv import read_csv, write_csv
 from spinndrift.models.recordings.csv_table import read_table
 from spinndrift.models.recordings.resample import continuous, geodesic, grid, hold, linear
 from spinndrift.models.recordings.store import Recording
+from spinndrift.models.se3 import AXES
 from spinndrift.models.vehicles.vehicle import Vehicle, load_vehicle
 from spinndrift.training.diagnosis.filter.problem import Bench
 from spinndrift.training.diagnosis.selection.multi_step_fit import (

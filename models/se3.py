@@ -28,6 +28,15 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Float
 
+AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
+"""The six axes, in the order of a twist and of a wrench."""
+XYZ = ("x", "y", "z")
+POSE = ("qw", "qx", "qy", "qz", *XYZ)
+TWIST = ("u", "v", "w", "p", "q", "r")
+WRENCH = ("X", "Y", "Z", "K", "M", "N")
+CHANNELS = (*XYZ, *AXES[3:], *TWIST)
+"""Displacement and rotation in the axes of one of two poses, then twist: m, rad, m/s, rad/s."""
+
 _SERIES_BELOW = 1.0  # squared angle; at one radian the closed forms lose no digit to cancellation
 
 

@@ -13,9 +13,9 @@ from hidden.scenarios import Plan
 
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects import KINDS, Extended, Library
-from spinndrift.models.effects.base import AXES
 from spinndrift.models.recordings.csv import read_csv
 from spinndrift.models.recordings.store import Recording
+from spinndrift.models.se3 import AXES, CHANNELS
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.reports.diagnosis_report import diagnosis_page
 from spinndrift.sims.reports.figures_simulated import at_ends
@@ -34,7 +34,6 @@ from spinndrift.training.diagnosis.filter.noise import (
 from spinndrift.training.diagnosis.filter.sensitivities import respond
 from spinndrift.training.diagnosis.filter.transition import Transition
 from spinndrift.training.diagnosis.findings.reported import (
-    CHANNELS,
     following,
     noise_words,
     residual,

@@ -12,9 +12,10 @@ import xarray as xr
 from diagonal import Diagonal, simulated
 
 from spinndrift.models import se3
+from spinndrift.models.se3 import CHANNELS
 from spinndrift.sims.reports.figures_learning import coverage_figure, error_figure, learning_figure
 from spinndrift.training.evaluation.evaluate import evaluate
-from spinndrift.training.evaluation.metrics import AXES, energy_score, order_statistics
+from spinndrift.training.evaluation.metrics import energy_score, order_statistics
 
 TRUTH = Diagonal.of()
 WRONG = Diagonal.of(mass=13.0, drag=5.0, diffusion=0.4)
@@ -122,7 +123,7 @@ def test_tables_are_tidy_and_whole(evaluation, tmp_path):
     ]
     expected = evaluation.dataset["coverage"].sel(model="wrong", axis="yaw", band=0.9)
     np.testing.assert_allclose([float(r["value"]) for r in picked], expected)
-    assert {r["of"] for r in rows if r["quantity"] == "rmse_axis"} == set(AXES)
+    assert {r["of"] for r in rows if r["quantity"] == "rmse_axis"} == set(CHANNELS)
     assert json.loads((tmp_path / "evaluation.json").read_text())["truth"]["finite"] == 1.0
     xr.testing.assert_allclose(
         xr.load_dataset(tmp_path / "evaluation.nc", engine="h5netcdf"), evaluation.dataset

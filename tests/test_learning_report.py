@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from spinndrift.models.se3 import AXES
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.demo import _compared, _task
 from spinndrift.sims.reports.figures_learning import learning_figure, stretches
-from spinndrift.sims.reports.learning_report import AXES, scale_words, taken_words
+from spinndrift.sims.reports.learning_report import scale_words, taken_words
 from spinndrift.sims.scenarios.scenario import load_scenario
 from spinndrift.training.fitting.fit import TrainingResult
 

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import se3
-from .base import AXES, Effect, Parameter, Plant
+from ..se3 import AXES
+from .base import Effect, Parameter, Plant
 
 ENTRIES = (
     ("surge_pitch", 0, 4),

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import se3
-from .base import XYZ, Effect, Parameter
+from ..se3 import XYZ
+from .base import Effect, Parameter
 from .recent import Recent
 
 

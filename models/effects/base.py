@@ -31,8 +31,6 @@ from ..networks import expand
 from .recent import Recent
 
 Family = Literal["actuation", "body", "environment", "disturbance", "measurement"]
-AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
-XYZ = ("x", "y", "z")
 THRUSTERS = ("1", "2", "3", "4", "5", "6", "7", "8")
 ALL_OR_ONE = ("all", *THRUSTERS)
 """Places of an effect that acts on all thrusters alike or on a single one."""

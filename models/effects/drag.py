@@ -5,7 +5,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .base import AXES, Effect, Parameter, Plant, axes_only
+from ..se3 import AXES
+from .base import Effect, Parameter, Plant, axes_only
 
 COUPLINGS = (
     ("sway_from_yaw", 1, 5),

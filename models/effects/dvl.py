@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import se3
-from .base import XYZ, Effect, Parameter
+from ..se3 import AXES, XYZ
+from .base import Effect, Parameter
 from .recent import Recent
 
 
@@ -53,7 +54,7 @@ class DvlMisalignment(Effect):
     name: ClassVar[str] = "dvl_misalignment"
     family: ClassVar = "measurement"
     parameters: ClassVar = (Parameter("angle", "rad", (0.01,), -0.5, 0.5),)
-    places: ClassVar = ("roll", "pitch", "yaw")
+    places: ClassVar = AXES[3:]
     order: ClassVar[int] = 30
     source: ClassVar[str] = "0.1 to 5°"
 

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import se3
-from .base import XYZ, Effect, Parameter, Plant, force_only
+from ..se3 import XYZ
+from .base import Effect, Parameter, Plant, force_only
 
 
 def up_in_body(X_WB: Float[Array, "7 *batch"]) -> Float[Array, "3 *batch"]:

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
-from .base import AXES, Effect, Parameter
+from ..se3 import AXES
+from .base import Effect, Parameter
 
 
 class DisturbanceLevel(Effect):

@@ -5,8 +5,9 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..se3 import AXES
 from ..thruster_curves import RESTING
-from .base import ALL_OR_ONE, AXES, THRUSTERS, Effect, Parameter, Plant
+from .base import ALL_OR_ONE, THRUSTERS, Effect, Parameter, Plant
 
 REFERENCE = 10.0
 """Reference force F_0 (N), at which the exponent has no influence."""

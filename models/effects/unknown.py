@@ -10,10 +10,10 @@ from jaxtyping import Array, Float
 
 from .. import se3
 from ..networks import expand
-from .base import AXES, Effect, Parameter, Plant, axes_only, force_only
+from ..se3 import AXES, TWIST
+from .base import Effect, Parameter, Plant, axes_only, force_only
 from .following import FOLLOWERS
 
-TWIST = ("u", "v", "w", "p", "q", "r")
 MOTION: dict[str, Callable[[Array], Array]] = {
     **{n: lambda V, i=i: V[i] for i, n in enumerate(TWIST)},
     **{f"|{n}|{n}": lambda V, i=i: jnp.abs(V[i]) * V[i] for i, n in enumerate(TWIST)},

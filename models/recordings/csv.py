@@ -20,11 +20,12 @@ import numpy as np
 from ..config.errors import UserError
 from ..config.typed_yaml import dump, load
 from ..frames import pose_to_enu, twist_frd_to_flu
+from ..se3 import TWIST, WRENCH
 from .build import Trajectory
 from .csv_table import Table, read_table
 from .kinematics import contradictions
 from .resample import continuous, geodesic, grid, hold, linear, slerp
-from .schema import COMMANDS, LIMITS, MAY_LACK, QUANTITIES, TWIST, UNEVEN, WRENCH, variable_units
+from .schema import COMMANDS, LIMITS, MAY_LACK, QUANTITIES, UNEVEN, variable_units
 from .store import Recording
 
 METADATA = "recording.yaml"

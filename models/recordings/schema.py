@@ -9,15 +9,13 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
 
+from ..se3 import POSE, TWIST, WRENCH, XYZ
+
 FORMAT = "spinndrift recording 1"
 FRAMES = "W: ENU z-up; B: FLU"
 HOLD = "zero-order: the command at index n acts from t_n to t_(n+1)"
 
 LEADING = ("scenario", "trajectory", "time")
-POSE = ("qw", "qx", "qy", "qz", "x", "y", "z")
-TWIST = ("u", "v", "w", "p", "q", "r")
-WRENCH = ("X", "Y", "Z", "K", "M", "N")
-AXES = ("x", "y", "z")
 
 STATES = {
     "X_WB": ("pose_component", "1, m"),
@@ -43,7 +41,7 @@ LABELS: dict[str, tuple[str, ...]] = {
     "pose_component": POSE,
     "twist_component": TWIST,
     "wrench_component": WRENCH,
-    "axis": AXES,
+    "axis": XYZ,
 }
 LIMITS: dict[str, tuple[float, float]] = {
     "attitude": (-1.01, 1.01),
@@ -79,7 +77,7 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
 }
 """Quantity of each component of a variable, or one for all."""
 # Channels that a log may lack; they are then NaN throughout a trajectory.
-MAY_LACK = {"X_WB": ("x", "y", "z"), "V_WB_B": TWIST}
+MAY_LACK = {"X_WB": XYZ, "V_WB_B": TWIST}
 _NORM_TOLERANCE = 1e-4
 _SHORTEST_STEP, _LONGEST_STEP = 1e-6, 1e4
 

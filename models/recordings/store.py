@@ -17,6 +17,7 @@ from jaxtyping import Array
 
 from ..config.errors import UserError
 from ..files.netcdf import load_netcdf, save_netcdf
+from ..se3 import WRENCH
 from .build import Trajectory, assemble, window
 from .schema import (
     COMMANDS,
@@ -26,7 +27,6 @@ from .schema import (
     SENSORS,
     STATES,
     UNEVEN,
-    WRENCH,
     check,
     check_plausible,
     observed,

@@ -18,6 +18,7 @@ from ...models.config import typed_yaml
 from ...models.config.errors import UserError
 from ...models.effects.library import kind
 from ...models.effects.unknown import Unknown
+from ...models.se3 import POSE, TWIST
 from ...training.diagnosis.findings.result import Verdict
 
 USUAL = "usual"
@@ -147,7 +148,7 @@ def read_oracle(folder: Path) -> list[tuple[Float[np.ndarray, "7 N"], Float[np.n
     Raises:
         UserError: a column is missing.
     """
-    names = ["qw", "qx", "qy", "qz", "x", "y", "z", "u", "v", "w", "p", "q", "r"]
+    names = [*POSE, *TWIST]
     found = []
     for path in sorted(folder.glob("*.csv")):
         table = np.genfromtxt(path, delimiter=",", names=True)

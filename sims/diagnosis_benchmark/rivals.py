@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 from ...models import se3
 from ...models.config.errors import UserError
 from ...models.recordings.csv import read_csv
-from ...models.recordings.schema import TWIST, WRENCH
+from ...models.se3 import TWIST, WRENCH
 from ...training.diagnosis.data.arrays import Data
 from ...training.diagnosis.filter.innovations import predict
 from ...training.diagnosis.filter.problem import Bench

@@ -2,7 +2,7 @@
 
 import math
 
-from ...models.effects.base import AXES
+from ...models.se3 import AXES
 from ...training.diagnosis.findings.maneuver_library import TRIALS
 from ...training.diagnosis.findings.result import Cause, Diagnosis, Interval, Value
 from ...training.diagnosis.pipeline import Finding

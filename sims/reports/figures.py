@@ -16,7 +16,7 @@ F = TypeVar("F")
 FLOWN, PLANNED, ESTIMATE = "#14607a", "#d9772b", "#7b5ea7"
 OBSTACLE, GOAL, LIMIT, WATER = "#8b96a1", "#2e8b57", "#b0413e", "#3d8fc4"
 INK, QUIET, GRID = "#1c2733", "#5b6b7a", "#e6ebef"
-AXES = ("#c4473a", "#3b8a4a", "#2f6fb5")  # x, y, z
+XYZ_COLORS = ("#c4473a", "#3b8a4a", "#2f6fb5")  # x, y, z
 WIDTH = 9.6  # in: the width of a page's text
 _SPAN, _LONG = 5.0, 300.0
 """Ratio of values from which an axis is logarithmic (two of 1, 2 and 5 are then on it), and ratio
@@ -74,7 +74,7 @@ def lines(
     axes: Axes, t: np.ndarray, values: np.ndarray, labels: tuple[str, ...], **options: Any
 ) -> None:
     """One line for each column."""
-    for column, label, color in zip(values.T, labels, AXES, strict=False):
+    for column, label, color in zip(values.T, labels, XYZ_COLORS, strict=False):
         axes.plot(t, column, label=label, color=color, **options)
 
 

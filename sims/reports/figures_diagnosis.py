@@ -4,10 +4,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ...models.se3 import AXES, CHANNELS
 from ...training.diagnosis.findings.result import Diagnosis
 from ...training.diagnosis.pipeline import Finding
 from .figures import FLOWN, INK, PLANNED, QUIET, common_legend, legend, panels, scaled, styled
-from .figures_maps import TWIST, run_times
+from .figures_maps import run_times
 
 CONTENDERS = {
     "base": "belief", "refitted": "refitted", "extended": "with the causes",
@@ -43,7 +44,6 @@ def residual_figure(finding: Finding) -> Figure:
     """Variance and autocorrelation of the innovations by axis: belief and explained."""
     figure, axes = panels(1, 2, 2.9)
     x = np.arange(12)
-    labels = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
     w, variances = finding.data.weight, []
     for k, (look, name, color) in enumerate(
         ((finding.base, "belief", PLANNED), (finding.final, "with the causes", FLOWN))
@@ -59,7 +59,7 @@ def residual_figure(finding: Finding) -> Figure:
     axes[0, 0].set_title("Variance against the noise's (1)")
     axes[0, 1].set_title("Correlation at one step (0)")
     for ax in axes[0]:
-        ax.set_xticks(x, labels, rotation=45)
+        ax.set_xticks(x, CHANNELS, rotation=45)
     legend(axes[0, 1])
     return figure
 
@@ -159,7 +159,7 @@ def innovations_figure(finding: Finding) -> Figure:
             total = np.bincount(bins.ravel(), look.z[:, 6 + i][:, own].ravel())
             mean = total / np.sqrt(np.maximum(count, 1))
             ax.plot(t, mean, color=color, lw=0.9, label=name)
-        ax.set_title(TWIST[i])
+        ax.set_title(AXES[i])
     for ax in axes[-1]:
         ax.set_xlabel("t / s")
     for ax in axes[:, 0]:

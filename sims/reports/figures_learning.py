@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from ...models.dynamics import Dynamics
 from ...models.recordings.store import Recording
+from ...models.se3 import CHANNELS
 from ...training.data.windows import Windows
 from ...training.evaluation.evaluate import Evaluation
 from ...training.evaluation.metrics import displacement
@@ -186,7 +187,6 @@ def bands_figure(
     t = windows.dt * np.arange(1, windows.steps + 1)
     figure, axes = panels(4, 3, 8.2, sharex=True)
     units = ("m", "rad", "m/s", "rad/s")
-    names = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
     for i, ax in enumerate(axes.ravel()):
         for low, high, alpha in ((5, 95, 0.18), (25, 75, 0.32)):
             a, b = np.percentile(sampled[i], (low, high), axis=1)
@@ -196,7 +196,7 @@ def bands_figure(
         ax.plot(t, believed[i], color=PLANNED, lw=1.1, ls="--", label="preset")
         span = limits[1] - limits[0]
         ax.set_ylim(limits[0] - 0.6 * span, limits[1] + 0.6 * span)
-        ax.set_title(f"{names[i]} / {units[i // 3]}")
+        ax.set_title(f"{CHANNELS[i]} / {units[i // 3]}")
     for ax in axes[-1]:
         ax.set_xlabel("t / s")
     legend(axes[0, -1])

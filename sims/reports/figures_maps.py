@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from ...models.se3 import AXES
 from ...training.diagnosis.data.arrays import Data
 from ...training.diagnosis.filter.noise import filtered, make_filter
 from ...training.diagnosis.filter.problem import Look
@@ -15,7 +16,6 @@ from ...training.diagnosis.filter.transition import Transition
 from ...training.diagnosis.pipeline import Finding
 from .figures import panels, styled
 
-TWIST = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 _WRENCH = ("X", "Y", "Z", "K", "M", "N")
 _UNITS = {
     **dict.fromkeys("uvw", "m/s"), **dict.fromkeys("pqr", "°/s"),
@@ -171,4 +171,4 @@ def map_figure(finding: Finding) -> Figure:
     known = where_they_are(finding)
     looks = (finding.base, finding.final)
     maps = [error_map(innovations_of(finding, look), known) for look in looks]
-    return draw_map(maps, ("Belief", "With the causes"), list(known), TWIST)
+    return draw_map(maps, ("Belief", "With the causes"), list(known), AXES)

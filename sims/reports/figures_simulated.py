@@ -8,12 +8,12 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from ...models import se3
+from ...models.se3 import CHANNELS
 from ...training.diagnosis.pipeline import Finding
 from ...training.diagnosis.validation.validation import Simulated
 from .figures import FLOWN, GRID, INK, PLANNED, common_legend, legend, panels, scaled, styled
 from .figures_maps import draw_map, error_map, variables
 
-NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
 _UNITS = ("m", "m", "m", "°", "°", "°", "m/s", "m/s", "m/s", "°/s", "°/s", "°/s")
 _BAND, _LOST = 0.9, 1e6
 """Share of simulations in a band; size of an error beyond which a simulation has diverged."""
@@ -87,7 +87,7 @@ def bands_figure(finding: Finding) -> Figure:
                                 label=named)  # fmt: skip
     for i, ax in enumerate(axes.flat):
         ax.plot(t, record[:, i], color=INK, lw=1.0, label="recorded")
-        ax.set_title(f"{NAMES[i]} / {_UNITS[i]}")
+        ax.set_title(f"{CHANNELS[i]} / {_UNITS[i]}")
         for a in range(first.every, n, first.every):
             ax.axvline(t[a], color=GRID, lw=1.2, zorder=0)
     for ax in axes[-1]:
@@ -120,7 +120,7 @@ def axes_figure(finding: Finding) -> Figure:
         for i, ax in enumerate(axes.flat):
             ax.plot(t, np.sqrt(square[:, i]), color=color, label=name)
     for i, ax in enumerate(axes.flat):
-        ax.set_title(f"{NAMES[i]} / {_UNITS[i]}")
+        ax.set_title(f"{CHANNELS[i]} / {_UNITS[i]}")
         ax.set_ylim(bottom=0)
     for ax in axes[-1]:
         ax.set_xlabel("horizon / s")
@@ -160,7 +160,7 @@ def simulated_map_figure(finding: Finding) -> Figure:
         bins = max(2, min(8, len(z) // 12))
         maps.append(error_map(z, means, bins))
         names.append(name[0].upper() + name[1:])
-    return draw_map(maps, names, list(variables(finding)), NAMES)
+    return draw_map(maps, names, list(variables(finding)), CHANNELS)
 
 
 @styled

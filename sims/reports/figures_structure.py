@@ -4,11 +4,12 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from ...models.se3 import AXES
 from ...training.diagnosis.data.arrays import Data
 from ...training.diagnosis.data.repeats import shares
 from ...training.diagnosis.pipeline import Finding
 from .figures import INK, QUIET, common_legend, panels, plain_logs, scaled, styled
-from .figures_maps import TWIST, error_map, innovations_of, labelled, where_they_are
+from .figures_maps import error_map, innovations_of, labelled, where_they_are
 from .figures_simulated import MODELS
 
 _LONGEST = 2.0
@@ -32,7 +33,7 @@ def memory_figure(finding: Finding) -> Figure:
             axes[0, i].plot(d.dt * lags, memory, color=color, label=name)
             f, power = _spectrum(z, d)
             axes[1, i].plot(f, power, color=color)
-    for i, axis in enumerate(TWIST):
+    for i, axis in enumerate(AXES):
         axes[0, i].axhspan(-spread, spread, color=QUIET, alpha=0.2, lw=0)
         axes[0, i].set_title(axis)
         axes[0, i].set_xlabel("lag / s")
@@ -70,7 +71,7 @@ def repeats_figure(finding: Finding) -> Figure:
             ax.bar(x + 0.38 * (k - 0.5), found[number], 0.36, color=color, label=name)
         ax.axhline(1, color=INK, lw=1, ls="--")
         ax.set_title(title)
-        ax.set_xticks(x, TWIST, rotation=30)
+        ax.set_xticks(x, AXES, rotation=30)
         if np.isnan(by_model[0][number]).all():
             ax.text(0.5, 0.5, "no runs repeat", ha="center", color=QUIET, transform=ax.transAxes)
     scaled(axes[0, 0], np.array([found[:3] for found in by_model]), bars=True)
@@ -111,7 +112,7 @@ def state_space_figure(finding: Finding) -> Figure:
             total = np.histogram2d(known[a], known[b], edges, weights=z)[0]
             mean = np.where(count > 0, total / np.sqrt(np.maximum(count, 1)), np.nan)
             image = ax.pcolormesh(*edges, mean.T, cmap="RdBu_r", vmin=-6, vmax=6, rasterized=True)
-            ax.set_title(f"{TWIST[i]}, {title}")
+            ax.set_title(f"{AXES[i]}, {title}")
             ax.set_ylabel(labelled(b))
             ax.grid(visible=False)
         axes[-1, column].set_xlabel(labelled(a))

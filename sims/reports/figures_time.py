@@ -5,6 +5,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ...models.se3 import AXES, XYZ
 from ...systems.planning.mppi import FIGURES
 from ..run.estimate import HEALTH, estimate_error
 from ..run.log import RunLog
@@ -26,8 +27,7 @@ from .figures import (
     styled,
 )
 
-_XYZ = ("x", "y", "z")
-_ANGLES = ("roll", "pitch", "yaw")
+_ANGLES = AXES[3:]
 _TIME = "time / s"
 PWM_RANGE = (1100.0, 1900.0)  # µs
 
@@ -39,7 +39,7 @@ def tracking_figure(log: RunLog) -> Figure | None:
     if error is None:
         return None
     figure, axes = panels(2, 1, 4.0, sharex=True)
-    lines(axes[0, 0], log.time, 100 * error[0][:, :3], _XYZ)
+    lines(axes[0, 0], log.time, 100 * error[0][:, :3], XYZ)
     lines(axes[1, 0], log.time, np.rad2deg(error[0][:, 3:]), _ANGLES)
     at_least(axes[0, 0], 2.0)
     at_least(axes[1, 0], 2.0)
@@ -67,7 +67,7 @@ def estimate_figure(log: RunLog) -> Figure | None:
     figure, axes = panels(3, 3, 5.6, sharex=True)
     units = ("cm", "degrees", "cm/s")
     for i, (name, labels) in enumerate(
-        (("Position", _XYZ), ("Attitude", _ANGLES), ("Velocity", _XYZ))
+        (("Position", XYZ), ("Attitude", _ANGLES), ("Velocity", XYZ))
     ):
         for j, label in enumerate(labels):
             ax, c = axes[i, j], 3 * i + j
@@ -159,14 +159,14 @@ def disturbance_figure(log: RunLog) -> Figure | None:
         return None
     figure, axes = panels(3, 1, 5.2, sharex=True)
     flow = log["flow_W"][:, :3] if "flow_W" in log else np.zeros((log.time.size, 3))
-    lines(axes[0, 0], log.time, 100 * flow, _XYZ)
+    lines(axes[0, 0], log.time, 100 * flow, XYZ)
     axes[0, 0].plot(
         log.time, 100 * np.linalg.norm(flow, axis=1), color=WATER, lw=0.9, alpha=0.7, label="speed"
     )
     axes[0, 0].set_title("Water's velocity (current, waves, wake), in W")
     axes[0, 0].set_ylabel("cm/s")
     F = log["F_disturbance_Bo_B"] if "F_disturbance_Bo_B" in log else np.zeros((log.time.size, 6))
-    lines(axes[1, 0], log.time, F[:, :3], _XYZ, lw=0.9)
+    lines(axes[1, 0], log.time, F[:, :3], XYZ, lw=0.9)
     lines(axes[2, 0], log.time, F[:, 3:], _ANGLES, lw=0.9)
     axes[1, 0].set_title("Other pushes: force, in B")
     axes[1, 0].set_ylabel("N")

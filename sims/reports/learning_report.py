@@ -8,6 +8,7 @@ import numpy as np
 from ...models.dynamics import Dynamics
 from ...models.recordings.store import Recording
 from ...models.recordings.summary import summarize
+from ...models.se3 import AXES
 from ...training.fitting.fit import TrainingResult
 from ..learning import FINE_SUBSTEPS, Learned
 from .figures_learning import (
@@ -21,7 +22,6 @@ from .pages import Page
 
 _LEFT_OUT = ("rmse_geodesic", "rmse_velocity", "finite")
 _SPEED = 0.5
-AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
 
 def add_data(page: Page, recording: Recording) -> Page:

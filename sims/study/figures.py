@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from ...models.se3 import AXES
 from ..reports.figures import ESTIMATE, FLOWN, GOAL, GRID, INK, LIMIT, PLANNED, QUIET, WIDTH, styled
-from ..reports.learning_report import AXES
 from .config import REGIMES
 from .table import Row
 

@@ -11,12 +11,12 @@ from jaxtyping import Array, Float
 
 from ...models.config.errors import UserError
 from ...models.dynamics import Dynamics
+from ...models.se3 import AXES, XYZ
 from ...models.vehicles.vehicle import load_vehicle
 from ...training.data.maneuvers import maneuver_wrench
 from ...training.evaluation.law_metrics import LawSamples, compare_laws
 from ...training.predict import predict
 from ..progress import Update
-from ..reports.learning_report import AXES
 from .config import Regime, StudyConfig
 
 _SHOWN_TIMES = 20
@@ -174,7 +174,7 @@ def shown_motions(
             "scenario": names,
             "law": ["true", "learned"],
             "time": ("time", (index + 1) / config.rate, {"units": "s"}),
-            "axis": ["x", "y", "z"],
+            "axis": list(XYZ),
         },
         attrs={"units": "m"},
     )

@@ -7,7 +7,7 @@ import numpy as np
 
 from ...models.recordings.build import Trajectory
 from ...models.recordings.kinematics import agreement
-from ...models.recordings.schema import TWIST
+from ...models.se3 import TWIST
 from .signals import Series, Signals
 
 _SLOW_OUTPUTS_HZ, _SLOW_STATE_HZ = 25.0, 10.0

@@ -12,11 +12,12 @@ from jaxtyping import Float
 from ...models.config.checks import check_numbers, require, require_rate
 from ...models.config.errors import UserError
 from ...models.dynamics import Dynamics
-from ...models.effects.base import AXES, Effect
+from ...models.effects.base import Effect
 from ...models.effects.extended import Extended
 from ...models.effects.library import Library
 from ...models.effects.thrust import AxisThrust
 from ...models.recordings.store import Recording
+from ...models.se3 import AXES
 from ...models.vehicles.vehicle import Vehicle
 from .candidates.unknowns import accept, seek, structure
 from .data.arrays import Data

@@ -15,10 +15,11 @@ from jaxtyping import Array
 from ...models.dynamics import Dynamics
 from ...models.files.atomic import atomic_path
 from ...models.files.netcdf import load_netcdf, save_netcdf
+from ...models.se3 import CHANNELS
 from ..data.windows import Windows
 from ..losses.base import Batch
 from ..predict import predict
-from .metrics import AXES, BANDS, GROUPS, coverage, displacement, energy_score, norms
+from .metrics import BANDS, GROUPS, coverage, displacement, energy_score, norms
 
 _CHUNK = 16
 _COLUMNS = ("model", "quantity", "of", "band", "horizon_s", "value")
@@ -200,7 +201,7 @@ def _evaluate_one(
         },
         coords={
             "norm": list(GROUPS),
-            "axis": list(AXES),
+            "axis": list(CHANNELS),
             "band": list(BANDS),
             "law": ["pose", "velocity"],
             "horizon": ("horizon", horizon, {"units": "s"}),

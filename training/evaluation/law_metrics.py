@@ -35,8 +35,9 @@ from jaxtyping import Array, Float
 
 from ...models import se3
 from ...models.config.checks import check_numbers, require
+from ...models.se3 import CHANNELS
 from ..losses.geodesic import relative_log
-from .metrics import AXES, BANDS, displacement, order_statistics
+from .metrics import BANDS, displacement, order_statistics
 
 PARTS = ("geodesic", "velocity")
 SIDES = ("law", "floor")
@@ -171,7 +172,7 @@ def compare_laws(
         coords={
             "side": list(SIDES),
             "part": list(PARTS),
-            "axis": list(AXES),
+            "axis": list(CHANNELS),
             "band": list(BANDS),
             "time": ("time", dt * (index + 1), {"units": "s"}),
         },
@@ -324,6 +325,6 @@ def _nothing(count: int) -> dict[str, np.ndarray]:
         "rmse_mean": (2, count),
         "rmse_samples": (2, count),
         "spread": (2, count),
-        "coverage": (len(BANDS), len(AXES), count),
+        "coverage": (len(BANDS), len(CHANNELS), count),
     }
     return {name: np.full(shape, np.nan) for name, shape in shapes.items()}

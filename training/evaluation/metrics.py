@@ -11,8 +11,6 @@ from jaxtyping import Array, Float
 from ..losses.geodesic import relative_log
 from ..losses.scores import partners, shifts
 
-AXES = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
-"""Displacement in the axes of the predicted body, then twist: m, rad, m/s, rad/s."""
 GROUPS: dict[str, slice] = {
     "position": slice(0, 3),
     "rotation": slice(3, 6),

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ....models.effects.base import AXES
 from ....models.effects.following import FOLLOWERS
-from ....models.effects.unknown import MOTION, TWIST, Unknown, powers
+from ....models.effects.unknown import MOTION, Unknown, powers
+from ....models.se3 import AXES, TWIST
 from ..filter.problem import Bench, Look
 from .structures import Group, Matched, Screen
 

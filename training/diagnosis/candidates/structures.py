@@ -22,10 +22,10 @@ from jaxtyping import Array, Float
 
 from ....models import se3
 from ....models.dynamics import Flow
-from ....models.effects.base import AXES
 from ....models.effects.extended import Extended
 from ....models.effects.inertia import times
 from ....models.effects.unknown import Unknown
+from ....models.se3 import AXES
 from ..filter.problem import Bench, Look
 from ..filter.sensitivities import through
 from ..selection.hypotheses import Chance

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from ....models.config.errors import UserError
 from ....models.recordings.kinematics import dead_reckoned
 from ....models.recordings.store import Recording
+from ....models.se3 import XYZ
 from ....models.vehicles.vehicle import Vehicle
 
 SEGMENT = 256
@@ -155,7 +156,7 @@ def make_data(
     """
     lacking = recording.missing
     of_pose = lacking.get("X_WB", ())
-    unmeasured = tuple(c for c in of_pose if c in ("x", "y", "z"))
+    unmeasured = tuple(c for c in of_pose if c in XYZ)
     if "V_WB_B" in lacking or unmeasured != of_pose:
         channels = ", ".join(f"{name} {'/'.join(which)}" for name, which in lacking.items())
         raise UserError(

@@ -5,10 +5,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ....models.config.errors import UserError
-from ....models.effects.base import AXES
 from ....models.recordings.kinematics import spikes
 from ....models.recordings.schema import UNEVEN
 from ....models.recordings.store import Recording
+from ....models.se3 import AXES, POSE, TWIST
 from .arrays import Data
 
 _STUCK = 0.5  # s
@@ -25,8 +25,8 @@ _EVEN_SHARE, _SURE = 0.9, 5.0
 _STILL = 0.02
 """Share of the strongest axis' command below which an axis counts as not driven."""
 _CHANNELS = {
-    "X_WB": ("qw", "qx", "qy", "qz", "x", "y", "z"),
-    "V_WB_B": ("u", "v", "w", "p", "q", "r"),
+    "X_WB": POSE,
+    "V_WB_B": TWIST,
 }
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ....models.effects.base import AXES
+from ....models.se3 import AXES
 from .arrays import Data
 
 _ALIKE = 0.1

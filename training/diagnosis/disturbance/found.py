@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from ....models.effects.base import AXES
+from ....models.se3 import AXES
 from ..data.repeats import repeating
 from ..filter.noise import estimate
 from ..filter.problem import Bench, Look

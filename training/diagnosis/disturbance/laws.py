@@ -13,7 +13,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float, Int
 
-from ....models.effects.base import AXES
+from ....models.se3 import AXES
 
 
 @dataclass(frozen=True)

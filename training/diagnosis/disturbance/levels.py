@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
-from ....models.effects.base import AXES
+from ....models.se3 import AXES
 from ..filter.likely_noise import beside_pushes
 from ..filter.noise import Noise, estimate, score_of, unit_processes
 from ..filter.problem import Bench, Look

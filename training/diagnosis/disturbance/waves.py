@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from ....models.effects.base import AXES
+from ....models.se3 import AXES
 from ..candidates.structures import Screen
 from ..filter.gram import gram
 from ..filter.problem import Bench, Look

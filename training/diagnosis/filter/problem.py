@@ -11,11 +11,12 @@ from jaxtyping import Array, Bool, Float
 
 from ....models.config.checks import require_double
 from ....models.dynamics import Dynamics
-from ....models.effects.base import AXES, XYZ, Effect
+from ....models.effects.base import Effect
 from ....models.effects.extended import Extended
 from ....models.effects.library import KINDS, Library
 from ....models.recordings.store import Recording
 from ....models.rigid_body import FossenDynamics
+from ....models.se3 import AXES, XYZ
 from ....models.vehicles.vehicle import Vehicle
 from ..data.arrays import Data, make_data
 from ..selection.correlated_noise import Beside

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ....models.effects.base import AXES
 from ....models.effects.extended import Extended
+from ....models.se3 import AXES
 from ...data.maneuvers import largest
 from ..data.arrays import Data
 from ..filter.problem import Bench

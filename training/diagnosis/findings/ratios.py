@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ....models import se3
-from ....models.effects.base import AXES
 from ....models.effects.extended import Extended
 from ....models.rigid_body import FossenDynamics
+from ....models.se3 import AXES
 from ..filter.problem import Bench, Look
 from . import result
 

@@ -8,8 +8,9 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
-from ....models.effects.base import AXES, Effect
+from ....models.effects.base import Effect
 from ....models.effects.library import kind
+from ....models.se3 import AXES, CHANNELS
 from ..data.repeats import repeating
 from ..disturbance.laws import Law, estimated, run_constants
 from ..filter.problem import Bench, Look
@@ -19,7 +20,6 @@ from ..selection.search import Found
 from . import result
 from .experiments import Experiment, of_law
 
-CHANNELS = ("x", "y", "z", "roll", "pitch", "yaw", "u", "v", "w", "p", "q", "r")
 _NAN = float("nan")
 _SCALE = 0.01
 """Reference spread of thrust between runs (1/8 to 64 times as much is tried)."""

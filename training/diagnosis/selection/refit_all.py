@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from ....models.effects.base import AXES
 from ....models.effects.library import COEFFICIENTS
+from ....models.se3 import AXES
 from ..filter.gram import least_within
 from ..filter.noise import Filter
 from ..filter.problem import Bench, Look

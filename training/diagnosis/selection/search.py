@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from ....models.effects.base import AXES
 from ....models.effects.library import kind
+from ....models.se3 import AXES
 from ..disturbance.found import SLOW, laws_of, won_by
 from ..disturbance.waves import beside_laws
 from ..filter.noise import Filter

@@ -15,11 +15,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ....models import se3
-from ....models.effects.base import AXES, Effect
+from ....models.effects.base import Effect
 from ....models.effects.deterministic_step import advance
 from ....models.effects.extended import FOR_EVER, Extended
 from ....models.effects.inertia import times
 from ....models.effects.recent import Recent
+from ....models.se3 import AXES
 from ...evaluation.metrics import BANDS, order_statistics
 from ..disturbance.laws import Law
 from ..filter.innovations import Arrays, as_arrays, at_first, difference, predict, settle, substeps

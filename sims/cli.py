@@ -1,16 +1,13 @@
 """The console command `spinndrift`."""
 
-import os
-import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from types import FrameType
+from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Protocol, runtime_checkable
 
 from ..models.config.errors import UserError
 from ..models.files.atomic import DISK_ERRORS
+from ..models.files.interrupts import interrupts_held
 
 _DESCRIPTION = """Learned stochastic dynamics and control for underwater vehicles.
 
@@ -30,8 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command; exit code 2 and one sentence for bad input, 130 after Ctrl-C."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        with _interrupted_between_imports(sys._getframe()):
-            _run(given)
+        _run(given)
     except UserError as error:
         _fail(f"spinndrift: {error}", 2)
     except KeyboardInterrupt:
@@ -45,56 +41,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _fail(f"spinndrift: {where}: can't be written ({error.strerror}); make room there", 2)
 
 
-@contextmanager
-def _interrupted_between_imports(home: FrameType) -> Iterator[None]:
-    """Defer Ctrl-C until an import is done: extension modules swallow it or raise another error.
-
-    `home` is the outermost frame that is searched for imports.
-    """
-    again: threading.Timer | None = None
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        nonlocal again
-        again = None
-        if not _importing(frame, home):
-            raise KeyboardInterrupt
-        again = threading.Timer(0.05, os.kill, (os.getpid(), number))
-        again.daemon = True
-        again.start()
-
-    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if not usual or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    signal.signal(signal.SIGINT, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        if again is not None:
-            again.cancel()
-            raise KeyboardInterrupt
-
-
-def _importing(frame: FrameType | None, home: FrameType) -> bool:
-    while frame is not None and frame is not home:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
-            return True
-        frame = frame.f_back
-    return False
-
-
 def _run(given: list[str]) -> None:
     if given == ["--version"]:
         from importlib.metadata import version
 
         print(version("spinndrift"))  # noqa: T201 - the output of `--version`
         return
-    command = _parsed(given)
-    import jax
+    with interrupts_held():
+        command = _parsed(given)
+        import jax
 
-    from .compile_cache import keep_compiled
-    from .options import check_options
+        from .compile_cache import keep_compiled
+        from .options import check_options
 
     check_options(command)
     keep_compiled()

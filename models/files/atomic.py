@@ -4,13 +4,12 @@ import errno
 import os
 import secrets
 import shutil
-import signal
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from ..config.errors import UserError
+from .interrupts import interrupts_held
 
 _PARTIAL = ".partial-"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
@@ -182,24 +181,3 @@ def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
                     os.replace(new, at)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
-
-
-@contextmanager
-def interrupts_held() -> Iterator[None]:
-    """Defer Ctrl-C until the block ends, in the main thread.
-
-    If the caller ignores Ctrl-C, as shells do for background jobs, it stays ignored.
-    """
-    before = signal.getsignal(signal.SIGINT)
-    main = threading.current_thread() is threading.main_thread()
-    if not main or before is signal.SIG_IGN:
-        yield
-        return
-    came: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, frame: came.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
-    if came:
-        signal.raise_signal(signal.SIGINT)

@@ -10,6 +10,7 @@ from tyro.conf import OmitArgPrefixes, subcommand
 
 from ...models.config.checks import RATE_OF_ALARMS, WORKERS
 from ...models.config.errors import UserError
+from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar
 from .check_estimator import CheckEstimator
 
@@ -41,9 +42,10 @@ class CheckDiagnosis:
     @contextmanager
     def place(self) -> Iterator[None]:
         """Check and lock the outputs."""
-        from ...models.files.owned import run_folder
-        from ..diagnosis_benchmark.run import CHECK
-        from ..reports.marked_page import held_page
+        with interrupts_held():
+            from ...models.files.owned import run_folder
+            from ..diagnosis_benchmark.run import CHECK
+            from ..reports.marked_page import held_page
 
         with ExitStack() as held:
             if self.docs is not None:
@@ -53,10 +55,11 @@ class CheckDiagnosis:
 
     def run(self) -> None:
         """Diagnose, judge, report."""
-        from ..diagnosis_benchmark.cases import find_cases
-        from ..diagnosis_benchmark.pages import write_page
-        from ..diagnosis_benchmark.run import run_cases
-        from ..diagnosis_benchmark.tables import print_tables, tables
+        with interrupts_held():
+            from ..diagnosis_benchmark.cases import find_cases
+            from ..diagnosis_benchmark.pages import write_page
+            from ..diagnosis_benchmark.run import run_cases
+            from ..diagnosis_benchmark.tables import print_tables, tables
 
         if self.docs is not None and self.docs.suffix != ".md":
             raise UserError(f"--docs {self.docs}: end the name in .md")

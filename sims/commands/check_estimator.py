@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from ...models.config.checks import WORKERS, Within
 from ...models.config.errors import UserError
+from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar
 
 if TYPE_CHECKING:
@@ -46,9 +47,10 @@ class CheckEstimator:
     @contextmanager
     def place(self) -> Iterator[None]:
         """Check and lock the outputs."""
-        from ...models.files.owned import run_folder
-        from ..estimator_check.run import ESTIMATOR
-        from ..reports.marked_page import held_page
+        with interrupts_held():
+            from ...models.files.owned import run_folder
+            from ..estimator_check.run import ESTIMATOR
+            from ..reports.marked_page import held_page
 
         with ExitStack() as held:
             if self.docs is not None:
@@ -58,11 +60,12 @@ class CheckEstimator:
 
     def run(self) -> None:
         """Simulate, judge, report."""
-        from ..diagnosis_benchmark.tables import print_tables
-        from ..estimator_check.pages import page_text
-        from ..estimator_check.run import run_settings
-        from ..estimator_check.tables import tables
-        from ..reports.marked_page import write_measured
+        with interrupts_held():
+            from ..diagnosis_benchmark.tables import print_tables
+            from ..estimator_check.pages import page_text
+            from ..estimator_check.run import run_settings
+            from ..estimator_check.tables import tables
+            from ..reports.marked_page import write_measured
 
         self._check_options()
         settings = self._settings()
@@ -89,14 +92,15 @@ class CheckEstimator:
 
     def _settings(self) -> list["Setting"]:
         """The settings to simulate; the model is trained first if it is needed but not given."""
-        from ..cores import share_cores
-        from ..estimator_check.model import demo_model
-        from ..estimator_check.settings import (
-            LEARNED,
-            chosen,
-            consistency_settings,
-            fault_settings,
-        )
+        with interrupts_held():
+            from ..cores import share_cores
+            from ..estimator_check.model import demo_model
+            from ..estimator_check.settings import (
+                LEARNED,
+                chosen,
+                consistency_settings,
+                fault_settings,
+            )
 
         names = chosen(self.only)
         share_cores()

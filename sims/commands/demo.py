@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from ...models.config.checks import COUNT
+from ...models.files.interrupts import interrupts_held
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,12 @@ class Demo:
 
     def run(self) -> None:
         """Run the demo and print its summary."""
-        from ...training.config import TrainingConfig
-        from ..cores import share_cores
-        from ..demo import EMBEDDED, demo, demo_folder
-        from ..progress import console, tell_code
-        from ..scenarios.scenario import load_scenario
+        with interrupts_held():
+            from ...training.config import TrainingConfig
+            from ..cores import share_cores
+            from ..demo import EMBEDDED, demo, demo_folder
+            from ..progress import console, tell_code
+            from ..scenarios.scenario import load_scenario
 
         share_cores()
         config = TrainingConfig()

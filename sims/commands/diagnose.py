@@ -9,6 +9,7 @@ from tyro.conf import Positional
 
 from ...models.config.checks import RATE_OF_ALARMS, WATER_DENSITY, Vector6, Within
 from ...models.config.errors import UserError
+from ...models.files.interrupts import interrupts_held
 from ...models.files.owned import FolderKind, run_folder
 from ..progress import console, progress_bar
 
@@ -62,17 +63,18 @@ class Diagnose:
 
     def run(self) -> None:
         """Load, diagnose, write."""
-        import json
+        with interrupts_held():
+            import json
 
-        import numpy as np
+            import numpy as np
 
-        from ...models.files.atomic import atomic_files
-        from ...models.files.checkpoint import load_model, save_model
-        from ...models.vehicles.vehicle import load_vehicle
-        from ...systems.logs.load import LogOptions, load_data
-        from ...training.diagnosis.findings.result import schema
-        from ...training.diagnosis.pipeline import DiagnoseConfig, diagnose
-        from ..reports.diagnosis_report import diagnosis_page
+            from ...models.files.atomic import atomic_files
+            from ...models.files.checkpoint import load_model, save_model
+            from ...models.vehicles.vehicle import load_vehicle
+            from ...systems.logs.load import LogOptions, load_data
+            from ...training.diagnosis.findings.result import schema
+            from ...training.diagnosis.pipeline import DiagnoseConfig, diagnose
+            from ..reports.diagnosis_report import diagnosis_page
 
         self._check()
         config = DiagnoseConfig(alpha=self.alpha, refit=self.refit)

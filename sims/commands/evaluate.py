@@ -9,6 +9,7 @@ from tyro.conf import Positional
 
 from ...models.config.checks import SECONDS
 from ...models.config.errors import UserError
+from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar
 
 
@@ -38,8 +39,9 @@ class Evaluate:
 
     def place(self) -> AbstractContextManager[Path | None]:
         """Check and lock the outputs."""
-        from ...models.files.owned import output_file
-        from ...training.evaluation.evaluate import is_evaluation
+        with interrupts_held():
+            from ...models.files.owned import output_file
+            from ...training.evaluation.evaluate import is_evaluation
 
         if self.out is None:
             return nullcontext()
@@ -47,10 +49,11 @@ class Evaluate:
 
     def run(self) -> None:
         """Load, predict, compare."""
-        from ...models.vehicles.vehicle import load_vehicle
-        from ...systems.logs.load import load_data
-        from ...training.data.windows import make_windows
-        from ..learning import FINE_SUBSTEPS, Start, compare, judged, windowing
+        with interrupts_held():
+            from ...models.vehicles.vehicle import load_vehicle
+            from ...systems.logs.load import load_data
+            from ...training.data.windows import make_windows
+            from ..learning import FINE_SUBSTEPS, Start, compare, judged, windowing
 
         if self.out is not None and self.out.suffix not in (".csv", ".json", ".nc"):
             raise UserError(f"--out {self.out}: end the name in .csv, .json or .nc")

@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar
 from tyro.conf import OmitArgPrefixes
 
 from ...models.config.errors import UserError
+from ...models.files.interrupts import interrupts_held
 from ...training.data.generate import GenerateConfig
 from ..progress import console, progress_bar
 
@@ -44,18 +45,20 @@ class Generate:
 
     def place(self) -> AbstractContextManager[Path]:
         """Check and lock the outputs."""
-        from ...models.files.owned import output_file
-        from ...models.recordings.store import Recording
+        with interrupts_held():
+            from ...models.files.owned import output_file
+            from ...models.recordings.store import Recording
 
         return output_file(self.out, Recording.is_one, "recording of spinndrift")
 
     def run(self) -> None:
         """Simulate and write."""
-        from ...models.disturbances import preset
-        from ...models.files.checkpoint import load_model
-        from ...models.recordings.summary import summarize
-        from ...models.vehicles.vehicle import load_vehicle
-        from ...training.data.generate import generate
+        with interrupts_held():
+            from ...models.disturbances import preset
+            from ...models.files.checkpoint import load_model
+            from ...models.recordings.summary import summarize
+            from ...models.vehicles.vehicle import load_vehicle
+            from ...training.data.generate import generate
 
         if self.out.suffix != ".nc":
             raise UserError(f"--out {self.out}: a Recording is a NetCDF file; end the name in .nc")

@@ -9,6 +9,7 @@ from tyro.conf import FlagCreatePairsOff, Positional
 
 from ...models.config.checks import WATER_DENSITY, Within
 from ...models.config.errors import UserError
+from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar
 
 
@@ -48,15 +49,17 @@ class Import:
 
     def place(self) -> AbstractContextManager[Path]:
         """Check and lock the outputs."""
-        from ...models.files.owned import output_file
-        from ...models.recordings.store import Recording
+        with interrupts_held():
+            from ...models.files.owned import output_file
+            from ...models.recordings.store import Recording
 
         return output_file(self._out(), Recording.is_one, "recording of spinndrift")
 
     def run(self) -> None:
         """Read, convert, write, summarise."""
-        from ...models.recordings.summary import summarize
-        from ...systems.logs.load import LogOptions, load_data
+        with interrupts_held():
+            from ...models.recordings.summary import summarize
+            from ...systems.logs.load import LogOptions, load_data
 
         out = self._out()
         if out.suffix != ".nc":

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ...models.config.checks import SECONDS, SEED
+from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar, tell_code
 
 
@@ -52,9 +53,10 @@ class Run:
 
     def run(self) -> None:
         """Simulate, write, summarise."""
-        from ..run.folder import new_folder, write_files
-        from ..run.loop import simulate
-        from ..scenarios.scenario import load_scenario
+        with interrupts_held():
+            from ..run.folder import new_folder, write_files
+            from ..run.loop import simulate
+            from ..scenarios.scenario import load_scenario
 
         scenario = load_scenario(self.scenario, self.scenario_text)
         tell_code(self.scenario, scenario.code)

@@ -10,6 +10,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ...models.config.checks import WORKERS, Within
 from ...models.config.errors import UserError
+from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar
 
 
@@ -61,9 +62,10 @@ class Study:
     @contextmanager
     def place(self) -> Iterator[None]:
         """Check and lock the outputs."""
-        from ...models.files.owned import output_file, run_folder
-        from ..study.pages import check_shown, is_page
-        from ..study.run import STUDY
+        with interrupts_held():
+            from ...models.files.owned import output_file, run_folder
+            from ..study.pages import check_shown, is_page
+            from ..study.run import STUDY
 
         with ExitStack() as held:
             if self.docs is not None:
@@ -74,13 +76,14 @@ class Study:
 
     def run(self) -> None:
         """Train, judge, report."""
-        from ...models.config.typed_yaml import load
-        from ...training.methods import METHODS
-        from ..cores import share_cores
-        from ..study.config import StudyConfig, from_belief, scaled
-        from ..study.pages import render
-        from ..study.run import run_study
-        from ..study.task import make_tasks
+        with interrupts_held():
+            from ...models.config.typed_yaml import load
+            from ...training.methods import METHODS
+            from ..cores import share_cores
+            from ..study.config import StudyConfig, from_belief, scaled
+            from ..study.pages import render
+            from ..study.run import run_study
+            from ..study.task import make_tasks
 
         if self.docs is not None and self.docs.suffix != ".md":
             raise UserError(f"--docs {self.docs}: end the name in .md")

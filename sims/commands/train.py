@@ -9,6 +9,7 @@ from tyro.conf import Positional
 
 from ...models.config.checks import COUNT, SEED
 from ...models.config.errors import UserError
+from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar
 
 
@@ -53,22 +54,24 @@ class Train:
 
     def place(self) -> AbstractContextManager[Path]:
         """Check and lock the outputs."""
-        from ...models.files.owned import run_folder
-        from ...training.fitting.run_folder import TRAINING
+        with interrupts_held():
+            from ...models.files.owned import run_folder
+            from ...training.fitting.run_folder import TRAINING
 
         return run_folder(self.out, TRAINING)
 
     def run(self) -> None:
         """Train, evaluate, report."""
-        from ...models.config.typed_yaml import load
-        from ...models.vehicles.vehicle import load_vehicle
-        from ...systems.logs.load import load_data
-        from ...training.config import TrainingConfig
-        from ...training.methods import method_config
-        from ..cores import share_cores
-        from ..learning import Start, learn
-        from ..reports.learning_report import add_data, add_evaluation, add_training
-        from ..reports.pages import Page
+        with interrupts_held():
+            from ...models.config.typed_yaml import load
+            from ...models.vehicles.vehicle import load_vehicle
+            from ...systems.logs.load import load_data
+            from ...training.config import TrainingConfig
+            from ...training.methods import method_config
+            from ..cores import share_cores
+            from ..learning import Start, learn
+            from ..reports.learning_report import add_data, add_evaluation, add_training
+            from ..reports.pages import Page
 
         share_cores()
         if self.method is not None:

@@ -1,7 +1,6 @@
 """Runs a scenario: builds the closed-loop diagram, simulates, monitors, logs."""
 
 import gc
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -14,6 +13,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram
 
 from ...models.config.errors import UserError
+from ...models.files.interrupts import interrupt_noted
 from ...systems.closed_loop import build_diagram, logged, seeded
 from ...systems.compiled.network import NotPureError
 from ...systems.compiled.simulator import CompiledSimulator
@@ -191,7 +191,7 @@ def _one(
         elif not warm:
             _warm_up(diagram, min(scenario.duration, _WARM_UP))
     timing.compilation = time.perf_counter() - started
-    with _stop_on_interrupt() as stopped, _few_collections():
+    with interrupt_noted() as stopped, _few_collections():
         outcome = _fly(scenario, diagram, simulator, monitor, tap, timing, tell, stopped)
     if passage is not None and not passage.safe and outcome.reason in ("duration", "no progress"):
         outcome = Outcome("no safe plan", outcome.time, no_safe_plan(scenario, passage))
@@ -310,24 +310,3 @@ def _few_collections() -> Iterator[None]:
         yield
     finally:
         gc.unfreeze()
-
-
-@contextmanager
-def _stop_on_interrupt() -> Iterator[threading.Event]:
-    """Turn the first Ctrl-C into an event, in the main thread and unless the caller ignores it."""
-    event = threading.Event()
-    former = signal.getsignal(signal.SIGINT)
-    main = threading.current_thread() is threading.main_thread()
-    if not main or former is signal.SIG_IGN:
-        yield event
-        return
-
-    def stop(*_: object) -> None:
-        event.set()
-        signal.signal(signal.SIGINT, former)
-
-    signal.signal(signal.SIGINT, stop)
-    try:
-        yield event
-    finally:
-        signal.signal(signal.SIGINT, former)

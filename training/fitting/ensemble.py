@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from ...models.dynamics import Dynamics
+from ...models.files.interrupts import interrupt_noted
 from ..config import TrainingConfig
 from ..data.windows import Windows
-from .fit import Progress, Run, TrainingResult, deferred_interrupt
+from .fit import Progress, Run, TrainingResult
 from .guard import TrainingError
 from .step import EnsembleStep
 
@@ -58,14 +59,14 @@ def fit_ensemble(
         run.begin(resume)
         if run.state.step >= config.steps:
             results[i] = run.finish(stopped=False)
-    with deferred_interrupt() as interrupted:
+    with interrupt_noted() as interrupted:
         try:
             while len(results) < len(runs):
                 _advance(step, runs, results)
                 steps = [run.state.step for i, run in enumerate(runs) if i not in results]
                 if progress is not None:
                     progress(min(steps, default=config.steps), config.steps, _mean_loss(runs))
-                if interrupted():
+                if interrupted.is_set():
                     raise KeyboardInterrupt
         except KeyboardInterrupt:
             for i, run in enumerate(runs):

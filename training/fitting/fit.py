@@ -1,11 +1,8 @@
 """Training: minibatches of windows, Adam, bit-exact checkpoints, recovery of non-finite steps."""
 
 import logging
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +15,7 @@ import numpy as np
 from ...models.config.errors import UserError
 from ...models.dynamics import Dynamics
 from ...models.files.checkpoint import save_model
+from ...models.files.interrupts import interrupt_noted
 from ..config import TrainingConfig
 from ..data.groups import group_labels, members, step_indices, whole_groups
 from ..data.provenance import fingerprint, provenance
@@ -161,14 +159,14 @@ class Run:
         devices = usable_devices(self.state.objective, self.config.batch)
         step = TrainStep(self.config, self.state.params, self.static, devices)
         stopped = False
-        with deferred_interrupt() as interrupted:
+        with interrupt_noted() as interrupted:
             try:
                 while self.state.step < self.config.steps and not stopped:
                     plan = self.plan()
                     stopped = self.take(plan, *step(*plan))
                     if progress is not None:
                         progress(self.state.step, self.config.steps, self.loss)
-                    if interrupted():
+                    if interrupted.is_set():
                         raise KeyboardInterrupt
             except KeyboardInterrupt:
                 self.checkpoint()
@@ -375,27 +373,3 @@ def _validation_loss(
         return objective.loss(model, batch, key)[0]
 
     return mean_over_devices(of_part, devices)(batch, whole, key)
-
-
-@contextmanager
-def deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Defer the first Ctrl-C, so that it can't interrupt a step; a second one interrupts at once.
-
-    If the caller ignores Ctrl-C, as shells do for background jobs, it stays ignored.
-    """
-    noted: list[int] = []
-    previous = signal.getsignal(signal.SIGINT)
-    main = threading.current_thread() is threading.main_thread()
-    if not main or previous is signal.SIG_IGN:
-        yield lambda: False
-        return
-
-    def note(number: int, frame: Any) -> None:
-        noted.append(number)
-        signal.signal(signal.SIGINT, previous)
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield lambda: bool(noted)
-    finally:
-        signal.signal(signal.SIGINT, previous)

@@ -1,0 +1,51 @@
+"""Ctrl-C at a moment of one's choice.
+
+Both contexts act in the main thread alone, where Python delivers signals. If the caller ignores
+Ctrl-C, as shells do for background jobs, it stays ignored.
+"""
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+
+@contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Defer Ctrl-C until the block ends: for steps that belong together, and for imports.
+
+    Extension modules swallow an interrupt of their import or raise another error.
+    """
+    came: list[int] = []
+    with _handled_by(lambda number, frame: came.append(number)):
+        yield
+    if came:
+        signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def interrupt_noted() -> Iterator[threading.Event]:
+    """Set the event yielded at the first Ctrl-C; a second one interrupts at once."""
+    event, before = threading.Event(), signal.getsignal(signal.SIGINT)
+
+    def note(number: int, frame: FrameType | None) -> None:
+        event.set()
+        signal.signal(signal.SIGINT, before)
+
+    with _handled_by(note):
+        yield event
+
+
+@contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
+    before = signal.getsignal(signal.SIGINT)
+    main = threading.current_thread() is threading.main_thread()
+    if not main or before is signal.SIG_IGN:
+        yield
+        return
+    signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)

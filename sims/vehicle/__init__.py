@@ -1,0 +1,1 @@
+"""A simulated vehicle behind a MAVLink server that behaves as ArduSub does."""

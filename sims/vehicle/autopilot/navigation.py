@@ -1,0 +1,124 @@
+"""What the autopilot knows of its motion: own sensors, and a horizontal position from outside.
+
+Frames here are the project's (W: east, north, up; B: forward, left, up).
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from .parameters import Parameters
+
+EXTERNAL = 6  # EK3_SRC1_…: external navigation
+_SETTLING = 35.0  # s after boot before displacements alone give a position: gyro biases settle
+_FUSING = 3.0  # s after boot
+_STALE = 1.0  # s without aid after which there is no position
+
+
+def _rest() -> Float[np.ndarray, "4"]:
+    return np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Estimates and readings of one instant.
+
+    Attributes:
+        q_WB: attitude estimate.
+        omega_B: angular rate (rad/s), as the gyroscopes have it.
+        f_B: specific force (m/s²), as the accelerometers have it.
+        height: estimate of z in W (m), negative under water.
+        climb: its rate (m/s).
+        pressure: at the depth sensor (Pa above the surface's).
+        voltage: of the battery under load (V).
+        current: of the battery (A).
+        leak: whether the hull's leak sensor is wet.
+    """
+
+    q_WB: Float[np.ndarray, "4"] = field(default_factory=_rest)
+    omega_B: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    f_B: Float[np.ndarray, "3"] = field(default_factory=lambda: np.array([0.0, 0.0, 9.80665]))
+    height: float = 0.0
+    climb: float = 0.0
+    pressure: float = 0.0
+    voltage: float = 16.0
+    current: float = 0.0
+    leak: bool = False
+
+
+def rotated(q_WB: Float[np.ndarray, "4"], v_B: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """A vector of B in W."""
+    w, u = q_WB[0], q_WB[1:]
+    return v_B + 2 * np.cross(u, np.cross(u, v_B) + w * v_B)
+
+
+class Aid:
+    """Horizontal position and velocity from messages of a DVL or of another navigation.
+
+    Displacements give a position from `_SETTLING` s after boot, positions at once, velocities alone
+    never. The position begins at zero where aiding starts, but for external positions.
+    """
+
+    def __init__(self, parameters: Parameters):
+        self._parameters = parameters
+        p = parameters
+        self._on = (
+            p.integer("VISO_TYPE") > 0
+            and p.integer("EK3_SRC1_POSXY") == EXTERNAL
+            and p.integer("EK3_SRC1_VELXY") == EXTERNAL
+        )
+        self.texts: list[str] = []
+        self.p_W = np.zeros(2)
+        self.v_W = np.zeros(2)
+        self._last = -math.inf
+        self._aiding = self._fusing = False
+
+    def valid(self, t: float) -> bool:
+        """Whether there is a horizontal position at time t."""
+        return self._aiding and t - self._last < _STALE
+
+    def displaced(
+        self, t: float, dt: float, dp_B: Float[np.ndarray, "3"], confidence: float, motion: Motion
+    ) -> None:
+        """Take VISION_POSITION_DELTA: a displacement (m) in B over `dt` s, with its confidence."""
+        known = bool(np.isfinite(dp_B).all()) and 0 < dt < 10 and confidence > 0
+        if not self._on or not known or t < _FUSING:
+            return
+        if not self._fusing:
+            self._fusing = True
+            self._tell("fusing odometry")
+        if not self._aiding:
+            if t < _SETTLING:
+                return
+            self._start(np.zeros(2))
+        elif t - self._last >= _STALE:
+            self._tell("started relative aiding")
+        moved = rotated(motion.q_WB, dp_B)[:2]
+        self.p_W = self.p_W + moved
+        self.v_W = moved / dt
+        self._last = t
+
+    def placed(
+        self, t: float, p_W: Float[np.ndarray, "3"], v_W: Float[np.ndarray, "3"] | None
+    ) -> None:
+        """Take ODOMETRY or VISION_POSITION_ESTIMATE: position (m) and velocity (m/s) in W."""
+        finite = bool(np.isfinite(p_W).all()) and (v_W is None or bool(np.isfinite(v_W).all()))
+        if not self._on or not finite or t < _FUSING:
+            return
+        if not self._aiding:
+            self._start(p_W[:2])
+        if v_W is not None:
+            self.v_W = v_W[:2].copy()
+        elif self._last > -math.inf and t > self._last:
+            self.v_W = (p_W[:2] - self.p_W) / (t - self._last)
+        self.p_W, self._last = p_W[:2].copy(), t
+
+    def _start(self, p_W: Float[np.ndarray, "2"]) -> None:
+        self._aiding = True
+        self.p_W = p_W.copy()
+        self._tell("started relative aiding")
+
+    def _tell(self, what: str) -> None:
+        self.texts.append(f"EKF3 IMU0 {what}")

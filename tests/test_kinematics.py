@@ -5,7 +5,7 @@ import pytest
 from motion import smooth_motion
 
 from spinndrift.models.recordings.kinematics import agreement, contradictions, dead_reckoned
-from spinndrift.models.recordings.resample import conjugate, rotate
+from spinndrift.models.recordings.resample import rotations
 
 T = np.arange(0.0, 20.0, 0.05)
 
@@ -53,7 +53,7 @@ def world_velocity(X, V, v_W):
 
 
 def world_rates(X, V, v_W):
-    V[3:] = rotate(X[:4], V[3:])
+    V[3:] = rotations(X[:4]).apply(V[3:].T).T
     return X, V
 
 
@@ -62,7 +62,7 @@ def scalar_last(X, V, v_W):
 
 
 def inverse(X, V, v_W):
-    return np.concatenate([conjugate(X[:4]), X[4:]]), V
+    return np.concatenate([X[:1], -X[1:4], X[4:]]), V
 
 
 def body_frd(X, V, v_W):

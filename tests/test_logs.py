@@ -4,6 +4,7 @@ import gzip
 import lzma
 import re
 
+import log_writers
 import numpy as np
 import pytest
 import scipy.signal
@@ -25,12 +26,9 @@ from helpers import ROOT, shared_data
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.recordings.kinematics import agreement
 from spinndrift.models.recordings.resample import (
-    conjugate,
     continuous,
     linear,
-    multiply,
-    rotate,
-    rotation_log,
+    rotations,
     slerp,
 )
 from spinndrift.sims.cli import main
@@ -56,7 +54,7 @@ def errors(run, dt):
     """Rotation (rad), position (m), velocity (m/s), rates (rad/s) of a run against the truth."""
     t = run.start + dt * np.arange(len(run))
     X, V, _ = truth(t)
-    turn = rotation_log(multiply(conjugate(X[:4]), run.X_WB[:, :4].T))
+    turn = (rotations(X[:4]).inv() * rotations(run.X_WB[:, :4].T)).as_rotvec().T
     return [
         np.abs(e).max()
         for e in (
@@ -133,6 +131,13 @@ def test_only_the_vehicle_is_heard(tmp_path):
     assert any("Several autopilots" in line for line in report.done)
     with pytest.raises(UserError, match="system 9: not an autopilot"):
         imported(tmp_path, two.bytes(), system=9)
+
+
+def test_attitudes_that_were_never_filled_in_are_none(tmp_path, monkeypatch):
+    ned = log_writers.ned
+    monkeypatch.setattr(log_writers, "ned", lambda t: [(0 * q, *rest) for q, *rest in ned(t)])
+    with pytest.raises(UserError, match="no ATTITUDE in this log"):
+        imported(tmp_path, dive().bytes())
 
 
 def test_cuts_at_modes_arming_and_gaps(tmp_path):
@@ -522,12 +527,11 @@ def test_the_demo_log_obeys_the_simulated_vehicles_laws(demo):
     for j, run in enumerate(recording.trajectories()):
         n = len(run)
         V, q = run.V_WB_B.T, continuous(run.X_WB[:, :4].T)
-        middle = q[:, 1:] + q[:, :-1]
-        middle /= np.linalg.norm(middle, axis=0)
-        v_W = rotate(q, V[:3])
-        acceleration = rotate(conjugate(middle), np.diff(v_W, axis=1) / recording.dt)
+        middle = rotations(q[:, 1:] + q[:, :-1]).inv()
+        v_W = rotations(q).apply(V[:3].T)
+        acceleration = middle.apply(np.diff(v_W, axis=0) / recording.dt).T
         mean = 0.5 * (V[:, 1:] + V[:, :-1])
-        up = rotate(conjugate(middle), np.tile([[0.0], [0.0], [1.0]], n - 1))
+        up = middle.apply([0.0, 0.0, 1.0]).T
         drag = (48.28, 62.08, 68.98)
         for i in range(3):
             columns = np.stack([F[j, 0, : n - 1, i], -mean[i] * np.abs(mean[i]), up[i]], axis=1)
@@ -571,12 +575,11 @@ def against(recording, t_q, q, t_v, v_W):
     turns, misses = [], []
     for run in recording.trajectories():
         t = run.start + recording.dt * np.arange(len(run))
-        true = slerp(t, t_q, continuous(q))
-        turns.append(rotation_log(multiply(conjugate(true), run.X_WB[:, :4].T)))
-        v_B = rotate(conjugate(true), linear(t, t_v, v_W))
-        misses.append(run.V_WB_B[:, :3].T - v_B)
-    angle = np.rad2deg(np.linalg.norm(np.concatenate(turns, axis=1), axis=0))
-    return float(np.median(angle)), float(np.sqrt(np.mean(np.concatenate(misses, axis=1) ** 2)))
+        back = rotations(slerp(t, t_q, continuous(q))).inv()
+        turns.append((back * rotations(run.X_WB[:, :4].T)).magnitude())
+        misses.append(run.V_WB_B[:, :3] - back.apply(linear(t, t_v, v_W).T))
+    angle = np.rad2deg(np.concatenate(turns))
+    return float(np.median(angle)), float(np.sqrt(np.mean(np.concatenate(misses) ** 2)))
 
 
 def test_the_whole_dive_agrees_with_the_simulators_truth():
@@ -610,7 +613,7 @@ def test_climb_of_the_whole_dive_is_the_simulators_at_every_frequency():
         cross, power = np.zeros(2), np.zeros(2)
         for run in recording.trajectories():
             t = run.start + 0.02 * np.arange(len(run))
-            found = rotate(run.X_WB[:, :4].T, run.V_WB_B[:, :3].T)[2]
+            found = rotations(run.X_WB[:, :4].T).apply(run.V_WB_B[:, :3])[:, 2]
             true = -linear(t, true_t, truth_["vd"][new])
             if len(run) < 4096:
                 continue

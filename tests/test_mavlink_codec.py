@@ -72,7 +72,8 @@ def test_euler_angles_there_and_back(roll, pitch, yaw, degrees):
     given_ = np.rad2deg(rpy) if degrees else rpy
     q = codec.attitude_from_euler(*given_, degrees=degrees)
     np.testing.assert_allclose(codec.euler_from_attitude(q, degrees=degrees), given_, atol=1e-6)
-    ned = Rotation.from_euler("ZYX", rpy[::-1]).as_matrix()
+    x, y, z = (Rotation.from_rotvec(turn) for turn in np.diag(rpy))
+    ned = (z * y * x).as_matrix()
     np.testing.assert_allclose(matrix(q), P @ ned @ Q, atol=1e-9)
 
 

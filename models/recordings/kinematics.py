@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .resample import conjugate, continuous, multiply, rotate, rotation_log
+from .resample import continuous, rotations
 
 _WINDOW_S, _LONGER_S = 0.5, (2.0, 5.0)
 _MOVES_M, _TURNS_RAD = 0.02, 0.02  # rms displacement in a window below which nothing is compared
@@ -67,16 +67,10 @@ def _increments(
 ) -> Arrays:
     """Displacements in B (m, rad) and integrals of the twist over windows, (6, windows)."""
     q = continuous(X_WB[:4])
-    step = np.diff(t)
-    middle = q[:, 1:] + q[:, :-1]
-    middle = middle / np.linalg.norm(middle, axis=0)
-    moved = np.concatenate(
-        [
-            rotate(conjugate(middle), np.diff(X_WB[4:], axis=1)),
-            rotation_log(multiply(conjugate(q[:, :-1]), q[:, 1:])),
-        ]
-    )
-    integrated = 0.5 * (V[:, 1:] + V[:, :-1]) * step
+    R, middle = rotations(q), rotations(q[:, 1:] + q[:, :-1])
+    steps = middle.inv().apply(np.diff(X_WB[4:]).T), (R[:-1].inv() * R[1:]).as_rotvec()
+    moved = np.concatenate(steps, axis=1).T
+    integrated = 0.5 * (V[:, 1:] + V[:, :-1]) * np.diff(t)
     window = np.floor((t[1:] - t[0]) / length - 1e-9).astype(int)
     edges = np.flatnonzero(np.concatenate([[True], np.diff(window) > 0]))
     return np.add.reduceat(moved, edges, axis=1), np.add.reduceat(integrated, edges, axis=1)
@@ -89,7 +83,7 @@ def dead_reckoned(
 
     Velocities are rotated into W by the recorded attitude and integrated by the trapezoidal rule.
     """
-    v_W = rotate(X_WB[:, :4].T, V_WB_B[:, :3].T).T
+    v_W = rotations(X_WB[:, :4].T).apply(V_WB_B[:, :3])
     moved = np.cumsum((v_W[1:] + v_W[:-1]) / 2 * np.diff(t)[:, None], axis=0)
     path = np.concatenate([np.zeros((1, 3)), moved])
     return np.concatenate([X_WB[:, :4], np.where(np.isnan(X_WB[:, 4:]), path, X_WB[:, 4:])], axis=1)
@@ -103,7 +97,7 @@ def _flip(x: np.ndarray, rows: tuple[int, ...]) -> np.ndarray:
 
 def _world(X: np.ndarray, V: np.ndarray, part: slice) -> Arrays:
     turned = V.copy()
-    turned[part] = rotate(conjugate(X[:4] / np.linalg.norm(X[:4], axis=0)), V[part])
+    turned[part] = rotations(X[:4]).inv().apply(V[part].T).T
     return X, turned
 
 
@@ -144,7 +138,7 @@ _ANGULAR: list[tuple[str, Callable[[np.ndarray, np.ndarray], Arrays]]] = [
     ),
     (
         "the quaternion looks like world-to-body; give body-to-world (its conjugate)",
-        lambda X, V: (np.concatenate([conjugate(X[:4]), X[4:]]), V),
+        lambda X, V: (_flip(X, (1, 2, 3)), V),
     ),
     (
         "p,q,r look like forward-right-down while the quaternion does not; "

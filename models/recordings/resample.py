@@ -6,6 +6,7 @@ body twist from one sample to the next. Arrays are component first, as in `model
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import RigidTransform, Rotation
 
 _SMALL = 1e-8
 
@@ -92,9 +93,7 @@ def slerp(
     t_new: Float[np.ndarray, " N"], t: Float[np.ndarray, " n"], q: Float[np.ndarray, "4 n"]
 ) -> Float[np.ndarray, "4 N"]:
     """Rotation at constant angular velocity between samples, unit and continuous in sign."""
-    i, s = _locate(t_new, t)
-    turned = multiply(conjugate(q[:, i]), q[:, i + 1])
-    return continuous(multiply(q[:, i], rotation_exp(s * rotation_log(turned))))
+    return geodesic(t_new, t, np.concatenate([q, np.zeros((3, t.size))]))[:4]
 
 
 def geodesic(
@@ -102,14 +101,13 @@ def geodesic(
 ) -> Float[np.ndarray, "7 N"]:
     """Pose at constant body twist between samples: X_i exp(s log(X_i⁻¹ X_i+1))."""
     i, s = _locate(t_new, t)
-    q, p = X[:4, i], X[4:, i]
-    omega = rotation_log(multiply(conjugate(q), X[:4, i + 1]))
-    travelled = rotate(conjugate(q), X[4:, i + 1] - p)
-    # p = V(ω) v with V = 1 + b ω̂ + c ω̂²; solve for v, then move by the fraction s of it
-    v = np.linalg.solve(_left_jacobian(omega), travelled.T[..., None])[..., 0]
-    moved = np.einsum("nij,nj->in", _left_jacobian(s * omega), s[:, None] * v)
-    turned = continuous(multiply(q, rotation_exp(s * omega)))
-    return np.concatenate([turned, p + rotate(q, moved)])
+    before, after = X[:, i], X[:, i + 1]
+    R = rotations(before[:4])
+    moved = R.inv().apply((after - before)[4:].T)
+    whole = RigidTransform.from_components(moved, R.inv() * rotations(after[:4]))
+    part = RigidTransform.from_exp_coords(s[:, None] * whole.as_exp_coords())
+    turned = (R * part.rotation).as_quat(scalar_first=True).T
+    return np.concatenate([continuous(turned), before[4:] + R.apply(part.translation).T])
 
 
 def continuous(q: Float[np.ndarray, "4 n"]) -> Float[np.ndarray, "4 n"]:
@@ -119,59 +117,9 @@ def continuous(q: Float[np.ndarray, "4 n"]) -> Float[np.ndarray, "4 n"]:
     return q * np.where(np.cumsum(flips) % 2, -1.0, 1.0)
 
 
-def multiply(
-    a: Float[np.ndarray, "4 *batch"], b: Float[np.ndarray, "4 *batch"]
-) -> Float[np.ndarray, "4 *batch"]:
-    """Quaternion product a b, components w x y z."""
-    return np.stack(
-        [
-            a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-            a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-            a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-            a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-        ]
-    )
-
-
-def conjugate(q: Float[np.ndarray, "4 *batch"]) -> Float[np.ndarray, "4 *batch"]:
-    """The inverse of a unit quaternion."""
-    return np.concatenate([q[:1], -q[1:]])
-
-
-def rotate(
-    q_AB: Float[np.ndarray, "4 *batch"], v_B: Float[np.ndarray, "3 *batch"]
-) -> Float[np.ndarray, "3 *batch"]:
-    """v_A = R_AB v_B."""
-    t = 2 * np.cross(q_AB[1:], v_B, axis=0)
-    return v_B + q_AB[:1] * t + np.cross(q_AB[1:], t, axis=0)
-
-
-def rotation_log(q: Float[np.ndarray, "4 *batch"]) -> Float[np.ndarray, "3 *batch"]:
-    """Rotation vector (rad) of at most half a turn."""
-    q = q * np.where(q[:1] < 0, -1.0, 1.0)
-    n = np.linalg.norm(q[1:], axis=0)
-    safe = np.where(n > _SMALL, n, 1.0)
-    return q[1:] * np.where(n > _SMALL, 2 * np.arctan2(n, q[0]) / safe, 2.0)
-
-
-def rotation_exp(omega: Float[np.ndarray, "3 *batch"]) -> Float[np.ndarray, "4 *batch"]:
-    """Unit quaternion of a rotation vector (rad)."""
-    angle = np.linalg.norm(omega, axis=0)
-    half = 0.5 * np.sinc(angle / (2 * np.pi))
-    return np.concatenate([np.cos(angle / 2)[None], half * omega])
-
-
-def _left_jacobian(omega: np.ndarray) -> np.ndarray:
-    angle2 = (omega**2).sum(axis=0)
-    angle = np.sqrt(angle2)
-    near = angle2 < 1e-6
-    safe = np.where(near, 1.0, angle2)
-    b = np.where(near, 0.5 - angle2 / 24, (1 - np.cos(angle)) / safe)
-    c = np.where(near, 1 / 6 - angle2 / 120, (angle - np.sin(angle)) / (safe * np.sqrt(safe)))
-    x, y, z = omega
-    zero = np.zeros_like(x)
-    hat = np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), -1, 0)
-    return np.eye(3) + b[:, None, None] * hat + c[:, None, None] * (hat @ hat)
+def rotations(q: Float[np.ndarray, "4 n"]) -> Rotation:
+    """Finite quaternions w x y z of any length as SciPy's rotations."""
+    return Rotation.from_quat(q.T, scalar_first=True)
 
 
 def _locate(t_new: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

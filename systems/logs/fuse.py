@@ -13,13 +13,12 @@ import numpy as np
 
 from ...models.recordings.build import Trajectory
 from ...models.recordings.resample import (
-    conjugate,
     grid,
     hermite,
     hold,
     linear,
     mean,
-    rotate,
+    rotations,
     slerp,
 )
 from .segments import Segment, segments
@@ -103,11 +102,10 @@ def resample(signals: Signals, segment: Segment, number: int, dt: float) -> Traj
         v_W = linear(t, signals.velocity.t, signals.velocity.x)
         sensors["vertical_velocity"] = v_W[2]
         if aided:
-            v = rotate(conjugate(q), v_W)
+            v = rotations(q).inv().apply(v_W.T).T
         else:
             p[:2] = np.nan
-            up = rotate(conjugate(q), np.tile([[0.0], [0.0], [1.0]], t.size))
-            v[2] = v_W[2] * up[2]
+            v[2] = v_W[2] * rotations(q).as_matrix()[:, 2, 2]
     if signals.specific_force is not None:
         sensors["imu_specific_force"] = _instants(signals.specific_force, t).T
     if signals.rates.source.startswith(("RAW_IMU", "SCALED_IMU", "IMU", "GYR")):

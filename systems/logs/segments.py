@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from ...models.recordings.resample import conjugate, multiply, rotation_exp, rotation_log
+from ...models.recordings.resample import rotations
 from .signals import Series, Signals, Spans
 
 _GUARD_S = 0.1
@@ -68,13 +69,12 @@ def jumps(signals: Signals) -> list[tuple[float, str]]:
     found = []
     q, omega = signals.attitude, signals.rates
     step = np.diff(q.t)
-    turned = multiply(conjugate(q.x[:, :-1]), q.x[:, 1:])
+    R = rotations(q.x)
     middle = 0.5 * (q.t[1:] + q.t[:-1])
     rate = np.stack([np.interp(middle, omega.t, omega.x[i]) for i in range(3)])
-    off = np.linalg.norm(
-        rotation_log(multiply(conjugate(rotation_exp(rate * step)), turned)), axis=0
-    )
-    times = middle[off > 0.06 + 1.5 * step]
+    turn = Rotation.from_rotvec(np.nan_to_num(rate * step).T)
+    off = (turn.inv() * R[:-1].inv() * R[1:]).magnitude()
+    times = middle[np.isfinite(rate).all(axis=0) & (off > 0.06 + 1.5 * step)]
     found += [(float(t), "attitude reset of the estimator") for t in times]
     if signals.position is None or signals.velocity is None:
         return found

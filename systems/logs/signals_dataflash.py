@@ -145,7 +145,7 @@ def _attitude(tables: Mapping[str, Table], core: int) -> Series:
         e = tables["ATT"]
         x = codec.attitude_from_euler(e["Roll"], e["Pitch"], e["Yaw"], degrees=True)
         found.append(series(e["t"], x, "ATT", "attitude"))
-    usable = [s for s in found if s is not None]
+    usable = [s for s in found if s is not None and np.isfinite(s.x).all()]
     if not usable:
         raise UserError("no attitude (XKQ, ATT) in this log; set LOG_BITMASK to its default")
     return max(usable, key=lambda s: s.rate)

@@ -108,7 +108,7 @@ def _attitude(tables: Mapping[str, Table]) -> Series:
     if (e := tables.get("ATTITUDE")) is not None:
         x = codec.attitude_from_euler(e["roll"], e["pitch"], e["yaw"])
         found.append(series(e["t"], x, "ATTITUDE", "attitude"))
-    usable = [s for s in found if s is not None]
+    usable = [s for s in found if s is not None and np.isfinite(s.x).all()]
     if not usable:
         raise UserError("no ATTITUDE in this log; stream ATTITUDE (50 Hz is good) while logging")
     return max(usable, key=lambda s: s.t.size)

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from ...models.frames import frd_to_flu, ned_to_enu, quaternion_to_flu_enu
 
@@ -78,36 +79,19 @@ def attitude_from_euler(
     roll: Field, pitch: Field, yaw: Field, degrees: bool = False
 ) -> Float[np.ndarray, "4 *batch"]:
     """q_WB from NED roll, pitch, yaw: ATTITUDE (rad) or ATT (degrees)."""
-    half = _stack(roll, pitch, yaw) / 2
-    if degrees:
-        half = np.deg2rad(half)
-    cr, cp, cy = np.cos(half)
-    sr, sp, sy = np.sin(half)
-    return quaternion_to_flu_enu(
-        np.stack(
-            [
-                cr * cp * cy + sr * sp * sy,
-                sr * cp * cy - cr * sp * sy,
-                cr * sp * cy + sr * cp * sy,
-                cr * cp * sy - sr * sp * cy,
-            ]
-        )
-    )
+    angles = np.moveaxis(_stack(yaw, pitch, roll), 0, -1)
+    q = Rotation.from_euler("ZYX", angles, degrees=degrees).as_quat(scalar_first=True)
+    return quaternion_to_flu_enu(np.moveaxis(q, -1, 0))
 
 
 def euler_from_attitude(
     q_WB: Float[np.ndarray, "4 *batch"], degrees: bool = False
 ) -> Float[np.ndarray, "3 *batch"]:
     """NED roll, pitch, yaw (rad) of q_WB: inverse of `attitude_from_euler`, yaw in (−π, π]."""
-    w, x, y, z = quaternion_to_frd_ned(q_WB)
-    rpy = np.stack(
-        [
-            np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-            np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
-            np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-        ]
-    )
-    return np.rad2deg(rpy) if degrees else rpy
+    q = np.moveaxis(quaternion_to_frd_ned(q_WB), 0, -1)
+    turned = Rotation.from_quat(q, scalar_first=True)
+    angles = turned.as_euler("ZYX", degrees=degrees, suppress_warnings=True)  # nose up or down
+    return np.moveaxis(angles, -1, 0)[::-1]
 
 
 def world_vector(north: Field, east: Field, down: Field) -> Float[np.ndarray, "3 *batch"]:

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from ...models.config.errors import UserError
 from ...models.effects.recorded_rollout import Commands
@@ -235,20 +236,17 @@ def _normalised(
     """Poses in the frame that `normalise` attaches to each window's start."""
     if normalise == "none":
         return X_WB
-    w, x, y, z = X_WB[0, :4].astype(np.float64)
+    X = np.moveaxis(X_WB, 1, -1).astype(np.float64)  # NumPy, for double precision
+    R = Rotation.from_quat(X[..., :4], scalar_first=True)
+    back = R[0].inv()
     if normalise == "heading":
-        half = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) / 2
-        w, x, y, z = np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)
-    # the inverse of the start's rotation, applied to all poses; in NumPy for double precision
-    u = np.stack([-x, -y, -z])
-    q, p = X_WB[:, :4].astype(np.float64), (X_WB[:, 4:] - X_WB[:1, 4:]).astype(np.float64)
-    scalar = w * q[:, 0] - np.sum(u * q[:, 1:], axis=1)
-    vector = w * q[:, 1:] + q[:, :1] * u + np.cross(u[None], q[:, 1:], axis=1)
-    turned = np.concatenate([scalar[:, None], vector], axis=1)
-    t = 2 * np.cross(u[None], p, axis=1)
-    moved = p + w * t + np.cross(u[None], t, axis=1)
-    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-    return np.concatenate([turned, moved], axis=1).astype(X_WB.dtype)
+        w, x, y, z = X[0, :, :4].T
+        heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        back = Rotation.from_rotvec(-heading[:, None] * [0.0, 0.0, 1.0])
+    turned = (back * R).as_quat(scalar_first=True)
+    moved = back.apply(X[..., 4:] - X[:1, :, 4:])
+    parts = [np.moveaxis(a, -1, 1) for a in (turned, moved)]
+    return np.concatenate(parts, axis=1).astype(X_WB.dtype)
 
 
 def split_windows(

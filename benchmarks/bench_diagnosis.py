@@ -38,23 +38,25 @@ def diagnoser(recording: Recording) -> Diagnoser:
 
 
 def test_predictions_of_all_samples(benchmark, recording):
-    bench = diagnoser(recording).bench
+    problem = diagnoser(recording).problem
 
     def look():
-        predict(bench.model, bench.library, bench.believed, bench.data).error.block_until_ready()
+        predict(
+            problem.model, problem.library, problem.believed, problem.data
+        ).error.block_until_ready()
 
     benchmark.pedantic(look, rounds=5, warmup_rounds=1)
 
 
 def test_all_single_causes(benchmark, recording):
     """One look at the data and the fit of every cause alone, single thrusters too."""
-    bench = diagnoser(recording).bench
+    problem = diagnoser(recording).problem
     rng = np.random.default_rng(0)
     choices = []
 
     def single():
-        first = bench.look(bench.believed)
-        search = Search(bench, [], 0.01, 6, rng, lambda fraction, remark: None)
+        first = problem.evaluate(problem.believed)
+        search = Search(problem, [], 0.01, 6, rng, lambda fraction, remark: None)
         choices.append(search.next(Found(first, first, first))[0])
 
     benchmark.pedantic(single, rounds=3, warmup_rounds=1)

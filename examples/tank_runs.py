@@ -30,9 +30,9 @@ from spinndrift.models.recordings.resample import continuous, geodesic, grid, ho
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.se3 import AXES
 from spinndrift.models.vehicles.vehicle import Vehicle, load_vehicle
-from spinndrift.training.diagnosis.filter.problem import Bench
+from spinndrift.training.diagnosis.filter.problem import DiagnosisProblem
 from spinndrift.training.diagnosis.selection.multi_step_fit import (
-    HorizonFit,
+    MultiStepFit,
     Windows,
     fit_forecasts,
     forecast_errors,
@@ -250,7 +250,7 @@ class Judged:
 
     name: str
     errors: Float[np.ndarray, "M 12 K"]
-    fits: dict[str, HorizonFit]
+    fits: dict[str, MultiStepFit]
 
 
 def rows_of(library: Library, lines: int) -> list[int]:
@@ -265,26 +265,26 @@ def rows_of(library: Library, lines: int) -> list[int]:
 
 def climb(
     recording: Recording, lines: int = len(LADDER), tell: Callable[[str], None] = print
-) -> tuple[Bench, Windows, list[Judged]]:
+) -> tuple[DiagnosisProblem, Windows, list[Judged]]:
     """Fit every line of the ladder without each run in turn, and forecast that run."""
-    bench = Bench.of(recording, load_vehicle("bluerov2_heavy"))
-    bench = bench.with_effect(AxisThrust.neutral())
-    w = windows(bench.data, HORIZON, EVERY)
+    problem = DiagnosisProblem.of(recording, load_vehicle("bluerov2_heavy"))
+    problem = problem.with_effect(AxisThrust.neutral())
+    w = windows(problem.data, HORIZON, EVERY)
     judged = []
     for number, (name, _) in enumerate(LADDER[:lines]):
         errors, fits = np.zeros((w.u.shape[0], 12, len(w.block))), {}
-        rows = rows_of(bench.library, number)
-        for s, run in enumerate(bench.data.names):
-            fit = fit_forecasts(bench, w, rows, kept=w.scenario != s)
+        rows = rows_of(problem.library, number)
+        for s, run in enumerate(problem.data.names):
+            fit = fit_forecasts(problem, w, rows, kept=w.scenario != s)
             own = w.scenario == s
-            errors[..., own] = forecast_errors(bench, fit.theta, w)[..., own]
+            errors[..., own] = forecast_errors(problem, fit.theta, w)[..., own]
             fits[run] = fit
         tell(f"fitted: {name}")
         judged.append(Judged(name, errors, fits))
-    return bench, w, judged
+    return problem, w, judged
 
 
-def tables(bench: Bench, w: Windows, judged: list[Judged]) -> str:
+def tables(problem: DiagnosisProblem, w: Windows, judged: list[Judged]) -> str:
     """What is gained on runs left out, and the values found, in Markdown."""
     rule = "|---" * 5 + "|"
     lines = [f"Errors after {HORIZON:g} s on the run left out, 95 % intervals, blocks of 10 s:", ""]
@@ -298,10 +298,10 @@ def tables(bench: Bench, w: Windows, judged: list[Judged]) -> str:
         cells = rmse(j.errors, w.block, np.random.default_rng(0), before.errors).values()
         lines.append(f"| {j.name} | " + " | ".join(_cell(*c, digits=2) for c in cells) + " |")
     lines += ["", "Position (m) and rotation (rad) by the run left out:", ""]
-    lines += ["| model | " + " | ".join(bench.data.names) + " |", "|---" * 4 + "|"]
+    lines += ["| model | " + " | ".join(problem.data.names) + " |", "|---" * 4 + "|"]
     for j in judged:
         cells = []
-        for s in range(len(bench.data.names)):
+        for s in range(len(problem.data.names)):
             own = w.scenario == s
             found = rmse(j.errors[..., own], w.block[own], np.random.default_rng(0))
             cells.append(f"{found['position'][0]:.3f}, {found['rotation'][0]:.3f}")
@@ -314,37 +314,37 @@ def tables(bench: Bench, w: Windows, judged: list[Judged]) -> str:
             "",
         ]
         for run, fit in judged[1].fits.items():
-            rows = [bench.library.index("axis_thrust", axis, "scale") for axis in AXES[:3]]
+            rows = [problem.library.index("axis_thrust", axis, "scale") for axis in AXES[:3]]
             lines.append(f"- without {run}: " + ", ".join(f"{1 + fit.theta[i]:.2f}" for i in rows))
     return "\n".join(lines)
 
 
-def values(bench: Bench, fit: HorizonFit) -> str:
+def values(problem: DiagnosisProblem, fit: MultiStepFit) -> str:
     """Coefficients by axis, for the inertia believed, with standard errors."""
     error = dict(zip(fit.rows, fit.errors, strict=True))
 
     def of(cause: str, where: str, parameter: str = "") -> tuple[float, float]:
-        rows = [i for i in bench.library.at(cause, where)
-                if parameter in ("", bench.library.entries[i].parameter.name)]  # fmt: skip
+        rows = [i for i in problem.library.at(cause, where)
+                if parameter in ("", problem.library.entries[i].parameter.name)]  # fmt: skip
         return float(fit.theta[rows[0]]), float(error.get(rows[0], 0.0))
 
-    M = np.diag(bench.mass(bench.believed))
+    M = np.diag(problem.mass(problem.believed))
     lines = ["| axis | thrust of the preset's | linear drag (believed) | quadratic drag (believed) "
              "| quadratic drag / inertia | drag / thrust, of the preset's |",
              "|---" * 6 + "|"]  # fmt: skip
     for i, axis in enumerate(AXES):
         (g, ge), (l, le), (d, de) = (of(c, axis) for c in
                                     ("axis_thrust", "linear_drag", "quadratic_drag"))  # fmt: skip
-        l0, d0 = (bench.believes(c, axis) for c in ("linear_drag", "quadratic_drag"))
+        l0, d0 = (problem.believes(c, axis) for c in ("linear_drag", "quadratic_drag"))
         lines.append(
             f"| {axis} | {1 + g:.2f} ± {ge:.2f} | {l0 + l:.2f} ± {le:.2f} ({l0:.2f}) "
             f"| {d0 + d:.2f} ± {de:.2f} ({d0:.2f}) | {(d0 + d) / M[i]:.2f} "
             f"| {(d0 + d) / d0 / (1 + g):.2f} |"
         )
-    others = [i for i in fit.rows if bench.library.entries[i].cause not in
+    others = [i for i in fit.rows if problem.library.entries[i].cause not in
               ("axis_thrust", "linear_drag", "quadratic_drag")]  # fmt: skip
     for i in others:
-        e = bench.library.entries[i]
+        e = problem.library.entries[i]
         lines.append(
             f"- {e.cause} {e.where} {e.parameter.name}: {fit.theta[i]:.4g} ± {error[i]:.2g} "
             f"{e.parameter.unit}"
@@ -397,11 +397,11 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"wrote {given.out / 'recording'}\n")
     if given.convert:
         return
-    bench, w, judged = climb(recording, given.lines, lambda text: print(text, file=sys.stderr))
-    print(tables(bench, w, judged))
-    fit = fit_forecasts(bench, w, rows_of(bench.library, given.lines - 1))
+    problem, w, judged = climb(recording, given.lines, lambda text: print(text, file=sys.stderr))
+    print(tables(problem, w, judged))
+    fit = fit_forecasts(problem, w, rows_of(problem.library, given.lines - 1))
     print(f"\n{judged[-1].name}, fitted to all runs, inertia as believed:\n")
-    print(values(bench, fit))
+    print(values(problem, fit))
     draw(w, judged, recording.dt, given.out / "tank-runs.png")
     print(f"\nwrote {given.out / 'tank-runs.png'}")
 

@@ -23,7 +23,7 @@ from spinndrift.training.data.generate import GenerateConfig, generate
 from spinndrift.training.diagnosis.data.arrays import Data
 from spinndrift.training.diagnosis.data.checks import limits
 from spinndrift.training.diagnosis.disturbance.laws import find_laws
-from spinndrift.training.diagnosis.filter import problem as looking
+from spinndrift.training.diagnosis.filter import problem as problem_module
 from spinndrift.training.diagnosis.filter.innovations import predict
 from spinndrift.training.diagnosis.filter.noise import (
     Noise,
@@ -31,11 +31,11 @@ from spinndrift.training.diagnosis.filter.noise import (
     make_filter,
     process_covariance,
 )
-from spinndrift.training.diagnosis.filter.sensitivities import respond
+from spinndrift.training.diagnosis.filter.sensitivities import whitened_sensitivities
 from spinndrift.training.diagnosis.filter.transition import Transition
 from spinndrift.training.diagnosis.findings.reported import (
     following,
-    noise_words,
+    noise_levels,
     residual,
     sentence,
     verdict,
@@ -119,29 +119,29 @@ def null(tmp_path_factory):
     for seed in (1, 2):
         folder = tmp_path_factory.mktemp("null")
         _, recording = recorded(folder, seed, "null")
-        diagnoser = Diagnoser(recording, VEHICLE).bench
-        found.append((diagnoser, diagnoser.look(diagnoser.believed)))
+        diagnoser = Diagnoser(recording, VEHICLE).problem
+        found.append((diagnoser, diagnoser.evaluate(diagnoser.believed)))
     return found
 
 
 def test_slopes_that_overflow_are_a_step_too_far(null, monkeypatch):
-    bench, look = null[0]
-    steep = np.full(look.predictions.jacobian.shape, np.inf)
-    broken = look.predictions._replace(jacobian=steep)
-    monkeypatch.setattr(looking, "predict", lambda *given: broken)
+    problem, evaluation = null[0]
+    steep = np.full(evaluation.predictions.jacobian.shape, np.inf)
+    broken = evaluation.predictions._replace(jacobian=steep)
+    monkeypatch.setattr(problem_module, "predict", lambda *given: broken)
     with pytest.raises(FloatingPointError, match="overflow"):
-        bench.predict(bench.believed)
+        problem.predict(problem.believed)
 
 
 def test_noise_is_found_and_innovations_are_white_on_a_null(null):
     """Two minutes of data: levels within what so few samples allow, whiteness to a few sigma."""
-    for diagnoser, look in null:
-        record, b = look.noise.record, look.noise.diffusion
+    for diagnoser, evaluation in null:
+        record, b = evaluation.noise.record, evaluation.noise.diffusion
         np.testing.assert_allclose(record[:3], 0.005, rtol=0.2)
         np.testing.assert_allclose(record[3:6], 0.0017, rtol=0.2)
         np.testing.assert_allclose(b[:3], 1.0, rtol=0.25)
         np.testing.assert_allclose(b[3:], 0.03, rtol=0.25)
-        z = look.z
+        z = evaluation.z
         n = np.sqrt(z.shape[0] * z.shape[2])
         assert np.abs(z.mean(axis=(0, 2)) * n).max() < 4.5
         acf = (z[1:] * z[:-1]).mean(axis=(0, 2)) / (z**2).mean(axis=(0, 2))
@@ -151,21 +151,21 @@ def test_noise_is_found_and_innovations_are_white_on_a_null(null):
 
 def test_responses_of_instruments_are_derivatives_of_the_innovations(null):
     """Also where instruments are at fault already: records differ as they show states."""
-    bench = null[0][0]
-    library = bench.library
+    problem = null[0][0]
+    library = problem.library
     rows = [library.index("heading_error", "all", "sine")]
     rows += [library.index("dvl_misalignment", "yaw", "angle")]
-    theta = bench.believed.copy()
+    theta = problem.believed.copy()
     theta[rows] = 0.06, 0.04
-    p, _, kalman = bench.predict(theta)
+    p, _, kalman = problem.predict(theta)
     probes = np.zeros((2, library.size))
     probes[[0, 1], rows] = 0.002
-    z = respond(bench.model, library, theta, probes, bench.data, p, kalman)
+    z = whitened_sensitivities(problem.model, library, theta, probes, problem.data, p, kalman)
     before = filtered(np.asarray(p.error), np.asarray(p.jacobian), kalman)
     for response, probe in zip(z[1:], probes, strict=True):
-        q = predict(bench.model, library, theta + probe, bench.data)
+        q = predict(problem.model, library, theta + probe, problem.data)
         after = filtered(np.asarray(q.error), np.asarray(q.jacobian), kalman)
-        change = (after - before) * bench.data.weight[:, None]
+        change = (after - before) * problem.data.weight[:, None]
         off = response.reshape(change.shape) - change
         assert np.sum(off**2) < 5e-4 * np.sum(change**2)
 
@@ -173,25 +173,25 @@ def test_responses_of_instruments_are_derivatives_of_the_innovations(null):
 def test_one_step_finds_a_heading_error_where_a_sample_turns_less_than_a_probe(tmp_path):
     case = draw(0, names=("heading_error",), plan=replace(PLAN, rate=50.0))
     case.write(tmp_path / "data")
-    bench = Diagnoser(read_csv(tmp_path / "data"), VEHICLE).bench
-    rows = bench.library.at("heading_error", "all")
-    step = bench.look(bench.believed, rows).evidence.fit(rows).values
+    problem = Diagnoser(read_csv(tmp_path / "data"), VEHICLE).problem
+    rows = problem.library.at("heading_error", "all")
+    step = problem.evaluate(problem.believed, rows).evidence.fit(rows).values
     truth, none = case.effects[0].parameters(), {"value": 0.0}
     for i, found in zip(rows, step, strict=True):
-        name = bench.library.entries[i].parameter.name
+        name = problem.library.entries[i].parameter.name
         assert found == pytest.approx(truth.get(name, none)["value"], abs=0.004), name
 
 
 def test_nulls_are_adequate(null):
     """No name wins what noise can't: the calibrated threshold holds on data of another maker."""
-    for diagnoser, look in null:
+    for diagnoser, evaluation in null:
         library = diagnoser.library
         sets = {h: library.at(*h) for h in library.hypotheses(single=False)}
-        chance = look.evidence.chance(list(sets.values()), [], np.random.default_rng(0))
+        chance = evaluation.evidence.chance(list(sets.values()), [], np.random.default_rng(0))
         threshold = chance.exceeded(0.01)
         assert chance.beyond(threshold) == pytest.approx(0.01)
         assert 3 < threshold < 20
-        fits = {h: look.evidence.fit(s) for h, s in sets.items()}
+        fits = {h: evaluation.evidence.fit(s) for h, s in sets.items()}
         assert choose(library, diagnoser.believed, fits, threshold, 0.01) is None
 
 
@@ -201,10 +201,10 @@ def test_nulls_are_adequate(null):
 )
 def test_causes_are_named_first(tmp_path, name):
     case, recording = recorded(tmp_path, 11, names=(name,))
-    diagnoser = Diagnoser(recording, VEHICLE).bench
-    look = diagnoser.look(diagnoser.believed)
+    diagnoser = Diagnoser(recording, VEHICLE).problem
+    evaluation = diagnoser.evaluate(diagnoser.believed)
     library = diagnoser.library
-    fits = {h: look.evidence.fit(library.at(*h)) for h in library.hypotheses(single=False)}
+    fits = {h: evaluation.evidence.fit(library.at(*h)) for h in library.hypotheses(single=False)}
     choice = choose(library, diagnoser.believed, fits, 8.0, 0.01)
     assert choice is not None
     assert choice.hypothesis[0] == name
@@ -450,12 +450,12 @@ def test_structure_without_a_name_is_found_where_it_is(tmp_path):
 
     case, recording = recorded(tmp_path, 70002, "unknown", names=("memory",))
     hidden = case.answer()["causes"][0]
-    bench = Diagnoser(recording, VEHICLE).bench
-    look = bench.look(bench.believed)
-    screen, rng = Screen(bench, look, None), np.random.default_rng(0)
+    problem = Diagnoser(recording, VEHICLE).problem
+    evaluation = problem.evaluate(problem.believed)
+    screen, rng = Screen(problem, evaluation, None), np.random.default_rng(0)
     nodes = [(t, f) for t in (0.4, 1.2, 4.0) for f in (0.0, 0.2, 0.5, 1.0)]
     found = {
-        axis: screen.match(_memory(bench, i, i, nodes), 0.01, rng)
+        axis: screen.match(_memory(problem, i, i, nodes), 0.01, rng)
         for i, axis in ((1, "sway"), (5, "yaw"))
     }
     assert hidden["where"] == "yaw"
@@ -482,13 +482,13 @@ def test_how_thrusters_follow_is_told_with_number_and_place(tmp_path, name, seed
 
     case, recording = recorded(tmp_path, seed, "unknown", names=(name,))
     hidden = case.answer()["causes"][0]
-    bench = Diagnoser(recording, VEHICLE).bench
+    problem = Diagnoser(recording, VEHICLE).problem
     rng = np.random.default_rng(0)
-    seen = screened(bench, bench.look(bench.believed), [], 0.01, rng)
+    seen = screened(problem, problem.evaluate(problem.believed), [], 0.01, rng)
     assert seen is not None
     effect = refined(seen[0], seen[1], rng)
     assert (effect.kind, effect.acts_on) == (kind, hidden["where"])
-    told = described(effect, np.ones(1), bench)
+    told = described(effect, np.ones(1), problem)
     assert told["variables"] == list(case.answer()["causes"][0]["variables"])
     if name != "exchange":
         (number,) = hidden["parameters"].values()
@@ -508,9 +508,9 @@ def test_a_swaying_mass_ahead_of_the_origin_is_seen_in_yaw(tmp_path):
 
     case, recording = recorded(tmp_path, 70011, "unknown", names=("appendage",))
     hidden = case.answer()["causes"][0]
-    bench = Diagnoser(recording, VEHICLE).bench
-    look = bench.look(bench.believed)
-    seen = screened(bench, look, [], 0.01, np.random.default_rng(0))
+    problem = Diagnoser(recording, VEHICLE).problem
+    evaluation = problem.evaluate(problem.believed)
+    seen = screened(problem, evaluation, [], 0.01, np.random.default_rng(0))
     assert hidden["where"] == "sway"
     assert seen is not None
     group = seen[1].group
@@ -558,25 +558,25 @@ def test_positions_that_were_not_measured_tell_nothing_and_ask_for_nothing(tmp_p
     hidden = recording.dataset.copy(deep=True)
     hidden["X_WB"][..., 4:6] = np.nan
     diagnoser = Diagnoser(Recording(hidden), VEHICLE)
-    bench = diagnoser.bench
-    assert bench.data.unmeasured == ("x", "y")
+    problem = diagnoser.problem
+    assert problem.data.unmeasured == ("x", "y")
     assert not diagnoser.faults
-    look = bench.look(bench.believed)
-    elsewhere = bench.data.X.copy()
-    elsewhere[:, 4] += np.sin(bench.data.times)
-    moved = replace(bench, data=replace(bench.data, X=elsewhere))
-    np.testing.assert_allclose(moved.look(bench.believed).z, look.z, atol=2e-3)
-    assert np.abs(look.z[:, :3]).max() < 0.01
-    rows = [bench.library.index("dvl_lever_arm", axis, "offset") for axis in "xyz"]
-    theta, after, fit = bench.polish(bench.believed, rows)
+    evaluation = problem.evaluate(problem.believed)
+    elsewhere = problem.data.X.copy()
+    elsewhere[:, 4] += np.sin(problem.data.times)
+    moved = replace(problem, data=replace(problem.data, X=elsewhere))
+    np.testing.assert_allclose(moved.evaluate(problem.believed).z, evaluation.z, atol=2e-3)
+    assert np.abs(evaluation.z[:, :3]).max() < 0.01
+    rows = [problem.library.index("dvl_lever_arm", axis, "offset") for axis in "xyz"]
+    theta, after, fit = problem.polish(problem.believed, rows)
     arm = np.array([p["value"] for p in case.effects[0].parameters().values()])
     assert np.all(np.abs(theta[rows] - arm) < 3 * fit.errors)
     assert np.all(fit.errors < 0.02)
     np.testing.assert_allclose((after.z[:, 3:] ** 2).mean(axis=(0, 2)), 1.0, atol=0.15)
-    left = residual(bench, after)
+    left = residual(problem, after)
     assert all(np.isnan(left[name].variance_ratio) for name in "xyz")
-    assert "position_m" not in noise_words(bench, after)
-    assert "x, y of the position were not measured" in limits(bench.data, [], False)[0]
+    assert "position_m" not in noise_levels(problem, after)
+    assert "x, y of the position were not measured" in limits(problem.data, [], False)[0]
     hidden["V_WB_B"][..., 0] = np.nan
     with pytest.raises(UserError, match="V_WB_B u is missing; a diagnosis needs"):
         Diagnoser(Recording(hidden), VEHICLE)
@@ -643,7 +643,7 @@ def test_commands_that_never_change_name_nothing_that_follows_them(tmp_path):
     diagnoser = Diagnoser(recording, VEHICLE)
     assert diagnoser.faults[0].startswith("thruster_force never changes")
     assert diagnoser.quiet == list(AXES)
-    names = {name for name, _ in diagnoser._names(diagnoser.bench, [], 0.0, 1.0).names}
+    names = {name for name, _ in diagnoser._names(diagnoser.problem, [], 0.0, 1.0).names}
     assert not names & {"thruster_lag", "quadratic_drag", "proximity", "payload"}
     assert names >= {"net_buoyancy", "current_steady", "dvl_scale"}
 
@@ -666,14 +666,14 @@ def test_times_below_those_of_sparse_commands_are_no_cause(tmp_path):
     sparse = Recording(recording.dataset.assign_attrs(command_period=0.1))
     for given, named in ((recording, True), (sparse, False)):
         diagnoser = Diagnoser(given, VEHICLE)
-        look = diagnoser.bench.look(diagnoser.bench.believed)
-        search = diagnoser._names(diagnoser.bench, [], 0.0, 1.0)
-        choice = search.next(Found(look, look, look))[0]
+        evaluation = diagnoser.problem.evaluate(diagnoser.problem.believed)
+        search = diagnoser._names(diagnoser.problem, [], 0.0, 1.0)
+        choice = search.next(Found(evaluation, evaluation, evaluation))[0]
         assert (choice is not None and choice.hypothesis[0] == "clock_offset") == named
-    assert "logged at 10 Hz" in limits(diagnoser.bench.data, [], False, command_period=0.1)[-1]
+    assert "logged at 10 Hz" in limits(diagnoser.problem.data, [], False, command_period=0.1)[-1]
     assert limits(
-        diagnoser.bench.data, [], False, command_period=diagnoser.bench.data.dt
-    ) == limits(diagnoser.bench.data, [], False)
+        diagnoser.problem.data, [], False, command_period=diagnoser.problem.data.dt
+    ) == limits(diagnoser.problem.data, [], False)
 
 
 def _read(folder, runs):
@@ -686,18 +686,20 @@ def _read(folder, runs):
 def test_a_name_nested_in_another_keeps_the_data(tmp_path):
     """A tether can push up as buoyancy does, with six numbers more: the simple name is given."""
     _, recording = recorded(tmp_path, 12, names=("net_buoyancy",))
-    bench = Diagnoser(recording, VEHICLE).bench
-    look = bench.look(bench.believed)
-    found = Found(look, look, look)
-    search = Search(bench, [], 0.01, 1, np.random.default_rng(0), lambda fraction, remark: None)
+    problem = Diagnoser(recording, VEHICLE).problem
+    evaluation = problem.evaluate(problem.believed)
+    found = Found(evaluation, evaluation, evaluation)
+    search = Search(problem, [], 0.01, 1, np.random.default_rng(0), lambda fraction, remark: None)
     search.run(found)
     assert found.hypotheses == [("net_buoyancy", "all")]
     fits, won = found.fits, found.accepted[0].fit.heldout_gain
     tether = fits["tether", "W"]
     assert tether.heldout_gain > won - 10
-    assert not is_itself(bench.library, look.theta, tether), "a tether pulls sideways or tautens"
+    assert not is_itself(problem.library, evaluation.theta, tether), (
+        "a tether pulls sideways or tautens"
+    )
     held = replace(tether, values=np.array([0.5, *tether.values[1:]]))
-    assert is_itself(bench.library, look.theta, held)
+    assert is_itself(problem.library, evaluation.theta, held)
 
 
 def test_simulated_states_without_noise_are_no_clock_that_is_off():
@@ -706,9 +708,9 @@ def test_simulated_states_without_noise_are_no_clock_that_is_off():
         maneuvers=("surge-forward", "yaw-left", "heave-roll-pitch"), trajectories=4, duration=6.0
     )
     diagnoser = Diagnoser(generate(config, VEHICLE), VEHICLE)
-    look = diagnoser.bench.look(diagnoser.bench.believed)
-    search = diagnoser._names(diagnoser.bench, [], 0.0, 1.0)
-    assert search.next(Found(look, look, look))[0] is None
+    evaluation = diagnoser.problem.evaluate(diagnoser.problem.believed)
+    search = diagnoser._names(diagnoser.problem, [], 0.0, 1.0)
+    assert search.next(Found(evaluation, evaluation, evaluation))[0] is None
 
 
 def test_bands_hold_what_a_law_of_the_disturbance_adds(tmp_path):
@@ -719,14 +721,16 @@ def test_bands_hold_what_a_law_of_the_disturbance_adds(tmp_path):
     from spinndrift.training.evaluation.metrics import BANDS
 
     _, recording = recorded(tmp_path, 5, names=("disturbance_colour",))
-    bench = Diagnoser(recording, VEHICLE).bench
-    look = bench.look(bench.believed, [])
-    laws = [w for w in laws_of(bench, look) if w.heldout_gain > 5 and "colour" in w.name]
-    _, colour = law_cause(laws, [], bench, look)
-    theta = np.repeat(bench.believed[:, None], len(bench.data.fold), axis=1)
+    problem = Diagnoser(recording, VEHICLE).problem
+    evaluation = problem.evaluate(problem.believed, [])
+    laws = [w for w in laws_of(problem, evaluation) if w.heldout_gain > 5 and "colour" in w.name]
+    _, colour = law_cause(laws, [], problem, evaluation)
+    theta = np.repeat(problem.believed[:, None], len(problem.data.fold), axis=1)
     shares, energies = [], []
-    for stirring in ((), (colour,)):
-        judged = judge(bench, Contender(theta, stirring=stirring), 2.0, 0, [], estimated=False)
+    for random_effects in ((), (colour,)):
+        judged = judge(
+            problem, Contender(theta, random_effects=random_effects), 2.0, 0, [], estimated=False
+        )
         shares.append(judged.inside[BANDS.index(0.9)].sum(axis=1) / judged.count.sum(axis=1))
         energies.append(judged.energy.sum(axis=1) / judged.count.sum(axis=1))
     assert shares[0][-1] < 0.8

@@ -1,4 +1,4 @@
-"""Laws of the disturbance: which are told, and causes judged beside those that last."""
+"""Laws of the disturbance: which are reported, and causes judged with slow ones as noise."""
 
 from dataclasses import dataclass, replace
 
@@ -19,16 +19,20 @@ from spinndrift.training.diagnosis.disturbance.found import (
     _grown,
     all_laws,
     laws_of,
-    told,
+    reported_laws,
     won_by,
 )
 from spinndrift.training.diagnosis.disturbance.laws import Law, estimated, impacts
 from spinndrift.training.diagnosis.disturbance.levels import LEVEL
-from spinndrift.training.diagnosis.disturbance.waves import beside_laws, find_current, find_waves
+from spinndrift.training.diagnosis.disturbance.waves import (
+    correlated_noise_of,
+    find_current,
+    find_waves,
+)
 from spinndrift.training.diagnosis.filter.noise import estimate, score_of
 from spinndrift.training.diagnosis.filter.transition import Transition
 from spinndrift.training.diagnosis.pipeline import Diagnoser
-from spinndrift.training.diagnosis.selection.correlated_noise import Beside
+from spinndrift.training.diagnosis.selection.correlated_noise import CorrelatedNoise
 from spinndrift.training.diagnosis.selection.search import Found, Search
 
 VEHICLE = load_vehicle("bluerov2_heavy")
@@ -36,7 +40,7 @@ LEVELS = np.array([1.0] * 3 + [0.03] * 3)
 
 
 @pytest.fixture(scope="module")
-def bench_of(tmp_path_factory):
+def problem_of(tmp_path_factory):
     """A bench of a hidden cause, and its cause; the belief states the level that was hidden."""
 
     def made(name, size, noise=None, believed=LEVELS, **plan):
@@ -45,7 +49,7 @@ def bench_of(tmp_path_factory):
         case = draw(3, names=(name,), size=size, plan=plan, noise=noise)
         case.write(folder)
         diagnoser = Diagnoser(read_csv(folder), VEHICLE, VEHICLE.dynamics(believed))
-        return diagnoser.bench, case.effects[0]
+        return diagnoser.problem, case.effects[0]
 
     return made
 
@@ -55,7 +59,7 @@ def test_what_is_drawn_anew_is_integrated_out():
     rng = np.random.default_rng(0)
     z, J = rng.standard_normal((4, 36, 5)), rng.standard_normal((3, 36, 5))
     variance = np.array([0.5, 2.0, 10.0])
-    G = Beside(drawn=J, precision=1 / variance).products(z)
+    G = CorrelatedNoise(amplitudes=J, precision=1 / variance).products(z)
     for r in range(5):
         dense = np.eye(36) + J[..., r].T @ np.diag(variance) @ J[..., r]
         np.testing.assert_allclose(
@@ -76,25 +80,25 @@ def test_a_slow_push_is_taken_out_of_all_that_it_moves():
     P = q * q  # variance of what is predicted: the Riccati equation of one state
     for _ in range(500):
         P = rho**2 * P / (P + 1) + q * q
-    beside = Beside.slowly(z, {2: (rho, P / (P + 1))})
-    white = beside._unslowed(z.reshape(1, -1, R)).reshape(N, 12, R)
+    correlated_noise = CorrelatedNoise.from_slow(z, {2: (rho, P / (P + 1))})
+    white = correlated_noise._without_slow(z.reshape(1, -1, R)).reshape(N, 12, R)
     for axis, share in ((8, 0.05), (2, 0.5)):
         before, after = (np.mean(a[1:, axis] * a[:-1, axis]) for a in (z, white))
         assert before > 0.05
         assert abs(after) < share * before
     assert np.mean(white[50:] ** 2) == pytest.approx(1, abs=0.02)
-    doubled = beside._unslowed(np.stack([z, 2 * z]).reshape(2, -1, R))
+    doubled = correlated_noise._without_slow(np.stack([z, 2 * z]).reshape(2, -1, R))
     np.testing.assert_allclose(doubled[1], 2 * doubled[0])
 
 
 @pytest.mark.parametrize("name", ["disturbance_colour", "waves", "current_varying"])
-def test_no_name_imitates_a_large_random_structure(bench_of, name):
+def test_no_name_imitates_a_large_random_structure(problem_of, name):
     """Three times a realistic size: names win thousands of nats, and none beside the structure."""
-    bench, _ = bench_of(name, 3.0)
-    look = bench.look(bench.believed)
-    assert laws_of(bench, look)[0].heldout_gain > 1000
-    search = Search(bench, [], 0.01, 6, np.random.default_rng(0), lambda fraction, remark: None)
-    found = Found(look, look, look)
+    problem, _ = problem_of(name, 3.0)
+    evaluation = problem.evaluate(problem.believed)
+    assert laws_of(problem, evaluation)[0].heldout_gain > 1000
+    search = Search(problem, [], 0.01, 6, np.random.default_rng(0), lambda fraction, remark: None)
+    found = Found(evaluation, evaluation, evaluation)
     best = max(f.heldout_gain for f in search._chosen(found)[1].values())
     choice, fits = search.next(found)
     assert best > 100
@@ -106,12 +110,12 @@ def test_a_name_that_leaves_nothing_of_a_law_is_taken(tmp_path):
     """A minute of a tether: pull and lever multiply, so before they are fitted colour wins more."""
     case = draw(1024, names=("tether",), plan=Plan().short())
     case.write(tmp_path / "data")
-    bench = Diagnoser(read_csv(tmp_path / "data"), VEHICLE, VEHICLE.dynamics(LEVELS)).bench
-    look = bench.look(bench.believed)
-    search = Search(bench, [], 0.01, 6, np.random.default_rng(0), lambda fraction, remark: None)
-    found = Found(look, look, look)
+    problem = Diagnoser(read_csv(tmp_path / "data"), VEHICLE, VEHICLE.dynamics(LEVELS)).problem
+    evaluation = problem.evaluate(problem.believed)
+    search = Search(problem, [], 0.01, 6, np.random.default_rng(0), lambda fraction, remark: None)
+    found = Found(evaluation, evaluation, evaluation)
     best = max(f.heldout_gain for f in search._chosen(found)[1].values())
-    law = laws_of(bench, look)[0].heldout_gain
+    law = laws_of(problem, evaluation)[0].heldout_gain
     assert law > best
     choice, _ = search.next(found)
     assert choice is not None
@@ -123,18 +127,18 @@ def test_what_a_name_wins_exactly_is_likelihood(tmp_path):
     """A name's own noise is smaller: squares of innovations alone may even grow."""
     case = draw(5, names=("thruster_lag",), plan=Plan().short())
     case.write(tmp_path / "data")
-    bench = Diagnoser(read_csv(tmp_path / "data"), VEHICLE, VEHICLE.dynamics(LEVELS)).bench
-    look = bench.look(bench.believed)
-    search = Search(bench, [], 0.01, 6, np.random.default_rng(0), lambda fraction, remark: None)
-    found, h = Found(look, look, look), ("thruster_lag", "all")
+    problem = Diagnoser(read_csv(tmp_path / "data"), VEHICLE, VEHICLE.dynamics(LEVELS)).problem
+    evaluation = problem.evaluate(problem.believed)
+    search = Search(problem, [], 0.01, 6, np.random.default_rng(0), lambda fraction, remark: None)
+    found, h = Found(evaluation, evaluation, evaluation), ("thruster_lag", "all")
     fit = search._chosen(found)[1][h]
     theta, seen, _ = search._fitted(h, {h: fit}, found, None)
     exact = search._exact(fit, theta, seen, found)
-    data, scores = bench.data, []
-    for one in (look, seen):
+    data, scores = problem.data, []
+    for one in (evaluation, seen):
         error, jacobian = (np.asarray(a) for a in (one.predictions.error, one.predictions.jacobian))
         steps = Transition.along(jacobian, data.weight, np.zeros(6))
-        inverse = np.linalg.inv(bench.mass(one.theta))
+        inverse = np.linalg.inv(problem.mass(one.theta))
         given = one.noise, steps, inverse, data.dt, data.step, data.weight
         scores.append(score_of(error, jacobian, *given).sum())
     assert exact.gain == pytest.approx(scores[1] - scores[0], rel=0.01)
@@ -142,23 +146,28 @@ def test_what_a_name_wins_exactly_is_likelihood(tmp_path):
     assert exact.heldout_gain > fit.heldout_gain
 
 
-def test_water_is_drawn_for_every_piece(bench_of):
+def test_water_is_drawn_for_every_piece(problem_of):
     """Scenarios of unequal numbers of runs: none of their pieces is left out."""
-    bench, _ = bench_of("current_varying", 1.0)
+    problem, _ = problem_of("current_varying", 1.0)
     scenario = np.where(np.arange(20) < 15, 0, np.arange(20))
-    bench = replace(bench, data=replace(bench.data, scenario=scenario))
-    look = bench.look(bench.believed)
-    beside = beside_laws(bench, look, [w for w in laws_of(bench, look) if "current" in w.name])
-    assert beside.drawn is not None
-    assert beside.drawn.shape[2] == 20
-    assert replace(bench, beside=beside).look(bench.believed, []).loss < look.loss
+    problem = replace(problem, data=replace(problem.data, scenario=scenario))
+    evaluation = problem.evaluate(problem.believed)
+    correlated_noise = correlated_noise_of(
+        problem, evaluation, [w for w in laws_of(problem, evaluation) if "current" in w.name]
+    )
+    assert correlated_noise.amplitudes is not None
+    assert correlated_noise.amplitudes.shape[2] == 20
+    assert (
+        replace(problem, correlated_noise=correlated_noise).evaluate(problem.believed, []).loss
+        < evaluation.loss
+    )
 
 
 @pytest.mark.parametrize("loop", ["open", "closed"])
-def test_swell_is_measured(bench_of, loop):
+def test_swell_is_measured(problem_of, loop):
     """Frequency, direction and size of a wave, with a pilot who works against it and without."""
-    bench, wave = bench_of("waves", 1.0, loop=loop)
-    law = find_waves(bench, bench.look(bench.believed, []))
+    problem, wave = problem_of("waves", 1.0, loop=loop)
+    law = find_waves(problem, problem.evaluate(problem.believed, []))
     omega = 2 * np.pi / wave.period
     agrees(law, omega, wave.direction, wave.amplitude)
     assert law.parameters["frequency"] == pytest.approx(omega, abs=0.03)
@@ -194,9 +203,9 @@ def test_a_wind_sea_is_no_slow_push(tmp_path):
     case = draw(3, names=("waves",), plan=Plan(runs=2, seconds=6.0))
     sea = Sea(0.1, 3.0, 0.7, tuple(2 * np.pi / omega), tuple(a))
     replace(case, effects=(sea,)).write(tmp_path / "data")
-    bench = Diagnoser(read_csv(tmp_path / "data"), VEHICLE, VEHICLE.dynamics(LEVELS)).bench
-    look = bench.look(bench.believed, [])
-    law = next(law for law in all_laws(bench, look, 12.0) if law.name in SLOW)
+    problem = Diagnoser(read_csv(tmp_path / "data"), VEHICLE, VEHICLE.dynamics(LEVELS)).problem
+    evaluation = problem.evaluate(problem.believed, [])
+    law = next(law for law in all_laws(problem, evaluation, 12.0) if law.name in SLOW)
     assert law.name == "waves"
     # that of a regular wave of the same orbital speed
     agrees(law, 2 * np.pi / 3.0, 0.7, np.sqrt(np.sum((a * omega) ** 2)) * 3.0 / (2 * np.pi), 0.3)
@@ -213,48 +222,48 @@ def agrees(law, omega, direction, amplitude, within=0.15):
     "name", ["disturbance_level", "disturbance_state_dependence", "disturbance_impacts"]
 )
 @pytest.mark.parametrize("size", [1.0, 3.0])
-def test_levels_and_what_comes_and_goes_are_told_apart(bench_of, name, size):
-    bench, _ = bench_of(name, size)
-    look = bench.look(bench.believed)
-    assert not look.noise.estimated
-    groups = told(all_laws(bench, look, 12.0), bench, look, 12.0)
+def test_levels_and_what_comes_and_goes_are_told_apart(problem_of, name, size):
+    problem, _ = problem_of(name, size)
+    evaluation = problem.evaluate(problem.believed)
+    assert not evaluation.noise.estimated
+    groups = reported_laws(all_laws(problem, evaluation, 12.0), problem, evaluation, 12.0)
     assert [group[0].name for group in groups] == [name]
     assert all(law.name == name for law in groups[0])
 
 
 @pytest.mark.parametrize("name", ["disturbance_colour", "disturbance_state_dependence"])
-def test_what_lasts_or_grows_is_no_level_in_calm_water(bench_of, name):
+def test_what_lasts_or_grows_is_no_level_in_calm_water(problem_of, name):
     """With a twentieth of the white disturbance, and as little of it believed."""
     calm = tuple(LEVELS / 20)
-    bench, _ = bench_of(name, 1.0, Noise(diffusion=calm), believed=np.array(calm))
-    look = bench.look(bench.believed)
-    laws = all_laws(bench, look, 12.0)
+    problem, _ = problem_of(name, 1.0, Noise(diffusion=calm), believed=np.array(calm))
+    evaluation = problem.evaluate(problem.believed)
+    laws = all_laws(problem, evaluation, 12.0)
     assert any(law.name == "disturbance_level" and law.heldout_gain > 12 for law in laws)
-    assert [group[0].name for group in told(laws, bench, look, 12.0)] == [name]
+    assert [group[0].name for group in reported_laws(laws, problem, evaluation, 12.0)] == [name]
 
 
-def test_growth_beside_a_level_is_told_where_it_holds_on_data_left_out(bench_of):
-    bench, _ = bench_of("disturbance_state_dependence", 1.0)
-    look = bench.look(bench.believed)
-    runs, name = np.ones(len(bench.data.fold)), "disturbance_state_dependence"
-    grown = next(law for law in laws_of(bench, look) if law.name == name)
+def test_growth_beside_a_level_is_told_where_it_holds_on_data_left_out(problem_of):
+    problem, _ = problem_of("disturbance_state_dependence", 1.0)
+    evaluation = problem.evaluate(problem.believed)
+    runs, name = np.ones(len(problem.data.fold)), "disturbance_state_dependence"
+    grown = next(law for law in laws_of(problem, evaluation) if law.name == name)
     other = "sway" if grown.where != "sway" else "heave"
     # what the levels take off is nothing: growth alone explains them as well
     levels = [Law(LEVEL, axis, {"change": 0.0}, 40 * runs) for axis in (grown.where, other)]
     for gain, growth, holds in ((-0.1, 0.1, False), (0.1, 0.0, False), (0.1, 0.1, True)):
-        beside = Law(name, other, {"growth": growth}, gain * runs)
-        shaped, left = _grown([grown, beside], [grown], levels, bench, look)
+        also = Law(name, other, {"growth": growth}, gain * runs)
+        shaped, left = _grown([grown, also], [grown], levels, problem, evaluation)
         assert left == []
         assert [law.where for law in shaped] == [grown.where] + [other] * holds
 
 
-def test_states_known_exactly_are_not_taken_for_estimates(bench_of):
+def test_states_known_exactly_are_not_taken_for_estimates(problem_of):
     """No errors of records at all: whoever simulates may write down what he simulated."""
     rng = np.random.default_rng(2)
-    bench, _ = bench_of("disturbance_level", 1.0)
+    problem, _ = problem_of("disturbance_level", 1.0)
     A = np.eye(12)
     A[:6, 6:] = 0.05 * np.eye(6)
-    mass = bench.mass(bench.believed)
+    mass = problem.mass(problem.believed)
     w = np.linalg.solve(mass, LEVELS[:, None] * rng.standard_normal((6, 200 * 30)))
     error = np.concatenate([0.025 * w, w]).reshape(12, 200, 30).swapaxes(0, 1) * np.sqrt(0.05)
     noise = estimate(error, np.ones((200, 30)), Transition.constant(A), mass, 0.05)
@@ -262,32 +271,32 @@ def test_states_known_exactly_are_not_taken_for_estimates(bench_of):
     np.testing.assert_allclose(noise.diffusion, LEVELS, rtol=0.05)
 
 
-def test_a_name_that_halves_the_errors_is_told_of_states_without_noise(bench_of):
+def test_a_name_that_halves_the_errors_is_told_of_states_without_noise(problem_of):
     """Smooth errors of a wrong model look like an estimator's until the name is found."""
-    bench, hidden = bench_of("current_steady", 1.0, noise=Noise.none())
-    look = bench.look(bench.believed)
-    assert look.noise.estimated
-    search = Search(bench, [], 0.01, 6, np.random.default_rng(0), lambda done, remark: None)
-    choice, _ = search.next(Found(look, look, look))
+    problem, hidden = problem_of("current_steady", 1.0, noise=Noise.none())
+    evaluation = problem.evaluate(problem.believed)
+    assert evaluation.noise.estimated
+    search = Search(problem, [], 0.01, 6, np.random.default_rng(0), lambda done, remark: None)
+    choice, _ = search.next(Found(evaluation, evaluation, evaluation))
     assert choice is not None
     assert choice.hypothesis == ("current_steady", "W")
-    theta = bench.polish(bench.believed, bench.library.at(*choice.hypothesis))[0]
-    found = theta[bench.library.at(*choice.hypothesis)]
+    theta = problem.polish(problem.believed, problem.library.at(*choice.hypothesis))[0]
+    found = theta[problem.library.at(*choice.hypothesis)]
     np.testing.assert_allclose(found, [hidden.east, hidden.north], atol=1e-3)
 
 
-def test_drag_stays_passive_and_wild_steps_are_tamed(bench_of):
-    bench, _ = bench_of("quadratic_drag", 1.0)
-    row = bench.library.at("quadratic_drag", "pitch")
-    believed = bench.believes("quadratic_drag", "pitch")
-    far = bench.believed.copy()
+def test_drag_stays_passive_and_wild_steps_are_tamed(problem_of):
+    problem, _ = problem_of("quadratic_drag", 1.0)
+    row = problem.library.at("quadratic_drag", "pitch")
+    believed = problem.believes("quadratic_drag", "pitch")
+    far = problem.believed.copy()
     far[row] = -2 * believed
-    theta = bench.polish(far, row, rounds=1)[0]
+    theta = problem.polish(far, row, rounds=1)[0]
     assert -believed <= theta[row][0] < 0
-    assert not bench._wild(np.repeat(bench.believed[:, None], len(bench.data.fold), 1)).any()
-    heavy = np.repeat(bench.believed[:, None], len(bench.data.fold), 1)
-    heavy[bench.library.at("linear_drag", "yaw"), 3] = -3000.0
-    assert np.flatnonzero(bench._wild(heavy)).tolist() == [3]
+    assert not problem._wild(np.repeat(problem.believed[:, None], len(problem.data.fold), 1)).any()
+    heavy = np.repeat(problem.believed[:, None], len(problem.data.fold), 1)
+    heavy[problem.library.at("linear_drag", "yaw"), 3] = -3000.0
+    assert np.flatnonzero(problem._wild(heavy)).tolist() == [3]
 
 
 def test_a_belief_that_diverges_on_the_data_is_told(tmp_path):
@@ -305,12 +314,12 @@ def test_a_current_that_wanders_is_one_motion_of_the_water(tmp_path, size):
     """Not pushes on every axis: its size and time constant within three standard errors."""
     case = draw(4, names=("current_varying",), size=size, plan=Plan(runs=3))
     case.write(tmp_path / "data")
-    bench = Diagnoser(read_csv(tmp_path / "data", resample=False), VEHICLE).bench
-    look = bench.look(bench.believed)
-    laws = all_laws(bench, look, 20.0)
+    problem = Diagnoser(read_csv(tmp_path / "data", resample=False), VEHICLE).problem
+    evaluation = problem.evaluate(problem.believed)
+    laws = all_laws(problem, evaluation, 20.0)
     assert laws[0].name == "current_varying"
     assert laws[0].heldout_gain > won_by("disturbance_colour", laws)
-    law = find_current(bench, look)
+    law = find_current(problem, evaluation)
     assert law.errors is not None
     for name, found in case.answer()["causes"][0]["parameters"].items():
         if np.isfinite(law.errors[name]):

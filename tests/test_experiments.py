@@ -10,7 +10,11 @@ from hidden.scenarios import Plan
 from spinndrift.models.recordings.csv import read_csv
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.diagnosis.findings.experiments import _added, experiments
-from spinndrift.training.diagnosis.findings.maneuver_library import TRIALS, VARIANTS, simulated
+from spinndrift.training.diagnosis.findings.maneuver_library import (
+    MANEUVERS,
+    VARIANTS,
+    simulate_maneuvers,
+)
 from spinndrift.training.diagnosis.pipeline import Diagnoser
 from spinndrift.training.diagnosis.selection.model_selection import Choice
 
@@ -23,26 +27,26 @@ def lagging(tmp_path_factory):
     """A lag found in two minutes of data: the bench, the look with it, its fit."""
     folder = tmp_path_factory.mktemp("lag")
     draw(5, names=("thruster_lag",), plan=Plan(runs=2, seconds=6.0)).write(folder / "data")
-    bench = Diagnoser(read_csv(folder / "data", resample=False), VEHICLE).bench
-    theta = bench.believed.copy()
-    theta[bench.library.at(*LAG)] = 0.05
-    theta, look, fit = bench.polish(theta, bench.library.at(*LAG))
-    return bench, look, fit
+    problem = Diagnoser(read_csv(folder / "data", resample=False), VEHICLE).problem
+    theta = problem.believed.copy()
+    theta[problem.library.at(*LAG)] = 0.05
+    theta, evaluation, fit = problem.polish(theta, problem.library.at(*LAG))
+    return problem, evaluation, fit
 
 
 def test_all_maneuvers_are_flown_as_they_say(lagging):
-    bench, look, _ = lagging
+    problem, evaluation, _ = lagging
     seen: dict[str, list] = {}
-    for names, data in simulated(bench, look.theta):
-        assert data.u.shape == bench.data.u.shape
+    for names, data in simulate_maneuvers(problem, evaluation.theta):
+        assert data.u.shape == problem.data.u.shape
         for r, name in enumerate(names):
             seen.setdefault(name, []).append((data.u[..., r], data.V[..., r], data.weight[:, r]))
     fill = seen.pop("", [])
     assert not any(weight.any() for _, _, weight in fill)
-    assert set(seen) == set(TRIALS)
-    bare = replace(bench, data=replace(bench.data, has_voltage=False, command="F_Bo_B"))
-    names = {name for names, _ in simulated(bare, look.theta) for name in names}
-    assert names - {""} == set(TRIALS) - {"battery", "thrusters"}, "which these data can't show"
+    assert set(seen) == set(MANEUVERS)
+    bare = replace(problem, data=replace(problem.data, has_voltage=False, command="F_Bo_B"))
+    names = {name for names, _ in simulate_maneuvers(bare, evaluation.theta) for name in names}
+    assert names - {""} == set(MANEUVERS) - {"battery", "thrusters"}, "which these data can't show"
     low, high = VEHICLE.thrusters().curve.limits(VEHICLE.thrusters().nominal_voltage)
     for name, pieces in seen.items():
         assert len(pieces) == VARIANTS
@@ -57,33 +61,35 @@ def test_all_maneuvers_are_flown_as_they_say(lagging):
 
 
 def test_a_chirp_tells_a_lag_from_a_delay_and_drifting_tells_nothing(lagging):
-    bench, look, fit = lagging
+    problem, evaluation, fit = lagging
     choice = Choice(LAG, fit, (DELAY,), ())
-    found = experiments(bench, look, [choice], [])[LAG]
+    found = experiments(problem, evaluation, [choice], [])[LAG]
     assert max(found.nats, key=lambda name: found.nats[name]) == "chirp"
     assert found.nats["drift"] == pytest.approx(0, abs=0.1)
     assert found.text.startswith("to tell it from actuation_delay: chirp one axis")
     # what has the cause as a part of itself can't be told from it by any maneuver
     nothing = Choice(LAG, fit, (), ())
-    alone = experiments(bench, look, [nothing], [])[LAG]
+    alone = experiments(problem, evaluation, [nothing], [])[LAG]
     assert alone.text.startswith("to measure it better")
     assert all(alone.nats[name] >= found.nats[name] - 1e-6 for name in alone.nats)
 
 
 def test_expected_nats_are_those_of_least_squares(lagging):
     """What a rival can't explain of the cause, in old and new data together less in the old."""
-    bench, look, _ = lagging
-    own, rival = bench.library.at(*LAG), bench.library.at("linear_drag", "surge")
-    there = bench.look(look.theta, sorted([*own, *rival]), look.kalman, again=look).plain
+    problem, evaluation, _ = lagging
+    own, rival = problem.library.at(*LAG), problem.library.at("linear_drag", "surge")
+    there = problem.evaluate(
+        evaluation.theta, sorted([*own, *rival]), evaluation.kalman, again=evaluation
+    ).plain
     rng = np.random.default_rng(0)
     J = rng.standard_normal((40, 2)) * [300.0, 1.0]  # responses of a maneuver: lag, drag
     new = np.zeros_like(there.total)
     a, b = there.column(own[0]), there.column(rival[0])
     new[np.ix_([a, b], [a, b])] = J.T @ J
-    got = _added(there, new, own, rival, look.theta - bench.believed)
+    got = _added(there, new, own, rival, evaluation.theta - problem.believed)
 
     def left(T):
-        size = look.theta[own[0]]
+        size = evaluation.theta[own[0]]
         H, g = T[b, b] + there.prior(rival)[0], T[a, b] * size
         return (T[a, a] * size**2 - g**2 / H * (2 - T[b, b] / H)) / 2
 

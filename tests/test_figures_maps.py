@@ -19,7 +19,7 @@ from spinndrift.sims.reports.figures_maps import (
     variables,
 )
 from spinndrift.training.diagnosis.data.arrays import make_data
-from spinndrift.training.diagnosis.filter.problem import Bench
+from spinndrift.training.diagnosis.filter.problem import DiagnosisProblem
 from spinndrift.training.diagnosis.findings.result import DataSummary, Diagnosis
 from spinndrift.training.diagnosis.pipeline import Finding
 
@@ -34,33 +34,33 @@ def recording(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def bench(recording):
-    return Bench.of(recording, VEHICLE)
+def problem(recording):
+    return DiagnosisProblem.of(recording, VEHICLE)
 
 
-def finding(bench, base, final):
+def finding(problem, base, final):
     data = DataSummary([], 0, 0.0, 0.05, "thruster_force", [], [], {})
     told = Diagnosis(
         4, "adequate", "", [], [], [], {}, {}, "scenario", data, 0, 0.0, 0.01
     )  # fmt: skip
     return Finding(
-        told, bench.model, bench.library, final.theta, bench.data, base, final, {}, [], {}
+        told, problem.model, problem.library, final.theta, problem.data, base, final, {}, [], {}
     )
 
 
-def test_one_noise_is_a_models_own_where_both_have_the_same(bench):
-    look = bench.look(bench.believed, [])
-    z = in_one_noise(finding(bench, look, look)).base.z
-    np.testing.assert_allclose(z, look.z, atol=2e-3)  # the look's are of single precision
+def test_one_noise_is_a_models_own_where_both_have_the_same(problem):
+    evaluation = problem.evaluate(problem.believed, [])
+    z = in_one_noise(finding(problem, evaluation, evaluation)).base.z
+    np.testing.assert_allclose(z, evaluation.z, atol=2e-3)  # the look's are of single precision
 
 
-def test_a_wrong_belief_is_larger_than_noise_in_the_noise_of_a_right_one(bench):
-    theta = bench.believed.copy()
-    theta[bench.library.at("thrust_scale", "all")] = 0.4
-    wrong, right = bench.look(theta, []), bench.look(bench.believed, [])
-    shared = in_one_noise(finding(bench, wrong, right))
+def test_a_wrong_belief_is_larger_than_noise_in_the_noise_of_a_right_one(problem):
+    theta = problem.believed.copy()
+    theta[problem.library.at("thrust_scale", "all")] = 0.4
+    wrong, right = problem.evaluate(theta, []), problem.evaluate(problem.believed, [])
+    shared = in_one_noise(finding(problem, wrong, right))
     assert shared.final is right
-    n = bench.data.steps
+    n = problem.data.steps
     own, one, noise = (
         (z.astype(float) ** 2).sum(axis=(0, 2))[6:].mean() / n
         for z in (wrong.z, shared.base.z, right.z)
@@ -80,23 +80,23 @@ def test_times_go_on_from_piece_to_piece_of_a_run(recording):
         np.testing.assert_allclose(times[0, own[1:]], times[last[:-1], own[:-1]], rtol=1e-12)
 
 
-def test_variables_are_attitude_and_every_command_with_units(bench):
-    look = bench.look(bench.believed, [])
-    found = variables(finding(bench, look, look))
-    q = bench.data.X[:-1, [1, 2, 3, 0]]
+def test_variables_are_attitude_and_every_command_with_units(problem):
+    evaluation = problem.evaluate(problem.believed, [])
+    found = variables(finding(problem, evaluation, evaluation))
+    q = problem.data.X[:-1, [1, 2, 3, 0]]
     euler = Rotation.from_quat(np.moveaxis(q, 1, -1).reshape(-1, 4)).as_euler("ZYX", degrees=True)
     for name, angle in zip(("heading", "pitch", "roll"), euler.T, strict=True):
         np.testing.assert_allclose(found[name].ravel(), angle, atol=1e-9)
     assert [n for n in found if n[0] == "f"] == [f"f{k}" for k in range(1, 9)]
-    np.testing.assert_array_equal(found["f3"], bench.data.u[:, 2])
+    np.testing.assert_array_equal(found["f3"], problem.data.u[:, 2])
     assert labelled("f3") == "f3 / N"
     assert labelled("u") == "u / (m/s)"
     assert all("/" in labelled(n) for n in found if n != "run")
     # a wrench comes back from the thrusters that it was split over
-    wrench = np.random.default_rng(0).standard_normal((6, *bench.data.voltage.shape))
+    wrench = np.random.default_rng(0).standard_normal((6, *problem.data.voltage.shape))
     u = np.asarray(VEHICLE.thrusters().allocate(jnp.asarray(wrench))).swapaxes(0, 1)
-    by_wrench = replace(bench, data=replace(bench.data, u=u, command="F_Bo_B"))
-    found = variables(finding(by_wrench, look, look))
+    by_wrench = replace(problem, data=replace(problem.data, u=u, command="F_Bo_B"))
+    found = variables(finding(by_wrench, evaluation, evaluation))
     np.testing.assert_allclose([found[n] for n in "XYZKMN"], wrench, atol=1e-9)
     assert labelled("K") == "K / N·m"
 

@@ -8,7 +8,7 @@ from hidden.simulator import Noise as Hidden
 
 from spinndrift.models.recordings.csv import read_csv
 from spinndrift.models.vehicles.vehicle import load_vehicle
-from spinndrift.training.diagnosis.filter.likely_noise import beside_pushes
+from spinndrift.training.diagnosis.filter.likely_noise import fit_with_slow_noise
 from spinndrift.training.diagnosis.filter.noise import (
     Noise,
     estimate,
@@ -111,7 +111,7 @@ def test_a_level_is_told_from_pushes_that_last(believed):
     assert np.all(alone.diffusion[[0, 2, 3]] > 1.2 * b[[0, 2, 3]])
     units = unit_processes(steps, inverse, DT)
     start = np.concatenate([alone.record, alone.diffusion])
-    left, lost = beside_pushes(
+    left, lost = fit_with_slow_noise(
         error, weight, steps, units, once, DT, start**2, believed * b, [0, 1, 3]
     )
     assert np.all(left < 1.2 * b)
@@ -185,8 +185,8 @@ def test_innovations_are_white_where_instruments_drown_the_process(tmp_path, hid
     draw(5, "null", plan=plan, noise=hidden).write(tmp_path / "data")
     vehicle = load_vehicle("bluerov2_heavy")
     belief = vehicle.dynamics(np.array(hidden.diffusion))
-    bench = Diagnoser(read_csv(tmp_path / "data"), vehicle, belief).bench
-    p, noise, kalman = bench.predict(bench.believed)
+    problem = Diagnoser(read_csv(tmp_path / "data"), vehicle, belief).problem
+    p, noise, kalman = problem.predict(problem.believed)
     given = np.repeat([hidden.position, hidden.attitude, hidden.velocity], 3)
     np.testing.assert_allclose(noise.record[:9], given, rtol=0.05)
     z = filtered(np.asarray(p.error), np.asarray(p.jacobian), kalman)

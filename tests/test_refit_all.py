@@ -27,7 +27,7 @@ from spinndrift.models.recordings.store import Recording
 from spinndrift.models.thruster_curves import RESTING
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.diagnosis.filter.noise import estimate
-from spinndrift.training.diagnosis.filter.problem import Bench
+from spinndrift.training.diagnosis.filter.problem import DiagnosisProblem
 from spinndrift.training.diagnosis.filter.transition import Transition
 from spinndrift.training.diagnosis.findings.ratios import ratios
 from spinndrift.training.diagnosis.selection.refit_all import (
@@ -123,10 +123,10 @@ def recording():
 
 
 def test_all_coefficients_of_another_vehicle_are_returned_as_ratios():
-    bench = with_coefficients(Bench.of(recording(), load_vehicle("bluerov2_heavy")))
-    theta = identify(bench)
-    rows = [c.row for c in coefficients(bench)]
-    found = {(r.name, r.where): r for r in ratios(bench, bench.look(theta, rows), rows)}
+    problem = with_coefficients(DiagnosisProblem.of(recording(), load_vehicle("bluerov2_heavy")))
+    theta = identify(problem)
+    rows = [c.row for c in coefficients(problem)]
+    found = {(r.name, r.where): r for r in ratios(problem, problem.evaluate(theta, rows), rows)}
     for key, value in truth().items():
         # small commands lie within the believed dead band, whose inside is but roughly known
         near = 0.06 if key[0] == "net_buoyancy" else 0.01
@@ -142,13 +142,13 @@ def test_the_ranges_are_physical_and_wrenches_have_no_curve():
     F = np.zeros((len(pwm), 6))
     for commands, level in (({"pwm": pwm[:, 0]}, True), ({"F_Bo_B": F}, False)):
         run = Trajectory("one", X[:, 0], V[:, 0], commands)
-        bench = with_coefficients(Bench.of(Recording(assemble([run], DT)), belief))
-        names = {bench.library.entries[c.row].cause for c in coefficients(bench)}
+        problem = with_coefficients(DiagnosisProblem.of(Recording(assemble([run], DT)), belief))
+        names = {problem.library.entries[c.row].cause for c in coefficients(problem)}
         assert ("thrust_table" in names) == ("thrust_curve" in names) == level
         assert ("thrust_offset" in names) == level
         assert {"added_mass", "linear_drag", "axis_thrust", "centre_of_buoyancy"} <= names
-        heave = bench.library.at("added_mass", "heave")
-        assert bench.limits(heave)[0][0] == pytest.approx(-18.68)
+        heave = problem.library.at("added_mass", "heave")
+        assert problem.limits(heave)[0][0] == pytest.approx(-18.68)
     assert "voltage_exponent" not in names  # no voltage was recorded
 
 
@@ -157,11 +157,13 @@ def test_a_command_of_the_other_sign_shows_in_the_ratios():
     X, V, _ = dive(runs=1, seconds=2.0)
     F = np.random.default_rng(1).normal(size=(len(X), 6)) * [9.0, 9.0, 9.0, 1.0, 1.0, 1.0]
     run = Trajectory("one", X[:, 0], V[:, 0], {"F_Bo_B": F})
-    bench = Bench.of(Recording(assemble([run], DT)), belief).with_effect(AxisThrust.neutral())
-    theta = bench.believed.copy()
-    rows = bench.library.at("axis_thrust", "heave")
+    problem = DiagnosisProblem.of(Recording(assemble([run], DT)), belief).with_effect(
+        AxisThrust.neutral()
+    )
+    theta = problem.believed.copy()
+    rows = problem.library.at("axis_thrust", "heave")
     theta[rows] = -1.5
-    found = {(r.name, r.where): r for r in ratios(bench, bench.look(theta, rows), rows)}
+    found = {(r.name, r.where): r for r in ratios(problem, problem.evaluate(theta, rows), rows)}
     for axis, share in (("heave", -0.5), ("surge", 1.0), ("yaw", 1.0)):
         r = found["thrust", axis]
         assert r.believed > 0

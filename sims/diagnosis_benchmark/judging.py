@@ -85,7 +85,7 @@ def compare(truth: Truth, d: Diagnosis) -> dict[str, Any]:
     first = causes[0] if causes else None
     matched = [h for h in truth.causes if first is not None and fits(h, first)]
     alike = () if first is None else first.indistinguishable_from
-    told_alike = [h for h in truth.causes if h.name in alike]
+    indistinguishable = [h for h in truth.causes if h.name in alike]
     place = None
     if first is not None and matched and matched[0].where and matched[0].name == first.name:
         places = {w.strip() for w in first.where.split(",")}
@@ -117,7 +117,7 @@ def compare(truth: Truth, d: Diagnosis) -> dict[str, Any]:
         "hidden": [h.name for h in truth.causes],
         "named": [c.name for c in causes],
         "first_right": bool(matched) if truth.causes else not causes,
-        "declared": bool(matched or told_alike) if truth.causes else not causes,
+        "declared": bool(matched or indistinguishable) if truth.causes else not causes,
         "place_right": place,
         "recalled": sum(any(fits(h, c) for c in causes) for h in truth.causes),
         "spurious": sum(not any(fits(h, c) for h in truth.causes) for c in causes),
@@ -162,14 +162,14 @@ def believed(truth: Truth, recording: Recording) -> tuple[Vehicle, Dynamics | No
 
 
 def _off(
-    told: tuple[Float[np.ndarray, "N 7 R"], Float[np.ndarray, "N 6 R"]],
+    forecasts: tuple[Float[np.ndarray, "N 7 R"], Float[np.ndarray, "N 6 R"]],
     truths: list[tuple[np.ndarray, np.ndarray]],
 ) -> dict[str, float]:
     total = {"position": 0.0, "rotation": 0.0, "velocity": 0.0, "rate": 0.0}
     for r, (X, V) in enumerate(truths):
-        count = min(X.shape[1] - 1, len(told[0]))
+        count = min(X.shape[1] - 1, len(forecasts[0]))
         X1, V1 = jnp.asarray(X[:, 1 : 1 + count]), V[:, 1 : 1 + count]
-        X2, V2 = jnp.asarray(told[0][:count, :, r].T), told[1][:count, :, r].T
+        X2, V2 = jnp.asarray(forecasts[0][:count, :, r].T), forecasts[1][:count, :, r].T
         turn = se3.log(se3.compose(se3.inverse(X1), X2))[3:]
         parts = (np.asarray(X2 - X1)[4:], np.asarray(turn), V2[:3] - V1[:3], V2[3:] - V1[3:])
         for name, part in zip(total, parts, strict=True):
@@ -191,6 +191,6 @@ def judge(case: Case, alpha: float, progress: Update) -> tuple[Judgement, Findin
     gain = {}
     if case.has_oracle and truth.causes:
         gain = gain_of(case, finding.extended.with_effects(()), finding.extended, vehicle)
-    told = compare(truth, d)
+    compared = compare(truth, d)
     about = {"case": case.name, "kind": truth.kind, "label": truth.called, "size": truth.size}
-    return Judgement(**about, data=truth.data, **told, gain=gain, seconds=d.seconds), finding
+    return Judgement(**about, data=truth.data, **compared, gain=gain, seconds=d.seconds), finding

@@ -30,7 +30,7 @@ from ...models.recordings.csv import read_csv
 from ...models.se3 import TWIST, WRENCH
 from ...training.diagnosis.data.arrays import Data
 from ...training.diagnosis.filter.innovations import predict
-from ...training.diagnosis.filter.problem import Bench
+from ...training.diagnosis.filter.problem import DiagnosisProblem
 from ...training.diagnosis.validation.blackbox import arguments, train
 from ...training.diagnosis.validation.forecast import Learned
 from .cases import Case
@@ -227,27 +227,27 @@ def compete(case: Case) -> dict[str, Rival]:
     pysindy()
     recording = read_csv(case.folder / "data", resample=False)
     vehicle, base = believed(case.truth, recording)
-    bench = Bench.of(recording, vehicle, base)
-    predictions = predict(bench.model, bench.library, bench.believed, bench.data)
-    errors = np.asarray(predictions.error) * bench.data.weight[:, None]
+    problem = DiagnosisProblem.of(recording, vehicle, base)
+    predictions = predict(problem.model, problem.library, problem.believed, problem.data)
+    errors = np.asarray(predictions.error) * problem.data.weight[:, None]
     directions = np.asarray(vehicle.thrusters().directions)
-    judged = functools.partial(_judged, case, bench)
+    judged = functools.partial(_judged, case, problem)
     found = {}
     for form in _FORMS:
-        model = sparse(form, errors, bench.data, directions)
-        found[form] = Rival(judged(model), _told(model))
-    box = train(predictions, bench.data, np.random.default_rng(0), whole=True)
+        model = sparse(form, errors, problem.data, directions)
+        found[form] = Rival(judged(model), _equations(model))
+    box = train(predictions, problem.data, np.random.default_rng(0), whole=True)
     return found | {"features": Rival(judged(box))}
 
 
-def _judged(case: Case, bench: Bench, rest: Learned) -> dict[str, float]:
+def _judged(case: Case, problem: DiagnosisProblem, rest: Learned) -> dict[str, float]:
     if not (case.has_oracle and case.truth.causes):
         return {}
-    model = bench.model.with_effects(())
-    return share_of_gain(case, bench.vehicle, (model, None), (model, rest))
+    model = problem.model.with_effects(())
+    return share_of_gain(case, problem.vehicle, (model, None), (model, rest))
 
 
-def _told(model: Sparse) -> dict[str, list[str]]:
+def _equations(model: Sparse) -> dict[str, list[str]]:
     names = labels(model.directions.shape[1])
     weights = np.asarray(model.weights)
     found = {}

@@ -54,7 +54,7 @@ class JudgeCase:
         keep_compiled()
         give_back_programs()
         folder = Path(self.out) / case.name
-        own, beside = self.left(case)
+        own, rivals_file = self.left(case)
         claim(folder, _CASE)
         if own:
             judged, finding = judge(
@@ -62,7 +62,7 @@ class JudgeCase:
             )
             finding.diagnosis.save(folder / "diagnosis.json")
             _write(folder / _DONE, {"alpha": self.alpha, **judged.plain()})
-        if beside:
+        if rivals_file:
             _write(folder / _RIVALS, {name: one.plain() for name, one in compete(case).items()})
 
 
@@ -108,8 +108,10 @@ def _judgement(work: JudgeCase, case: Case) -> dict[str, Any] | None:
         raise UserError(
             f"{at}: was judged with alpha {row['alpha']:g}, not {work.alpha:g}; name another --out"
         )
-    beside = at.with_name(_RIVALS)
-    row["rivals"] = json.loads(beside.read_text(encoding="utf-8")) if beside.exists() else {}
+    rivals_file = at.with_name(_RIVALS)
+    row["rivals"] = (
+        json.loads(rivals_file.read_text(encoding="utf-8")) if rivals_file.exists() else {}
+    )
     return row
 
 

@@ -151,9 +151,9 @@ def _confusion(rows: Sequence[Row]) -> Table:
         own = [r for r in chosen if r["label"] == label]
         others: dict[str, int] = {}
         for r in own:
-            told = ", ".join(dict.fromkeys(r["named"])) or "adequate"
-            others[told] = others.get(told, 0) + 1
-        told = "; ".join(f"{k} × {n}" if len(own) > 1 else k for k, n in others.items())
+            named = ", ".join(dict.fromkeys(r["named"])) or "adequate"
+            others[named] = others.get(named, 0) + 1
+        listed = "; ".join(f"{k} × {n}" if len(own) > 1 else k for k, n in others.items())
         z = [abs(v) for r in own for v in r["z"].values()]
         gains = [g for r in own if (g := gain_share(r)) is not None]
         hits = sum(r["first_right"] for r in own)
@@ -161,7 +161,7 @@ def _confusion(rows: Sequence[Row]) -> Table:
             (
                 label,
                 f"{hits} of {len(own)}",
-                told,
+                listed,
                 f"{max(z):.1f}" if z else "–",
                 _middle(gains),
                 f"{np.median([r['seconds'] for r in own]):.0f}",

@@ -3,7 +3,7 @@
 import math
 
 from ...models.se3 import AXES
-from ...training.diagnosis.findings.maneuver_library import TRIALS
+from ...training.diagnosis.findings.maneuver_library import MANEUVERS
 from ...training.diagnosis.findings.result import Cause, Diagnosis, Interval, Value
 from ...training.diagnosis.pipeline import Finding
 from .figures_diagnosis import (
@@ -86,7 +86,7 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
                 (
                     c.name,
                     c.where,
-                    "; ".join(_told(k, v) for k, v in c.parameters.items()),
+                    "; ".join(_with_value(k, v) for k, v in c.parameters.items()),
                     f"{c.evidence.heldout_gain:.0f}",
                     _probability(c.evidence.p_value),
                     ", ".join(c.indistinguishable_from) or "–",
@@ -124,7 +124,7 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
     if d.refitted:
         page.text("Coefficients that were fitted before any cause was named:")
         page.table(
-            [(r.name, r.where, f"{r.believed:.4g}", _told(r.parameter, r.fitted))
+            [(r.name, r.where, f"{r.believed:.4g}", _with_value(r.parameter, r.fitted))
              for r in d.refitted],
             ("coefficient", "where", "believed", "fitted (95 %)"),
         )  # fmt: skip
@@ -136,8 +136,11 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
             "What each maneuver of a set is expected to tell about a cause, beside its closest "
             "rivals: simulated by the model with the causes, looked at as these data were.",
         )
-        trials = dict.fromkeys(t for c in d.causes for t in c.experiments)
-        page.table([(t, TRIALS[t].text) for t in trials if t in TRIALS], ("maneuver", "what to do"))
+        maneuvers = dict.fromkeys(t for c in d.causes for t in c.experiments)
+        page.table(
+            [(t, MANEUVERS[t].text) for t in maneuvers if t in MANEUVERS],
+            ("maneuver", "what to do"),
+        )
     page.section("Simulations beside the records")
     page.figure(
         bands_figure(finding),
@@ -224,15 +227,15 @@ def _noise(key: str) -> str:
 
 
 def _probability(p: float) -> str:
-    told = "< 1e-300" if p == 0 else f"{p:.2g}" if math.isfinite(p) else "–"
-    return told.replace("-", "−")
+    text = "< 1e-300" if p == 0 else f"{p:.2g}" if math.isfinite(p) else "–"
+    return text.replace("-", "−")
 
 
 def _rivals(c: Cause) -> str:
     return ", ".join(f"{r.name} ({r.where}) {r.heldout_gain:.0f}" for r in c.rivals) or "–"
 
 
-def _told(name: str, v: Value) -> str:
+def _with_value(name: str, v: Value) -> str:
     return f"{name} = {_valued(v)}"
 
 

@@ -45,15 +45,17 @@ def residual_figure(finding: Finding) -> Figure:
     figure, axes = panels(1, 2, 2.9)
     x = np.arange(12)
     w, variances = finding.data.weight, []
-    for k, (look, name, color) in enumerate(
+    for k, (evaluation, name, color) in enumerate(
         ((finding.base, "belief", PLANNED), (finding.final, "with the causes", FLOWN))
     ):
-        z = look.z * w[:, None]
+        z = evaluation.z * w[:, None]
         variance = (z**2).sum(axis=(0, 2)) / w.sum()
         memory = (z[1:] * z[:-1]).sum(axis=(0, 2)) / np.maximum((z**2).sum(axis=(0, 2)), 1e-300)
         for ax, values in zip(axes[0], (variance, memory), strict=True):
-            ax.bar(x + 0.38 * (k - 0.5), values * finding.data.told, 0.36, color=color, label=name)
-        variances.append(variance * finding.data.told)
+            ax.bar(
+                x + 0.38 * (k - 0.5), values * finding.data.measured, 0.36, color=color, label=name
+            )
+        variances.append(variance * finding.data.measured)
     scaled(axes[0, 0], np.array(variances), bars=True)
     axes[0, 0].axhline(1, color=INK, lw=1, ls="--")
     axes[0, 0].set_title("Variance against the noise's (1)")
@@ -70,17 +72,17 @@ def experiments_figure(diagnosis: Diagnosis) -> Figure | None:
     causes = [c for c in diagnosis.causes if c.experiments]
     if not causes:
         return None
-    trials = list(dict.fromkeys(name for c in causes for name in c.experiments))
-    figure, axes = panels(1, len(causes), 0.9 + 0.22 * len(trials), sharey=True)
+    maneuvers = list(dict.fromkeys(name for c in causes for name in c.experiments))
+    figure, axes = panels(1, len(causes), 0.9 + 0.22 * len(maneuvers), sharey=True)
     for ax, c in zip(axes[0], causes, strict=True):
-        nats = np.array([c.experiments.get(name, 0.0) for name in trials])
+        nats = np.array([c.experiments.get(name, 0.0) for name in maneuvers])
         colors = [FLOWN if n == nats.max() else QUIET for n in nats]
-        ax.barh(range(len(trials)), np.maximum(nats, 0.01), color=colors, height=0.7)
+        ax.barh(range(len(maneuvers)), np.maximum(nats, 0.01), color=colors, height=0.7)
         ax.set_xscale("log")
         ax.set_xlim(left=0.01)
         ax.set_xlabel("nats a minute")
         ax.set_title(f"{c.name.replace('_', ' ')} · {c.where}")
-    axes[0, 0].set_yticks(range(len(trials)), trials)
+    axes[0, 0].set_yticks(range(len(maneuvers)), maneuvers)
     axes[0, 0].invert_yaxis()
     return figure
 
@@ -152,11 +154,11 @@ def innovations_figure(finding: Finding) -> Figure:
     t = d.dt * np.arange(1, len(count) + 1)
     for i, ax in enumerate(axes.flat):
         ax.axhspan(-2, 2, color=QUIET, alpha=0.15, lw=0)
-        for look, name, color in (
+        for evaluation, name, color in (
             (finding.base, "belief", PLANNED),
             (finding.final, "with the causes", FLOWN),
         ):
-            total = np.bincount(bins.ravel(), look.z[:, 6 + i][:, own].ravel())
+            total = np.bincount(bins.ravel(), evaluation.z[:, 6 + i][:, own].ravel())
             mean = total / np.sqrt(np.maximum(count, 1))
             ax.plot(t, mean, color=color, lw=0.9, label=name)
         ax.set_title(AXES[i])

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from ...models.se3 import AXES
 from ...training.diagnosis.data.arrays import Data
 from ...training.diagnosis.filter.noise import filtered, make_filter
-from ...training.diagnosis.filter.problem import Look
+from ...training.diagnosis.filter.problem import Evaluation
 from ...training.diagnosis.filter.transition import Transition
 from ...training.diagnosis.pipeline import Finding
 from .figures import panels, styled
@@ -36,15 +36,15 @@ def in_one_noise(finding: Finding) -> Finding:
 
     The noise estimated with a wrong model absorbs some of its errors and would hide them.
     """
-    d, look, noise = finding.data, finding.base, finding.final.noise
+    d, evaluation, noise = finding.data, finding.base, finding.final.noise
     here = d.weight[:, None] > 0
-    error = np.where(here, np.asarray(look.predictions.error), 0.0)
-    jacobian = np.where(here[:, :, None], np.asarray(look.predictions.jacobian), 0.0)
-    steps = Transition.along(jacobian, d.weight, look.predictions.late)
+    error = np.where(here, np.asarray(evaluation.predictions.error), 0.0)
+    jacobian = np.where(here[:, :, None], np.asarray(evaluation.predictions.jacobian), 0.0)
+    steps = Transition.along(jacobian, d.weight, evaluation.predictions.late)
     inverse = np.asarray(finding.extended.inertia().inverse)
     kalman = make_filter(noise, steps, inverse, d.dt, d.step, jacobian)
     z = filtered(error, jacobian, kalman) * d.weight[:, None]
-    return replace(finding, base=look._replace(noise=noise, kalman=kalman, z=z))
+    return replace(finding, base=evaluation._replace(noise=noise, kalman=kalman, z=z))
 
 
 def run_times(d: Data) -> Float[np.ndarray, "M R"]:
@@ -154,9 +154,9 @@ def draw_map(
     return figure
 
 
-def innovations_of(finding: Finding, look: Look) -> Float[np.ndarray, "n 6"]:
+def innovations_of(finding: Finding, evaluation: Evaluation) -> Float[np.ndarray, "n 6"]:
     """Whitened innovations of the twist at all existing steps."""
-    return look.z[:, 6:].swapaxes(1, 2)[finding.data.weight > 0].astype(float)
+    return evaluation.z[:, 6:].swapaxes(1, 2)[finding.data.weight > 0].astype(float)
 
 
 def where_they_are(finding: Finding) -> dict[str, Float[np.ndarray, " n"]]:
@@ -169,6 +169,6 @@ def where_they_are(finding: Finding) -> dict[str, Float[np.ndarray, " n"]]:
 def map_figure(finding: Finding) -> Figure:
     """Dependence of the error on state and input by axis, for belief and explained model."""
     known = where_they_are(finding)
-    looks = (finding.base, finding.final)
-    maps = [error_map(innovations_of(finding, look), known) for look in looks]
+    evaluations = (finding.base, finding.final)
+    maps = [error_map(innovations_of(finding, evaluation), known) for evaluation in evaluations]
     return draw_map(maps, ("Belief", "With the causes"), list(known), AXES)

@@ -24,7 +24,7 @@ MODELS = {"base": ("belief", PLANNED), "extended": ("with the causes", FLOWN)}
 
 def contenders(finding: Finding) -> list[tuple[Simulated, str, str]]:
     """Simulations with name and colour: of the belief, and with the causes if there are any."""
-    kept = [(finding.simulated.get(key), *told) for key, told in MODELS.items()]
+    kept = [(finding.simulated.get(key), *style) for key, style in MODELS.items()]
     return [(s, name, color) for s, name, color in kept if s is not None]
 
 
@@ -170,14 +170,16 @@ def runs_figure(finding: Finding) -> Figure:
     figure, axes = panels(2, 1, 4.0, sharex=True)
     order = np.lexsort((data.run, data.scenario))
     place = {int(piece): i for i, piece in enumerate(order)}
-    for look, (name, color) in zip((finding.base, finding.final), MODELS.values(), strict=True):
-        count = np.maximum(data.weight.sum(axis=0) * data.told.sum(), 1)
-        one = np.sqrt((look.z.astype(float) ** 2).sum(axis=(0, 1)) / count)
+    for evaluation, (name, color) in zip(
+        (finding.base, finding.final), MODELS.values(), strict=True
+    ):
+        count = np.maximum(data.weight.sum(axis=0) * data.measured.sum(), 1)
+        one = np.sqrt((evaluation.z.astype(float) ** 2).sum(axis=(0, 1)) / count)
         _dots(axes[0, 0], np.arange(len(order)), one[order], name, color)
     last = contenders(finding)[-1][0]
     for simulated, name, color in contenders(finding):
         z, _, piece = at_ends(finding, simulated, last)
-        square = (z[:, data.told > 0] ** 2).mean(axis=1)
+        square = (z[:, data.measured > 0] ** 2).mean(axis=1)
         own = np.unique(piece)
         many = np.sqrt([square[piece == p].mean() for p in own])
         _dots(axes[1, 0], np.array([place[int(p)] for p in own]), many, name, color)

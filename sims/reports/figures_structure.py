@@ -25,9 +25,11 @@ def memory_figure(finding: Finding) -> Figure:
     longest = max(2, min(round(_LONGEST / d.dt), len(d.u) // 2))
     lags = np.arange(1, longest + 1)
     spread = 2 / np.sqrt(max(d.steps, 1))
-    for look, (name, color) in zip((finding.base, finding.final), MODELS.values(), strict=True):
+    for evaluation, (name, color) in zip(
+        (finding.base, finding.final), MODELS.values(), strict=True
+    ):
         for i in range(6):
-            z = look.z[:, 6 + i].astype(float) * d.weight
+            z = evaluation.z[:, 6 + i].astype(float) * d.weight
             square = max(float((z**2).sum()), 1e-300)
             memory = [(z[k:] * z[:-k]).sum() / square for k in lags]
             axes[0, i].plot(d.dt * lags, memory, color=color, label=name)
@@ -62,7 +64,9 @@ def _spectrum(
 def repeats_figure(finding: Finding) -> Figure:
     """Repeatable part of the innovations (model error) and the rest (noise)."""
     d = finding.data
-    by_model = [shares(look.z[:, 6:].astype(float), d) for look in (finding.base, finding.final)]
+    by_model = [
+        shares(evaluation.z[:, 6:].astype(float), d) for evaluation in (finding.base, finding.final)
+    ]
     figure, axes = panels(1, 3, 2.7, sharey=True)
     titles = ("Means of runs", "Means of repeated runs, step by step", "Spread of repeated runs")
     x = np.arange(6)
@@ -80,7 +84,7 @@ def repeats_figure(finding: Finding) -> Figure:
     return figure
 
 
-def most_telling(finding: Finding) -> list[tuple[int, str, str]]:
+def most_structured(finding: Finding) -> list[tuple[int, str, str]]:
     """Axes with most structure in the belief's innovations, each with its two main variables."""
     known = where_they_are(finding)
     known.pop("run")  # not a coordinate of state space
@@ -98,16 +102,16 @@ def most_telling(finding: Finding) -> list[tuple[int, str, str]]:
 def state_space_figure(finding: Finding) -> Figure:
     """Mean innovations of the worst axes over their two most informative variables."""
     known = where_they_are(finding)
-    chosen = most_telling(finding)
+    chosen = most_structured(finding)
     figure, axes = panels(2, len(chosen), 5.2, sharex="col", sharey="col")
     image = None
     for column, (i, a, b) in enumerate(chosen):
         edges = [_edges(known[name]) for name in (a, b)]
-        for ax, look, title in zip(
+        for ax, evaluation, title in zip(
             axes[:, column], (finding.base, finding.final), ("belief", "with the causes"),
             strict=True,
         ):  # fmt: skip
-            z = innovations_of(finding, look)[:, i]
+            z = innovations_of(finding, evaluation)[:, i]
             count = np.histogram2d(known[a], known[b], edges)[0]
             total = np.histogram2d(known[a], known[b], edges, weights=z)[0]
             mean = np.where(count > 0, total / np.sqrt(np.maximum(count, 1)), np.nan)

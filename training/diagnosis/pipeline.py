@@ -19,16 +19,14 @@ from ...models.effects.thrust import AxisThrust
 from ...models.recordings.store import Recording
 from ...models.se3 import AXES
 from ...models.vehicles.vehicle import Vehicle
-from .candidates.unknowns import accept, seek, structure
+from .candidates.unknowns import add_structure, find_structure, structure
 from .data.arrays import Data
 from .data.checks import SPARSE, limits, problems, require_enough, unexcited
-from .disturbance.found import OF_OTHERS, all_laws, best_law, passing
-from .disturbance.found import told as told_laws
+from .disturbance.found import OF_OTHERS, all_laws, best_law, passing, reported_laws
 from .disturbance.laws import Law
 from .disturbance.levels import LEVEL
-from .filter.problem import Bench, Look
-from .findings import reported as telling
-from .findings import result
+from .filter.problem import DiagnosisProblem, Evaluation
+from .findings import reported, result
 from .findings.experiments import experiments
 from .findings.ratios import ratios
 from .selection.hypotheses import Fit
@@ -36,7 +34,7 @@ from .selection.model_selection import Hypothesis, parameters_of
 from .selection.refit_all import identify, with_coefficients
 from .selection.search import Found, Search, refitted
 from .validation.blackbox import train
-from .validation.validation import Contender, Simulated, judge, told, white_part
+from .validation.validation import Contender, Simulated, judge, model_gain, white_part
 
 Progress = Callable[[float, str], None]
 Refit = Literal["auto", "none", "scales", "linear", "command", "all"]
@@ -100,8 +98,8 @@ class Finding:
     library: Library
     theta: Float[np.ndarray, " p"]
     data: Data
-    base: Look
-    final: Look
+    base: Evaluation
+    final: Evaluation
     fits: dict[Hypothesis, Fit]
     laws: list[Law]
     simulated: dict[str, Simulated]
@@ -121,16 +119,16 @@ class Diagnoser:
         config = DiagnoseConfig() if config is None else config
         self.config = replace(config, refit="none") if config.refit == "auto" else config
         self.furthest = 0.0
-        self.tell = progress
+        self.report = progress
         self.faults, faulty = problems(recording)
-        self.bench = Bench.of(recording, vehicle, base, faulty)
-        require_enough(self.bench.data)
-        if self.config.refit == "command" and not self.bench.library.has("axis_thrust"):
-            self.bench = self.bench.with_effect(AxisThrust.neutral())
+        self.problem = DiagnosisProblem.of(recording, vehicle, base, faulty)
+        require_enough(self.problem.data)
+        if self.config.refit == "command" and not self.problem.library.has("axis_thrust"):
+            self.problem = self.problem.with_effect(AxisThrust.neutral())
         self.resampled = any("resampled" in note for note in recording.notes)
         self.command_period = recording.command_period
-        directions = np.asarray(self.bench.model.allocate(jnp.eye(self.bench.data.u.shape[1])))
-        self.quiet = unexcited(self.bench.data, directions)
+        directions = np.asarray(self.problem.model.allocate(jnp.eye(self.problem.data.u.shape[1])))
+        self.quiet = unexcited(self.problem.data, directions)
         self.driven = len(self.quiet) < len(AXES)
         if not self.driven:
             self.faults.append(
@@ -142,70 +140,70 @@ class Diagnoser:
     def progress(self, fraction: float, remark: str) -> None:
         """Report progress, which never decreases."""
         self.furthest = max(self.furthest, fraction)
-        self.tell(self.furthest, remark)
+        self.report(self.furthest, remark)
 
     def run(self) -> Finding:
         """The whole diagnosis."""
         started = time.monotonic()
-        config, bench = self.config, self.bench
+        config, problem = self.config, self.problem
         self.progress(0.02, "one-step predictions")
         if config.refit == "all":
-            bench = self.bench = with_coefficients(bench)
-        base = first = self._believed(bench)
-        nuisance = refitted(bench, config.refit)
+            problem = self.problem = with_coefficients(problem)
+        base = first = self._believed(problem)
+        nuisance = refitted(problem, config.refit)
         if nuisance:
-            first = self._refitted(bench)
+            first = self._refitted(problem)
         found = Found(base, first, first)
-        bench, nuisance, structures = self._search(bench, nuisance, found)
+        problem, nuisance, structures = self._search(problem, nuisance, found)
         self.progress(0.72, "all causes together")
-        rows = telling.joint_rows(found, nuisance, bench)
+        rows = reported.joint_rows(found, nuisance, problem)
         final = fitted = found.current
         joint = None
         if rows:
-            theta, fitted, joint = self._together(bench, found, rows)
-            final = bench.look(theta)
+            theta, fitted, joint = self._together(problem, found, rows)
+            final = problem.evaluate(theta)
         self.progress(0.78, "laws of the disturbance")
         least = found.threshold + _LAW_MARGIN
         if self.resampled:  # interpolation makes the noise uneven
-            least += _RESAMPLED * bench.data.steps
+            least += _RESAMPLED * problem.data.steps
         # the residual of imperfectly fitted causes is no law
         least = max(least, OF_OTHERS * sum(choice.fit.heldout_gain for choice in found.accepted))
         least = max(least, found.left_undescribed)
-        laws = [] if final.noise.estimated else all_laws(bench, final, least)
-        groups = told_laws(laws, bench, final, least)
+        laws = [] if final.noise.estimated else all_laws(problem, final, least)
+        groups = reported_laws(laws, problem, final, least)
         shaped = [law for group in groups for law in group if law.name != LEVEL]
-        passed = passing(laws, bench, least)
+        passed = passing(laws, problem, least)
         tested = len(found.fits) + len(laws)
-        causes, stirring = [], []
+        causes, random_effects = [], []
         if joint is not None:
             self.progress(0.8, "what to do next")
-            following = experiments(bench, final, found.accepted, nuisance)
+            following = experiments(problem, final, found.accepted, nuisance)
             causes = [
-                telling.cause(
-                    a, bench, final, joint, following[a.hypothesis], structures.get(a.hypothesis)
+                reported.cause(
+                    a, problem, final, joint, following[a.hypothesis], structures.get(a.hypothesis)
                 )
                 for a in found.accepted
             ]
         for group in groups:
             rivals = [law for law in passed if law.name != group[0].name]
-            law_cause, effect = telling.law_cause(group, rivals, bench, final)
+            law_cause, effect = reported.law_cause(group, rivals, problem, final)
             causes.append(law_cause)
-            stirring.append(effect)
-        gain, simulated = self._gain(
-            bench, found, fitted, rows, shaped, tuple(stirring), bool(causes)
+            random_effects.append(effect)
+        gain, simulated = self._validate(
+            problem, found, fitted, rows, shaped, tuple(random_effects), bool(causes)
         )
-        residual = telling.residual(bench, final)
-        left = telling.left_over(residual, causes, bench, final, least)
+        residual = reported.residual(problem, final)
+        left = reported.left_over(residual, causes, problem, final, least)
         if not self.driven:
             left.insert(0, "commands never change, so what follows them can't be told")
-        d = bench.data
+        d = problem.data
         diagnosis = result.Diagnosis(
             version=result.VERSION,
-            verdict=telling.verdict(causes, left),
-            sentence=telling.sentence(causes, self.faults, bool(nuisance), left),
+            verdict=reported.verdict(causes, left),
+            sentence=reported.sentence(causes, self.faults, bool(nuisance), left),
             causes=causes,
-            refitted=[] if joint is None else telling.refitted(bench, final, nuisance, joint),
-            ratios=ratios(bench, fitted, rows) if config.refit == "all" else [],
+            refitted=[] if joint is None else reported.refitted(problem, final, nuisance, joint),
+            ratios=ratios(problem, fitted, rows) if config.refit == "all" else [],
             residual=residual,
             gain=gain,
             left_out=d.left_out if len(np.unique(d.fold)) > 1 else "nothing",
@@ -219,7 +217,7 @@ class Diagnoser:
                 limits=limits(
                     d, self.quiet, self.resampled, final.noise.estimated, self.command_period
                 ),
-                noise=telling.noise_words(bench, final),
+                noise=reported.noise_levels(problem, final),
             ),
             tested=tested,
             threshold=found.threshold,
@@ -227,104 +225,108 @@ class Diagnoser:
             seconds=time.monotonic() - started,
         )
         extended = Extended.create(
-            bench.model.base,
-            (*bench.library.used(final.theta), *stirring),
-            bench.vehicle.thrusters(),
+            problem.model.base,
+            (*problem.library.used(final.theta), *random_effects),
+            problem.vehicle.thrusters(),
         ).for_steps_of(_FINEST)
         return Finding(
-            diagnosis, extended, bench.library, final.theta, d, base, final, found.fits, laws,
+            diagnosis, extended, problem.library, final.theta, d, base, final, found.fits, laws,
             simulated,
         )  # fmt: skip
 
-    def _believed(self, bench: Bench) -> Look:
+    def _believed(self, problem: DiagnosisProblem) -> Evaluation:
         try:
-            return bench.look(bench.believed)
+            return problem.evaluate(problem.believed)
         except FloatingPointError as error:
             raise UserError(
-                f"{error} within a step of {bench.data.longest:.3g} s from recorded states: the "
+                f"{error} within a step of {problem.data.longest:.3g} s from recorded states: the "
                 "believed model is unstable on these data; check units of commands and twists, or "
                 "give a --vehicle or --model that is near"
             ) from error
 
-    def _refitted(self, bench: Bench) -> Look:
+    def _refitted(self, problem: DiagnosisProblem) -> Evaluation:
         """The believed model with the coefficients of `refit` fitted."""
         if self.config.refit == "all":
             remark = "all coefficients together"
-            return bench.look(identify(bench, lambda f: self.progress(0.03 + 0.07 * f, remark)))
-        rows = refitted(bench, self.config.refit)
-        return bench.look(bench.polish(bench.believed, rows)[0])
+            return problem.evaluate(
+                identify(problem, lambda f: self.progress(0.03 + 0.07 * f, remark))
+            )
+        rows = refitted(problem, self.config.refit)
+        return problem.evaluate(problem.polish(problem.believed, rows)[0])
 
     def _together(
-        self, bench: Bench, found: Found, rows: list[int]
-    ) -> tuple[np.ndarray, Look, Fit]:
+        self, problem: DiagnosisProblem, found: Found, rows: list[int]
+    ) -> tuple[np.ndarray, Evaluation, Fit]:
         """Joint fit of all causes and nuisance parameters."""
         if self.config.refit != "all":
-            return bench.polish(found.current.theta, rows)
-        causes = parameters_of(bench.library, found.hypotheses)
-        theta = identify(bench, start=found.current.theta, also=causes)
-        fitted = bench.look(theta, rows)
+            return problem.polish(found.current.theta, rows)
+        causes = parameters_of(problem.library, found.hypotheses)
+        theta = identify(problem, start=found.current.theta, also=causes)
+        fitted = problem.evaluate(theta, rows)
         return theta, fitted, fitted.evidence.fit(rows)
 
     def _within(self, low: float, high: float) -> Progress:
         return lambda fraction, remark: self.progress(low + (high - low) * fraction, remark)
 
-    def _names(self, bench: Bench, nuisance: list[int], low: float, high: float) -> Search:
+    def _names(
+        self, problem: DiagnosisProblem, nuisance: list[int], low: float, high: float
+    ) -> Search:
         config, within = self.config, self._within(low, high)
-        shortest = (_OF_A_STEP if self.resampled else _NO_TIME) * bench.data.dt
-        if self.command_period > SPARSE * bench.data.dt:
+        shortest = (_OF_A_STEP if self.resampled else _NO_TIME) * problem.data.dt
+        if self.command_period > SPARSE * problem.data.dt:
             shortest = max(shortest, _OF_A_COMMAND * self.command_period)
         return Search(
-            bench, nuisance, config.alpha, config.most, self.rng, within, self.quiet, shortest
+            problem, nuisance, config.alpha, config.most, self.rng, within, self.quiet, shortest
         )
 
     def _search(
-        self, bench: Bench, nuisance: list[int], found: Found
-    ) -> tuple[Bench, list[int], dict[Hypothesis, result.Structure]]:
+        self, problem: DiagnosisProblem, nuisance: list[int], found: Found
+    ) -> tuple[DiagnosisProblem, list[int], dict[Hypothesis, result.Structure]]:
         """Causes, unmodelled structure (a new effect in the library), and further causes.
 
         Where a disturbance law wins far more than any cause, structure is sought first; where more
         than two causes are needed, it is sought before the third.
         """
         config, structures = self.config, {}
-        search = self._names(bench, nuisance, 0.1, 0.5)
+        search = self._names(problem, nuisance, 0.1, 0.5)
         choice, found.left = search.next(found)
         found.fits = found.left
         best = 0.0 if choice is None else choice.fit.heldout_gain
-        law = best_law(bench, found.first)
+        law = best_law(problem, found.first)
         seen = None
         if _RIVALS * law < max(best, found.threshold + _LAW_MARGIN):
-            bench = search.run(found, _NAMES_FIRST).bench
+            problem = search.run(found, _NAMES_FIRST).problem
             if len(found.accepted) == _NAMES_FIRST and search.next(found)[0] is not None:
                 found.left = search.next(found)[1]
-                seen = seek(bench, nuisance, found, config.alpha, self.rng, self.quiet)
+                seen = find_structure(problem, nuisance, found, config.alpha, self.rng, self.quiet)
             if found.accepted or seen is None:  # else structure replaces the causes
                 seen = None
-                bench = search.run(found).bench
+                problem = search.run(found).problem
         for number in range(_MOST_UNKNOWN):
             self.progress(0.52 + 0.1 * number, "structure without a name")
             if seen is None:
-                seen = seek(bench, nuisance, found, config.alpha, self.rng, self.quiet)
-            taken = {e.places[0] for e in bench.library.effects if e.name == "unknown"}
+                seen = find_structure(problem, nuisance, found, config.alpha, self.rng, self.quiet)
+            taken = {e.places[0] for e in problem.library.effects if e.name == "unknown"}
             if seen is None or seen.matched.group.effect.acts_on in taken:
                 if number == 0 and not found.accepted:
-                    bench = search.run(found).bench
+                    problem = search.run(found).problem
                 break
-            bench = accept(bench, nuisance, found, seen, self.rng)
-            nuisance = refitted(bench, config.refit)
+            problem = add_structure(problem, nuisance, found, seen, self.rng)
+            nuisance = refitted(problem, config.refit)
             where = found.hypotheses[-1][1]
-            structures["unknown", where] = structure(bench, where, found.current.theta, seen)
-            again = self._names(bench, nuisance, 0.55 + 0.1 * number, 0.6 + 0.1 * number)
-            bench, seen = again.run(found).bench, None
-        return bench, nuisance, structures
+            structures["unknown", where] = structure(problem, where, found.current.theta, seen)
+            again = self._names(problem, nuisance, 0.55 + 0.1 * number, 0.6 + 0.1 * number)
+            problem, seen = again.run(found).problem, None
+        return problem, nuisance, structures
 
-    def _gain(
+    def _validate(
         self,
-        bench: Bench,
+        problem: DiagnosisProblem,
         found: Found,
-        fitted: Look,
+        fitted: Evaluation,
         rows: list[int],
         laws: list[Law],
-        stirring: tuple[Effect, ...],
+        random_effects: tuple[Effect, ...],
         extended: bool,
     ) -> tuple[dict[str, result.ModelGain], dict[str, Simulated]]:
         """Base, base refitted, extended model and black box on data left out of their fits.
@@ -333,36 +335,41 @@ class Diagnoser:
         """
         horizon, seed = self.config.horizon, self.config.seed
         self.progress(0.82, "gain: the belief")
-        R = len(bench.data.fold)
-        still = np.repeat(bench.believed[:, None], R, axis=1)
+        R = len(problem.data.fold)
+        still = np.repeat(problem.believed[:, None], R, axis=1)
         contenders = {"base": Contender(still)}
         if self.config.refit in ("none", "scales"):
-            belief = refitted(bench, "linear")
-            _, look, _ = bench.polish(bench.believed, belief, rounds=3)
+            belief = refitted(problem, "linear")
+            _, evaluation, _ = problem.polish(problem.believed, belief, rounds=3)
         else:
-            belief = refitted(bench, self.config.refit)
-            look = bench.look(bench.moved(found.first.theta, self.bench.library), belief)
-        contenders["refitted"] = Contender(bench.without_each(look, belief))
+            belief = refitted(problem, self.config.refit)
+            evaluation = problem.evaluate(
+                problem.moved(found.first.theta, self.problem.library), belief
+            )
+        contenders["refitted"] = Contender(problem.without_each(evaluation, belief))
         if extended:
             won = np.zeros(R)
             for law in laws:
                 won += law.heldout if len(law.heldout) == R else 0.0
-            white = white_part(laws, bench)
+            white = white_part(laws, problem)
             # the level is estimated for every contender
-            laws_of_it = tuple(e for e in stirring if e.name != LEVEL)
+            laws_of_it = tuple(e for e in random_effects if e.name != LEVEL)
             contenders["extended"] = Contender(
-                bench.without_each(fitted, rows), won=won, stirring=laws_of_it, white=white
+                problem.without_each(fitted, rows),
+                law_gain=won,
+                random_effects=laws_of_it,
+                white_share=white,
             )
         contenders["black_box"] = Contender(
-            still, train(found.base.predictions, bench.data, self.rng)
+            still, train(found.base.predictions, problem.data, self.rng)
         )
         judged, estimated = {}, fitted.noise.estimated
         for number, (name, contender) in enumerate(contenders.items()):
             self.progress(0.84 + 0.04 * number, f"gain: {name.replace('_', ' ')}")
-            in_use = [] if contender.box is not None else [*belief, *rows]
-            judged[name] = judge(bench, contender, horizon, seed, in_use, estimated)
+            in_use = [] if contender.black_box is not None else [*belief, *rows]
+            judged[name] = judge(problem, contender, horizon, seed, in_use, estimated)
         gain = {
-            name: told(j, judged["base"], bench, horizon, np.random.default_rng(seed))
+            name: model_gain(j, judged["base"], problem, horizon, np.random.default_rng(seed))
             for name, j in judged.items()
         }
         return gain, {name: j.simulated for name, j in judged.items()}
@@ -406,8 +413,8 @@ def _diagnose(
     second = again.diagnosis
     if best_gain(second) < best_gain(first) + _CLEARLY:
         return found
-    told = telling.with_coefficients_off(second)
-    return replace(again, diagnosis=replace(told, seconds=first.seconds + second.seconds))
+    corrected = reported.with_coefficients_off(second)
+    return replace(again, diagnosis=replace(corrected, seconds=first.seconds + second.seconds))
 
 
 def coefficients_are_off(diagnosis: result.Diagnosis) -> bool:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from ....models.effects.following import FOLLOWERS
 from ....models.effects.unknown import MOTION, Unknown, powers
 from ....models.se3 import AXES, TWIST
-from ..filter.problem import Bench, Look
+from ..filter.problem import DiagnosisProblem, Evaluation
 from .structures import Group, Matched, Screen
 
 _TENTHS = tuple(round(0.1 * k, 1) for k in range(5, 16))
@@ -32,37 +32,39 @@ _CORRELATED, _MOST_CORRELATED = 0.1, 2
 axis, and number of such axes at most."""
 
 
-def groups(bench: Bench, look: Look, quiet: Sequence[str] = ()) -> Iterator[Group]:
+def groups(
+    problem: DiagnosisProblem, evaluation: Evaluation, quiet: Sequence[str] = ()
+) -> Iterator[Group]:
     """All groups that are tried; dependence on motion of `quiet` axes is not identifiable."""
-    d = bench.data
+    d = problem.data
     nodes = [(time, f) for time, frequencies in NODES.items() for f in frequencies]
     moving = [i for i, axis in enumerate(AXES) if axis not in quiet]
-    for i in _correlated(look):
+    for i in _correlated(evaluation):
         for j in moving:
             if j != i and i in moving:
-                yield _memory(bench, i, j, nodes)
+                yield _memory(problem, i, j, nodes)
     for i in moving:
         axis = AXES[i]
-        yield _memory(bench, i, i, nodes)
-        yield _of_state(bench, Unknown.neutral(kind="motion", acts_on=axis, numbers=_ALL_MOTION))
-        yield _of_state(bench, Unknown.neutral(kind="pose", acts_on=axis))
+        yield _memory(problem, i, i, nodes)
+        yield _of_state(problem, Unknown.neutral(kind="motion", acts_on=axis, numbers=_ALL_MOTION))
+        yield _of_state(problem, Unknown.neutral(kind="pose", acts_on=axis))
     level = d.command != "F_Bo_B"
     for k in range(d.u.shape[1] if level else 0):
-        yield _of_thruster(bench, k)
+        yield _of_thruster(problem, k)
     if level:
-        yield _of_exchange(bench)
+        yield _of_exchange(problem)
         for where in ("thrusters", *(str(k + 1) for k in range(d.u.shape[1]))):
             for kind, numbers in FOLLOWED.items():
-                yield _of_follower(bench, kind, where, numbers)
+                yield _of_follower(problem, kind, where, numbers)
     z = d.X[:-1, 6][d.weight > 0]
     numbers = (float(z.mean()), float(z.std() + 1e-3))
-    yield _of_state(bench, Unknown.neutral(kind="depth", acts_on="W", numbers=numbers))
+    yield _of_state(problem, Unknown.neutral(kind="depth", acts_on="W", numbers=numbers))
     for i in moving:
-        yield _of_state(bench, Unknown.neutral(kind="damping", acts_on=AXES[i], numbers=numbers))
+        yield _of_state(problem, Unknown.neutral(kind="damping", acts_on=AXES[i], numbers=numbers))
     bumps = _bumps(d.X[:-1, 4][d.weight > 0], d.X[:-1, 5][d.weight > 0])
     if len(bumps) > 9:
         for kind in ("place", "flow"):
-            yield _of_state(bench, Unknown.neutral(kind=kind, acts_on="W", numbers=bumps))
+            yield _of_state(problem, Unknown.neutral(kind=kind, acts_on="W", numbers=bumps))
 
 
 _ALL_MOTION = tuple(float(i) for i in range(len(MOTION)))
@@ -72,8 +74,8 @@ _VARIABLES = {
 }  # fmt: skip
 
 
-def _of_state(bench: Bench, effect: Unknown) -> Group:
-    d, k = bench.data, effect.size()
+def _of_state(problem: DiagnosisProblem, effect: Unknown) -> Group:
+    d, k = problem.data, effect.size()
 
     def columns(kept: np.ndarray) -> np.ndarray:
         X, V = (jnp.asarray(a[:-1][..., kept].swapaxes(0, 1)) for a in (d.X, d.V))
@@ -92,20 +94,20 @@ def _of_state(bench: Bench, effect: Unknown) -> Group:
     return Group(effect, action, _VARIABLES[effect.kind], columns, (tuple(range(k)),))
 
 
-def _of_thruster(bench: Bench, k: int) -> Group:
+def _of_thruster(problem: DiagnosisProblem, k: int) -> Group:
     effect = Unknown.neutral(kind="thruster", acts_on=str(k + 1))
 
     def columns(kept: np.ndarray) -> np.ndarray:
-        return np.moveaxis(np.asarray(powers(jnp.asarray(bench.data.u[:, k][:, kept]))), 0, 1)[
+        return np.moveaxis(np.asarray(powers(jnp.asarray(problem.data.u[:, k][:, kept]))), 0, 1)[
             :, None
         ]
 
     return Group(effect, "thruster", (f"f{k + 1}",), columns, (tuple(range(effect.size())),))
 
 
-def _of_exchange(bench: Bench) -> Group:
+def _of_exchange(problem: DiagnosisProblem) -> Group:
     """Two thrusters with exchanged commands, one pair a node."""
-    model, d = bench.model, bench.data
+    model, d = problem.model, problem.data
     count = d.u.shape[1]
     pairs = tuple(itertools.combinations(range(count), 2))
     effect = Unknown.neutral(kind="exchange", acts_on="thrusters", numbers=(1.0, 2.0))
@@ -123,9 +125,11 @@ def _of_exchange(bench: Bench) -> Group:
     return Group(effect, "thrusters", variables, columns, nodes, labels)
 
 
-def _of_follower(bench: Bench, kind: str, where: str, numbers: Sequence[float]) -> Group:
+def _of_follower(
+    problem: DiagnosisProblem, kind: str, where: str, numbers: Sequence[float]
+) -> Group:
     """Backlash or rate limit of one thruster or of all, one value a node."""
-    model, d = bench.model, bench.data
+    model, d = problem.model, problem.data
     count, single = d.u.shape[1], where != "thrusters"
     effect = Unknown.neutral(kind=kind, acts_on=where, numbers=(numbers[0],), thrusters=count)
     of = [int(where) - 1] if single else list(range(count))
@@ -172,22 +176,24 @@ def _followed(kind: str, commands: Array, held: Array, numbers: Array) -> Array:
     return jnp.moveaxis(jax.lax.scan(follow, start, (commands, held))[1], 1, 0)
 
 
-def _correlated(look: Look) -> list[int]:
+def _correlated(evaluation: Evaluation) -> list[int]:
     """Axes with the most correlated neighbouring innovations, above `_CORRELATED`."""
-    correlation = look.correlation[6:]
+    correlation = evaluation.correlation[6:]
     first = np.argsort(-correlation)[:_MOST_CORRELATED]
     return [int(i) for i in first if correlation[i] > _CORRELATED]
 
 
-def _memory(bench: Bench, axis: int, of: int, nodes: Sequence[tuple[float, float]]) -> Group:
+def _memory(
+    problem: DiagnosisProblem, axis: int, of: int, nodes: Sequence[tuple[float, float]]
+) -> Group:
     """A wrench on an axis with memory of a component of the twist."""
     effect = Unknown.neutral(kind="memory", acts_on=AXES[axis], numbers=(*nodes[0], float(of)))
 
     def columns(kept: np.ndarray) -> np.ndarray:
-        v = bench.data.V[:-1, of][:, kept]
+        v = problem.data.V[:-1, of][:, kept]
         rates = np.array([complex(-1 / t, 2 * np.pi * f) for t, f in nodes])[:, None]
         z, found = np.zeros((len(nodes), len(kept)), complex), []
-        for x, h in zip(v, bench.data.step[:, kept], strict=True):
+        for x, h in zip(v, problem.data.step[:, kept], strict=True):
             turn = np.exp(rates * h)
             gain = (turn - 1) / rates
             after = turn * z + gain * x
@@ -232,7 +238,7 @@ def refined(screen: Screen, found: Matched, rng: np.random.Generator) -> Unknown
             step = (spread - 1) * max(f, 0.2)
             frequencies = [g for g in (f - step, f, f + step) if g >= 0.03] if f else [0.0]
             times = (T / spread, T, T * spread)
-            finer = _memory(screen.bench, axis, of, [(t, g) for g in frequencies for t in times])
+            finer = _memory(screen.problem, axis, of, [(t, g) for g in frequencies for t in times])
             again = screen.match(finer, 0.01, rng, draws=0)
             T, f = finer.labels[again.node]
         return Unknown.neutral(kind="memory", acts_on=effect.acts_on, numbers=(T, f, float(of)))
@@ -242,7 +248,7 @@ def refined(screen: Screen, found: Matched, rng: np.random.Generator) -> Unknown
         (number,) = found.group.labels[found.node]
         for spread in _FINER:
             numbers = (number / spread, number, number * spread)
-            finer = _of_follower(screen.bench, effect.kind, effect.acts_on, numbers)
+            finer = _of_follower(screen.problem, effect.kind, effect.acts_on, numbers)
             number = numbers[screen.match(finer, 0.01, rng, draws=0).node]
         return replace(effect, numbers=(number,))
     if effect.kind == "motion":
@@ -251,9 +257,9 @@ def refined(screen: Screen, found: Matched, rng: np.random.Generator) -> Unknown
     return effect
 
 
-def described(effect: Unknown, weights: np.ndarray, bench: Bench) -> dict[str, Any]:
+def described(effect: Unknown, weights: np.ndarray, problem: DiagnosisProblem) -> dict[str, Any]:
     """Variables, one sentence, lag, frequency and region of what was matched."""
-    d = bench.data
+    d = problem.data
     exists = d.weight > 0
     heading = np.arctan2(
         2 * (d.X[:-1, 0] * d.X[:-1, 3] + d.X[:-1, 1] * d.X[:-1, 2]),
@@ -269,43 +275,47 @@ def described(effect: Unknown, weights: np.ndarray, bench: Bench) -> dict[str, A
         lag, frequency = effect.numbers[:2]
         variables = (effect.terms[0],)
         rings = f" and rings at {frequency:.2f} Hz" if frequency else ""
-        told = f"a wrench on {where} that remembers {variables[0]} for {lag:.2g} s{rings}"
+        description = f"a wrench on {where} that remembers {variables[0]} for {lag:.2g} s{rings}"
     elif effect.kind == "motion":
         order = np.argsort(-np.abs(weights))
-        told = f"a wrench on {where} in " + ", ".join(effect.terms[i] for i in order)
+        description = f"a wrench on {where} in " + ", ".join(effect.terms[i] for i in order)
         variables = [n for n in TWIST if any(n in effect.terms[i] for i in order)]
     elif effect.kind == "thruster":
         variables = (f"f{where}",)
-        told = f"the force of thruster {where} against its command"
+        description = f"the force of thruster {where} against its command"
     elif effect.kind == "exchange":
         i, j = (int(k) for k in effect.numbers)
         variables = (f"f{i}", f"f{j}")
-        told = f"thrusters {i} and {j} that take each other's command, by their wires or columns"
+        description = (
+            f"thrusters {i} and {j} that take each other's command, by their wires or columns"
+        )
     elif effect.kind in FOLLOWERS:
         single = where != "thrusters"
         variables = (f"f{where}",) if single else tuple(f"f{k + 1}" for k in range(d.u.shape[1]))
         who = f"thruster {where} following its" if single else "thrusters that follow their"
         how = {"play": "with backlash of {:.2g} N", "slew": "by {:.2g} N/s at most"}
-        told = f"{who} commands {how[effect.kind].format(effect.numbers[0])}"
+        description = f"{who} commands {how[effect.kind].format(effect.numbers[0])}"
     elif effect.kind == "pose":
-        told = f"a wrench on {where} that depends on heading, roll or pitch"
+        description = f"a wrench on {where} that depends on heading, roll or pitch"
     elif effect.kind == "damping":
         variables = ("z", TWIST[AXES.index(where)])
-        told = f"damping of {where} that depends on depth"
+        description = f"damping of {where} that depends on depth"
     elif effect.kind == "depth":
-        told = "a force in W that depends on depth"
+        description = "a force in W that depends on depth"
     else:
         what = "moving water" if effect.kind == "flow" else "a force"
         count = len(weights) // 2
         size = np.hypot(weights[:count], weights[count:])
         x, y = np.array(effect.numbers[1:]).reshape(-1, 2)[int(np.argmax(size))]
-        told = f"{what} that depends on the place in W (x, y), largest near ({x:.1f}, {y:.1f}) m"
+        description = (
+            f"{what} that depends on the place in W (x, y), largest near ({x:.1f}, {y:.1f}) m"
+        )
     region = {}
     for name in variables:
         if name in seen:
             low, high = np.percentile(seen[name][exists], (2, 98))
             region[name] = (float(low), float(high))
     return {
-        "acts_on": where, "variables": list(variables), "description": told, "lag": lag,
+        "acts_on": where, "variables": list(variables), "description": description, "lag": lag,
         "frequency": frequency or None, "region": region,
     }  # fmt: skip

@@ -26,7 +26,7 @@ from ....models.effects.extended import Extended
 from ....models.effects.inertia import times
 from ....models.effects.unknown import Unknown
 from ....models.se3 import AXES
-from ..filter.problem import Bench, Look
+from ..filter.problem import DiagnosisProblem, Evaluation
 from ..filter.sensitivities import through
 from ..selection.hypotheses import Chance
 from ..selection.model_selection import CLEAR
@@ -109,14 +109,14 @@ class Screen:
 
     def __init__(
         self,
-        bench: Bench,
-        look: Look,
-        beside: Float[np.ndarray, "m N12 R"] | None,
+        problem: DiagnosisProblem,
+        evaluation: Evaluation,
+        free: Float[np.ndarray, "m N12 R"] | None,
         whole: bool = False,
     ):
         """On all pieces if `whole`, else on so many of each fold that `PIECES` are not exceeded."""
-        self.bench, self.look = bench, look
-        data = bench.data
+        self.problem, self.evaluate = problem, evaluation
+        data = problem.data
         labels = np.unique(data.fold)
         each = len(data.fold) if whole else max(1, PIECES // len(labels))
         chosen: list[int] = []
@@ -127,23 +127,23 @@ class Screen:
         self.kept = np.array(sorted(chosen))
         self.fold = data.fold[self.kept]
         self.cluster = data.cluster[self.kept]
-        k = look.kalman.of(self.kept)
+        k = evaluation.kalman.of(self.kept)
         self.filters = (
-            jnp.asarray(np.asarray(look.predictions.jacobian)[..., self.kept]),
+            jnp.asarray(np.asarray(evaluation.predictions.jacobian)[..., self.kept]),
             jnp.asarray(k.keep),
             jnp.asarray(k.whiten),
             jnp.asarray(data.weight[:, self.kept]),
             jnp.asarray(data.own_steps(self.kept)),
         )
-        z = look.z[..., self.kept].reshape(len(data.u) * 12, -1)
-        self.z = z[None] if beside is None else np.concatenate([z[None], beside[..., self.kept]])
-        self.inverse = np.linalg.inv(bench.mass(look.theta))
+        z = evaluation.z[..., self.kept].reshape(len(data.u) * 12, -1)
+        self.z = z[None] if free is None else np.concatenate([z[None], free[..., self.kept]])
+        self.inverse = np.linalg.inv(problem.mass(evaluation.theta))
 
-    def responses(self, group: Group) -> Float[np.ndarray, "k N12 R"]:
+    def sensitivities(self, group: Group) -> Float[np.ndarray, "k N12 R"]:
         """Changes of the whitened innovations by each column of a group."""
-        return self.passed(self.accelerations(group, group.columns(self.kept)))
+        return self.whitened(self.accelerations(group, group.columns(self.kept)))
 
-    def passed(self, a: Float[np.ndarray, "N 6 k R"]) -> Float[np.ndarray, "k N12 R"]:
+    def whitened(self, a: Float[np.ndarray, "N 6 k R"]) -> Float[np.ndarray, "k N12 R"]:
         """Changes of the whitened innovations by accelerations dV/dt."""
         parts = []
         for first in range(0, a.shape[2], LANES):
@@ -160,7 +160,7 @@ class Screen:
         if group.action == "wrench":
             return self.inverse[:, AXES.index(group.effect.acts_on)][:, None, None] * phi
         if group.action == "thruster":
-            model = self.bench.model
+            model = self.problem.model
             unit = np.eye(len(model.inverse))[:, int(group.effect.acts_on) - 1]
             wrench = self.inverse @ np.asarray(model.allocate(jnp.asarray(unit)))
             return wrench[:, None, None] * phi
@@ -170,7 +170,7 @@ class Screen:
         return np.einsum("nijr,njkr->nikr", F, phi)
 
     def _of_world(self, inverse: Float[np.ndarray, "6 3"]) -> Float[np.ndarray, "N 6 3 R"]:
-        X = self.bench.data.X[:-1][..., self.kept].swapaxes(0, 1)
+        X = self.problem.data.X[:-1][..., self.kept].swapaxes(0, 1)
         unit = np.eye(3)[:, :, None, None] + np.zeros((1, 1, *X.shape[1:]))
         turned = se3.rotate_inverse(jnp.asarray(X)[:, None], jnp.asarray(unit))
         return np.einsum("ij,jknr->nikr", inverse, np.asarray(turned))
@@ -178,7 +178,7 @@ class Screen:
     @cached_property
     def water(self) -> tuple[Float[np.ndarray, "N 6 3 R"], Float[np.ndarray, "N 6 3 R"]]:
         """dV/dt for velocity (m/s) and for acceleration (m/s²) of the water in W, one each."""
-        still = np.zeros((len(self.bench.data.u), 3, len(self.kept)))
+        still = np.zeros((len(self.problem.data.u), 3, len(self.kept)))
         both = self._of_water(still)[1]
         return both[:, :, :3], both[:, :, 3:]
 
@@ -192,10 +192,10 @@ class Screen:
     def _of_water(
         self, v_WC_W: Float[np.ndarray, "N 3 R"]
     ) -> tuple[Float[np.ndarray, "N 6 R"], Float[np.ndarray, "N 6 6 R"]]:
-        d = self.bench.data
+        d = self.problem.data
         given = (d.X[:-1][..., self.kept], d.V[:-1][..., self.kept], d.u[..., self.kept], v_WC_W)
         arrays = (jnp.asarray(a.swapaxes(0, 1)) for a in given)
-        drift, slope = _of_water(self.bench.model, *arrays)
+        drift, slope = _of_water(self.problem.model, *arrays)
         return np.moveaxis(np.asarray(drift), 1, 0), np.moveaxis(np.asarray(slope), 2, 0)
 
     # ------------------------------------------------------------------------------ matching
@@ -207,7 +207,7 @@ class Screen:
 
         That threshold is infinite where the gain is small, and larger where runs disagree.
         """
-        J = self.responses(group)
+        J = self.sensitivities(group)
         columns = np.concatenate([self.z, J]).astype(np.float64)
         free = len(self.z)
         G = np.einsum("iar,jar->rij", columns, columns, optimize=True)
@@ -242,7 +242,7 @@ class Screen:
 
     def sparse(self, group: Group, most: int = 4) -> tuple[float, ...]:
         """The few columns that orthogonal matching takes first (Pati et al. 1993)."""
-        columns = np.concatenate([self.z, self.responses(group)]).astype(np.float64)
+        columns = np.concatenate([self.z, self.sensitivities(group)]).astype(np.float64)
         free = len(self.z)
         T = np.einsum("iar,jar->ij", columns, columns, optimize=True)
         size = np.sqrt(np.maximum(np.diag(T), 1e-12))

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..disturbance.found import best_law
-from ..filter.problem import Bench, Look
-from ..filter.sensitivities import respond
+from ..filter.problem import DiagnosisProblem, Evaluation
+from ..filter.sensitivities import whitened_sensitivities
 from ..findings import result
 from ..selection.hypotheses import Design, Fit
 from ..selection.model_selection import Choice, admissible, parameters_of
@@ -23,7 +23,7 @@ _TOGETHER, _OF_A_LAW = 1.1, 0.7
 
 
 @dataclass(frozen=True)
-class Seen:
+class FoundStructure:
     """The best structure at one θ, its gain in nats of all data, and the best cause's gain."""
 
     screen: Screen
@@ -32,31 +32,39 @@ class Seen:
     name_gain: float
 
 
-def responses_of(bench: Bench, look: Look, rows: list[int]) -> Float[np.ndarray, "m N12 R"] | None:
+def sensitivities_of(
+    problem: DiagnosisProblem, evaluation: Evaluation, rows: list[int]
+) -> Float[np.ndarray, "m N12 R"] | None:
     """Whitened sensitivities to parameters, one small probe each."""
     if not rows:
         return None
-    design = Design.of(bench.library, look.theta, rows)
+    design = Design.of(problem.library, evaluation.theta, rows)
     first = [int(np.flatnonzero(design.owner == i)[0]) for i in rows]
     probes = design.probes[first]
-    z = respond(
-        bench.model, bench.library, look.theta, probes, bench.data, look.predictions, look.kalman
+    z = whitened_sensitivities(
+        problem.model,
+        problem.library,
+        evaluation.theta,
+        probes,
+        problem.data,
+        evaluation.predictions,
+        evaluation.kalman,
     )
     return z[1:]
 
 
 def screened(
-    bench: Bench,
-    look: Look,
+    problem: DiagnosisProblem,
+    evaluation: Evaluation,
     rows: list[int],
     alpha: float,
     rng: np.random.Generator,
     quiet: Sequence[str] = (),
 ) -> tuple[Screen, Matched, float] | None:
     """The structure that wins most with `rows` free, of those significant against noise alone."""
-    screen = Screen(bench, look, responses_of(bench, look, rows))
-    share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
-    tried = list(groups(bench, look, quiet))
+    screen = Screen(problem, evaluation, sensitivities_of(problem, evaluation, rows))
+    share = problem.data.steps / problem.data.weight[:, screen.kept].sum()
+    tried = list(groups(problem, evaluation, quiet))
     best: Matched | None = None
     for group in tried:
         m = screen.match(group, alpha / len(tried), rng)
@@ -69,19 +77,21 @@ def screened(
     return screen, best, best.gain * share
 
 
-def _best_name(bench: Bench, look: Look, fits: dict) -> float:
-    gains = [f.heldout_gain for f in fits.values() if admissible(bench.library, look.theta, f)]
+def _best_name(problem: DiagnosisProblem, evaluation: Evaluation, fits: dict) -> float:
+    gains = [
+        f.heldout_gain for f in fits.values() if admissible(problem.library, evaluation.theta, f)
+    ]
     return max([0.0, *gains])
 
 
-def seek(
-    bench: Bench,
+def find_structure(
+    problem: DiagnosisProblem,
     nuisance: list[int],
     found: Found,
     alpha: float,
     rng: np.random.Generator,
     quiet: Sequence[str] = (),
-) -> Seen | None:
+) -> FoundStructure | None:
     """Structure in the residual of the causes; where it wins more than they do, in place of them.
 
     In the second case `found` is reset to the model without causes. None is sought in estimated
@@ -89,56 +99,72 @@ def seek(
     """
     if found.current.noise.estimated:
         return None
-    rows = [*parameters_of(bench.library, found.hypotheses), *nuisance]
-    left = screened(bench, found.current, rows, alpha, rng, quiet)
+    rows = [*parameters_of(problem.library, found.hypotheses), *nuisance]
+    left = screened(problem, found.current, rows, alpha, rng, quiet)
     if left is None:
         return None
     screen, best, gain = left
-    name = _best_name(bench, found.current, found.left)
-    law = best_law(bench, found.current)
+    name = _best_name(problem, found.current, found.left)
+    law = best_law(problem, found.current)
     if gain < BEATS * name or gain < _OF_A_LAW * law:
         return None
     known = [h for h in found.hypotheses if h[0] != "unknown"]
     if known and len(known) == len(found.hypotheses):
-        at_first = screened(bench, found.first, nuisance, alpha, rng, quiet)
+        at_first = screened(problem, found.first, nuisance, alpha, rng, quiet)
         evidence = found.first.evidence
         owned = set(evidence.design.owner.tolist())
-        own = [i for i in parameters_of(bench.library, known) if i in owned]
+        own = [i for i in parameters_of(problem.library, known) if i in owned]
         together = evidence.fit(own, nuisance).heldout_gain if own else np.inf
-        alone = _best_name(bench, found.first, found.fits)
+        alone = _best_name(problem, found.first, found.fits)
         if at_first is not None and at_first[2] > max(BEATS * alone, _TOGETHER * together):
             found.accepted, found.current = [], found.first
-            return Seen(*at_first, alone)
-    return Seen(screen, best, gain, name)
+            return FoundStructure(*at_first, alone)
+    return FoundStructure(screen, best, gain, name)
 
 
-def accept(
-    bench: Bench, nuisance: list[int], found: Found, seen: Seen, rng: np.random.Generator
-) -> Bench:
+def add_structure(
+    problem: DiagnosisProblem,
+    nuisance: list[int],
+    found: Found,
+    found_structure: FoundStructure,
+    rng: np.random.Generator,
+) -> DiagnosisProblem:
     """Add the structure to the model, refit it with all that was accepted; the new problem."""
-    effect = refined(seen.screen, seen.matched, rng)
+    effect = refined(found_structure.screen, found_structure.matched, rng)
     rivals = sorted(found.left.items(), key=lambda item: -item[1].heldout_gain)[:5]
-    wider = bench.with_effect(effect)
-    theta = wider.moved(found.current.theta, bench.library)
+    wider = problem.with_effect(effect)
+    theta = wider.moved(found.current.theta, problem.library)
     hypothesis = ("unknown", effect.acts_on)
     own = wider.library.at(*hypothesis)
-    free = [wider.library.index(*_key(bench.library.entries[i])) for i in nuisance]
+    free = [wider.library.index(*_key(problem.library.entries[i])) for i in nuisance]
     rows = [*own, *parameters_of(wider.library, found.hypotheses), *free]
     theta, _, joint = wider.polish(theta, rows, rounds=6)
-    heldout = seen.matched.heldout * seen.gain / max(seen.matched.gain, 1e-300)
-    p = seen.matched.p_value
-    fit = Fit(tuple(own), theta[own], {}, joint.errors[: len(own)], seen.gain, heldout, p)
+    heldout = (
+        found_structure.matched.heldout
+        * found_structure.gain
+        / max(found_structure.matched.gain, 1e-300)
+    )
+    p = found_structure.matched.p_value
+    fit = Fit(
+        tuple(own), theta[own], {}, joint.errors[: len(own)], found_structure.gain, heldout, p
+    )
     ranked = tuple((h, f.heldout_gain) for h, f in rivals)
     found.accepted.append(Choice(hypothesis, fit, (), ranked, p))
-    found.current = wider.look(theta)
+    found.current = wider.evaluate(theta)
     return wider
 
 
-def structure(bench: Bench, where: str, theta: np.ndarray, seen: Seen) -> result.Structure:
+def structure(
+    problem: DiagnosisProblem, where: str, theta: np.ndarray, found_structure: FoundStructure
+) -> result.Structure:
     """The structure that was found, in words."""
-    effect = next(e for e in bench.library.effects if e.name == "unknown" and e.places == (where,))
-    told = described(effect, theta[bench.library.at("unknown", where)], bench)  # pyright: ignore[reportArgumentType]
-    return result.Structure(**told, heldout_gain=seen.gain, best_name_gain=seen.name_gain)
+    effect = next(
+        e for e in problem.library.effects if e.name == "unknown" and e.places == (where,)
+    )
+    words = described(effect, theta[problem.library.at("unknown", where)], problem)  # pyright: ignore[reportArgumentType]
+    return result.Structure(
+        **words, heldout_gain=found_structure.gain, best_name_gain=found_structure.name_gain
+    )
 
 
 def _key(entry: tuple) -> tuple[str, str, str]:

@@ -73,7 +73,7 @@ class Data:
     unmeasured: tuple[str, ...] = ()
 
     @property
-    def told(self) -> Float[np.ndarray, "12"]:
+    def measured(self) -> Float[np.ndarray, "12"]:
         """1 for errors (pose in B, twist) that are measured, 0 for others."""
         found = np.ones(12)
         found[:3] = not self.unmeasured

@@ -92,13 +92,13 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
 
     def which(runs: list[int]) -> str:
         """Their scenarios, with the repetition where there are several."""
-        told = []
+        listed = []
         for number in runs[:_NAMED]:
             first = names.index(names[number])
             several = names.count(names[number]) > 1
-            told.append(names[number] + (f" (run {number - first + 1})" if several else ""))
+            listed.append(names[number] + (f" (run {number - first + 1})" if several else ""))
         more = f" and {len(runs) - _NAMED} more" if len(runs) > _NAMED else ""
-        return f"{', '.join(told)}{more}"
+        return f"{', '.join(listed)}{more}"
 
     found = [
         f"{channel} repeats one value for {_STUCK:g} s or more in {which(runs)}: stuck? Give the "

@@ -9,15 +9,15 @@ from jaxtyping import Float
 from ....models.se3 import AXES
 from ..data.repeats import repeating
 from ..filter.noise import estimate
-from ..filter.problem import Bench, Look
+from ..filter.problem import DiagnosisProblem, Evaluation
 from ..filter.transition import Transition
 from ..selection.model_selection import margin
 from ..validation.validation import white_part
 from .laws import Law, estimated, find_laws, growth_alone, run_constants
-from .levels import LEVEL, beside_slow, find_levels, process_share
+from .levels import LEVEL, find_levels, levels_with_slow_noise, process_share
 from .waves import are_waves, find_current, find_waves
 
-_BLOW = 4.0
+_IMPACT = 4.0
 """Standard deviations beyond which an error counts as an impact."""
 _SHORTEST, _SMALLEST = 3.0, 0.1
 """Least time constant of a colour (steps), and least relative change of a level."""
@@ -30,23 +30,28 @@ OF_OTHERS = 1e-3
 """Share of other findings' gain that a law must win: they leave a residual of that order."""
 
 
-def laws_of(bench: Bench, look: Look) -> list[Law]:
+def laws_of(problem: DiagnosisProblem, evaluation: Evaluation) -> list[Law]:
     """Disturbance laws of the residual, largest gain first.
 
     None where states were estimated: errors of an estimator are no disturbance.
     """
-    if look.noise.estimated:
+    if evaluation.noise.estimated:
         return []
-    data = bench.data
+    data = problem.data
     speed = np.linalg.norm(data.V[:-1, :3], axis=1)
     found = find_laws(
-        look.z.astype(float), speed, data.weight, data.fold, data.dt, process_share(bench, look)
+        evaluation.z.astype(float),
+        speed,
+        data.weight,
+        data.fold,
+        data.dt,
+        process_share(problem, evaluation),
     )
-    rows = bench.library.at("current_steady", "W")
-    evidence = look.plain
+    rows = problem.library.at("current_steady", "W")
+    evidence = evaluation.plain
     if set(rows) <= set(evidence.design.owner.tolist()) and len(evidence.runs) > 2:
         columns = [evidence.column(i) for i in rows]
-        sizes = np.array([bench.library.entries[i].parameter.probes[0] for i in rows])
+        sizes = np.array([problem.library.entries[i].parameter.probes[0] for i in rows])
         gain, values, loss = run_constants(evidence.runs, columns, sizes, evidence.fold)
         found.append(Law("current_varying", "W", values, gain, loss))
     return sorted(found, key=lambda law: -law.heldout_gain)
@@ -57,18 +62,18 @@ def won_by(name: str, laws: Sequence[Law]) -> float:
     return sum((max(law.heldout_gain, 0.0) for law in laws if law.name == name), 0.0)
 
 
-def best_law(bench: Bench, look: Look) -> float:
+def best_law(problem: DiagnosisProblem, evaluation: Evaluation) -> float:
     """Held-out gain of the best disturbance law (nats)."""
-    return max((law.heldout_gain for law in laws_of(bench, look)), default=0.0)
+    return max((law.heldout_gain for law in laws_of(problem, evaluation)), default=0.0)
 
 
-def all_laws(bench: Bench, look: Look, least: float) -> list[Law]:
+def all_laws(problem: DiagnosisProblem, evaluation: Evaluation, least: float) -> list[Law]:
     """Disturbance laws of the residual, waves and level included, largest gain first."""
-    found = laws_of(bench, look)
-    alike = repeating(look.z, bench.data)
+    found = laws_of(problem, evaluation)
+    alike = repeating(evaluation.z, problem.data)
     slow = [law for law in found if law.name == "disturbance_colour"]
     if max((law.heldout_gain for law in slow), default=0.0) > least:
-        waves, current = find_waves(bench, look), find_current(bench, look)
+        waves, current = find_waves(problem, evaluation), find_current(problem, evaluation)
         if are_waves(waves, slow):
             found.append(waves)
         # one motion of the water against disturbances by axis, or against a constant current
@@ -79,16 +84,18 @@ def all_laws(bench: Bench, look: Look, least: float) -> list[Law]:
     # errors that repeat with the commands are not random
     water = {"W"} if len(alike) >= _MOST_AXES else set()
     found = [law for law in found if law.name not in SLOW or law.where not in {*alike, *water}]
-    found += find_levels(bench, look, least)
+    found += find_levels(problem, evaluation, least)
     return sorted(found, key=lambda law: -law.heldout_gain)
 
 
-def passing(laws: Sequence[Law], bench: Bench, least: float) -> list[Law]:
+def passing(laws: Sequence[Law], problem: DiagnosisProblem, least: float) -> list[Law]:
     """Laws that win more than `least` nats and that errors of the noise levels can't imitate."""
-    return [law for law in laws if law.heldout_gain > least and _is_apart(law, bench)]
+    return [law for law in laws if law.heldout_gain > least and _is_apart(law, problem)]
 
 
-def told(laws: Sequence[Law], bench: Bench, look: Look, least: float) -> list[list[Law]]:
+def reported_laws(
+    laws: Sequence[Law], problem: DiagnosisProblem, evaluation: Evaluation, least: float
+) -> list[list[Law]]:
     """Which of the laws that pass are reported, in groups of one name each, largest first.
 
     Of laws with a structure one name is reported. Each of them changes levels: a slow one biases
@@ -98,30 +105,32 @@ def told(laws: Sequence[Law], bench: Bench, look: Look, least: float) -> list[li
     them, and with either only if it is the larger part of the change. A structure must win more
     than the residual that the level leaves.
     """
-    passed = passing(laws, bench, least)
+    passed = passing(laws, problem, least)
     levels = [law for law in passed if law.name == LEVEL]
     shaped = [law for law in passed if law.name != LEVEL]
     if not shaped:
         return [levels] if levels else []
     shaped = [law for law in shaped if law.name == shaped[0].name]
     if shaped[0].name == "disturbance_state_dependence":
-        shaped, levels = _grown(laws, shaped, levels, bench, look)
+        shaped, levels = _grown(laws, shaped, levels, problem, evaluation)
     if levels and shaped[0].name in SLOW:
-        levels = beside_slow(levels, bench, look, least)
+        levels = levels_with_slow_noise(levels, problem, evaluation, least)
     kept = []
     for law in levels:
-        rest = _level_beside(law, shaped, bench, look)
-        if rest is not None and _is_apart(rest, bench):
+        rest = _remaining_level(law, shaped, problem, evaluation)
+        if rest is not None and _is_apart(rest, problem):
             kept.append(rest)
     if not kept:
         return [shaped]
     least = OF_OTHERS * sum(law.heldout_gain for law in kept)
-    beside = [law for law in shaped if law.heldout_gain > least]
-    both = [kept, beside] if beside else [kept]
+    structured = [law for law in shaped if law.heldout_gain > least]
+    both = [kept, structured] if structured else [kept]
     return sorted(both, key=lambda group: -group[0].heldout_gain)
 
 
-def _level_beside(law: Law, shaped: Sequence[Law], bench: Bench, look: Look) -> Law | None:
+def _remaining_level(
+    law: Law, shaped: Sequence[Law], problem: DiagnosisProblem, evaluation: Evaluation
+) -> Law | None:
     """A level with the change that laws of one name leave to it, or None if they explain it."""
     i, name = AXES.index(law.where), shaped[0].name
     if name in SLOW:
@@ -131,16 +140,20 @@ def _level_beside(law: Law, shaped: Sequence[Law], bench: Bench, look: Look) -> 
         return law
     all_of_it = 1 + law.parameters["change"]
     if name == "disturbance_impacts":
-        rest = all_of_it * _without_blows(bench, look)[i] / look.noise.diffusion[i]
+        rest = all_of_it * _without_impacts(problem, evaluation)[i] / evaluation.noise.diffusion[i]
     else:
-        rest = all_of_it * float(white_part(own, bench)[i])
+        rest = all_of_it * float(white_part(own, problem)[i])
     if abs(np.log(rest)) < abs(np.log(all_of_it / rest)):
         return None
     return replace(law, parameters={"change": float(rest - 1)})
 
 
 def _grown(
-    laws: Sequence[Law], shaped: Sequence[Law], levels: Sequence[Law], bench: Bench, look: Look
+    laws: Sequence[Law],
+    shaped: Sequence[Law],
+    levels: Sequence[Law],
+    problem: DiagnosisProblem,
+    evaluation: Evaluation,
 ) -> tuple[list[Law], list[Law]]:
     """Laws of growth with the speed, and the levels that remain.
 
@@ -148,12 +161,12 @@ def _grown(
     part of it, and so are those of other axes that growth explains as well. Growth is reported on
     those others where it wins on data left out.
     """
-    data = bench.data
+    data = problem.data
     speed = np.linalg.norm(data.V[:-1, :3], axis=1)
-    share, won = process_share(bench, look), {}
+    share, won = process_share(problem, evaluation), {}
     for law in levels:
         i, rest = AXES.index(law.where), 1 / (1 + law.parameters["change"])
-        z = look.z[:, 6 + i].astype(float)
+        z = evaluation.z[:, 6 + i].astype(float)
         won[law.where] = growth_alone(z, speed, data.weight, rest, share[i])
     grows = {law.where for law in shaped}
     if sum(won.get(axis, 0.0) for axis in grows) <= 0:
@@ -164,26 +177,31 @@ def _grown(
     return [*shaped, *more], [law for law in levels if law.where not in grows | also]
 
 
-def _without_blows(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
+def _without_impacts(problem: DiagnosisProblem, evaluation: Evaluation) -> Float[np.ndarray, "6"]:
     """Diffusion estimated from steps without an impact in them or in a neighbouring step."""
-    data = bench.data
-    error, jacobian = np.asarray(look.predictions.error), np.asarray(look.predictions.jacobian)
+    data = problem.data
+    error, jacobian = (
+        np.asarray(evaluation.predictions.error),
+        np.asarray(evaluation.predictions.jacobian),
+    )
     exists = data.weight > 0
     spread = 1.4826 * np.median(np.abs(error[:, 6:].swapaxes(1, 2)[exists]), axis=0)
-    hit = np.any(np.abs(error[:, 6:]) > _BLOW * spread[:, None], axis=1)
+    hit = np.any(np.abs(error[:, 6:]) > _IMPACT * spread[:, None], axis=1)
     near = hit.copy()
     near[1:] |= hit[:-1]
     near[:-1] |= hit[1:]
     weight = data.weight * ~near
-    steps = Transition.along(jacobian, weight, look.predictions.late)
-    mass = bench.mass(look.theta)
+    steps = Transition.along(jacobian, weight, evaluation.predictions.late)
+    mass = problem.mass(evaluation.theta)
     return estimate(error, weight, steps, mass, data.dt, estimated=False).diffusion
 
 
-def _is_apart(law: Law, bench: Bench) -> bool:
+def _is_apart(law: Law, problem: DiagnosisProblem) -> bool:
     """Whether errors of the noise levels alone can't imitate a law."""
     if law.name == "disturbance_colour" and law.loss is not None:
-        return float(np.exp(estimated(law, bench.data.cluster)[0][0])) > _SHORTEST * bench.data.dt
+        return (
+            float(np.exp(estimated(law, problem.data.cluster)[0][0])) > _SHORTEST * problem.data.dt
+        )
     if law.name == LEVEL:
         return abs(law.parameters["change"]) > _SMALLEST
     return True

@@ -35,7 +35,7 @@ class Law:
         return float(self.heldout.sum())
 
 
-Told = tuple[np.ndarray, dict[str, float], Callable[[np.ndarray], np.ndarray]]
+LawFit = tuple[np.ndarray, dict[str, float], Callable[[np.ndarray], np.ndarray]]
 """Held-out gain by piece, the best parameters, and the loss as a function of their logarithms."""
 _GROWTHS = np.geomspace(0.05, 1000.0, 48)
 _EVENNESS, _ALIKE = (0.3, 0.1, 0.03), 4.0
@@ -61,7 +61,7 @@ def _held_out(losses: np.ndarray, fold: np.ndarray) -> tuple[np.ndarray, int]:
 
 def impacts(
     z: Float[np.ndarray, "N R"], weight: Float[np.ndarray, "N R"], fold: Int[np.ndarray, " R"]
-) -> Told:
+) -> LawFit:
     """Gain of a mixture of N(0, s²) with share 1 - p and impacts with share p over N(0, σ²).
 
     Impacts have Gaussian sizes, w = `size`, or where that clearly wins more, about one size, ±μ
@@ -110,7 +110,7 @@ def speed_dependence(
     weight: Float[np.ndarray, "N R"],
     fold: Int[np.ndarray, " R"],
     share: float = 1.0,
-) -> Told:
+) -> LawFit:
     """Gain of a process with the variance q (1 + k |v|²) over a constant one.
 
     `share` of the variance of z is process noise, the rest measurement noise.
@@ -151,7 +151,7 @@ def growth_alone(
 def colour(
     z: Float[np.ndarray, "N R"], weight: Float[np.ndarray, "N R"], fold: Int[np.ndarray, " R"],
     dt: float,
-) -> Told:  # fmt: skip
+) -> LawFit:  # fmt: skip
     """Gain of predicting z by a slow part m' = ρ (m + κ (z - m)) (an ARMA(1, 1) process)."""
     plain = (z**2 * weight / 2).sum(axis=0)
 
@@ -182,7 +182,7 @@ def colour(
 
 def run_constants(
     products: Float[np.ndarray, "R m m"], columns: list[int], sizes: np.ndarray, fold: np.ndarray
-) -> Told:
+) -> LawFit:
     """Gain of effects whose size is drawn anew for each run: z ~ N(0, I + σ² J Jᵀ).
 
     By the matrix determinant lemma the likelihood of a run needs J'J and J'z alone. σ is the
@@ -216,12 +216,12 @@ def find_laws(
     found = []
     for i, axis in enumerate(AXES):
         own = z[:, 6 + i]
-        for name, told in (
+        for name, fitted in (
             ("disturbance_impacts", impacts(own, weight, fold)),
             ("disturbance_state_dependence", speed_dependence(own, speed, weight, fold, share[i])),
             ("disturbance_colour", colour(own, weight, fold, dt)),
         ):
-            gain, values, loss = told
+            gain, values, loss = fitted
             found.append(Law(name, axis, values, gain, loss))
     return sorted(found, key=lambda law: -law.heldout_gain)
 

@@ -9,21 +9,21 @@ import scipy.linalg
 from jaxtyping import Float
 
 from ....models.se3 import AXES
-from ..filter.likely_noise import beside_pushes
+from ..filter.likely_noise import fit_with_slow_noise
 from ..filter.noise import Noise, estimate, score_of, unit_processes
-from ..filter.problem import Bench, Look
+from ..filter.problem import DiagnosisProblem, Evaluation
 from ..filter.transition import Transition
 from .laws import Law
 
 LEVEL = "disturbance_level"
 
 
-def believed_levels(bench: Bench) -> Float[np.ndarray, "6"]:
+def believed_levels(problem: DiagnosisProblem) -> Float[np.ndarray, "6"]:
     """Diffusion b of the believed model; zero where it has none."""
-    return np.asarray(bench.model.base.mass_and_diffusion(jnp.zeros(6))[1])
+    return np.asarray(problem.model.base.mass_and_diffusion(jnp.zeros(6))[1])
 
 
-def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
+def find_levels(problem: DiagnosisProblem, evaluation: Evaluation, least: float) -> list[Law]:
     """Levels axis by axis, none where the believed model has none.
 
     The gain is that of the level estimated on the other folds over the believed one, all other
@@ -31,12 +31,15 @@ def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
     believed one held, for measurement noise may compensate for it. The error of a level is
     that of its likelihood or, if larger, that by the jackknife over folds.
     """
-    believed = believed_levels(bench)
+    believed = believed_levels(problem)
     if not np.any(believed > 0):
         return []
-    data = bench.data
-    error, jacobian = np.asarray(look.predictions.error), np.asarray(look.predictions.jacobian)
-    mass, labels = bench.mass(look.theta), np.unique(data.fold)
+    data = problem.data
+    error, jacobian = (
+        np.asarray(evaluation.predictions.error),
+        np.asarray(evaluation.predictions.jacobian),
+    )
+    mass, labels = problem.mass(evaluation.theta), np.unique(data.fold)
     inverse = np.linalg.inv(mass)
     gain = np.zeros((6, len(data.fold)))
     levels = np.zeros((len(labels), 6))
@@ -49,7 +52,7 @@ def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
     for k, label in enumerate(labels):
         own = data.fold == label
         rest = data.weight * (~own if not own.all() else 1)
-        steps = Transition.along(jacobian, rest, look.predictions.late)
+        steps = Transition.along(jacobian, rest, evaluation.predictions.late)
         noise = estimate(error, rest, steps, mass, data.dt, estimated=False)
         levels[k] = noise.diffusion
         best = score(own, noise, steps)
@@ -65,30 +68,32 @@ def find_levels(bench: Bench, look: Look, least: float) -> list[Law]:
                 other = estimate(error, rest, steps, mass, data.dt, held, estimated=False)
                 gain[i, own] = best - score(own, other, steps)
         spread = np.sqrt((n - 1) / n * np.sum((levels[:, i] - levels[:, i].mean()) ** 2))
-        change = float(look.noise.diffusion[i] / believed[i] - 1)
-        error_of = {"change": float(max(spread, look.noise.error[i]) / believed[i])}
+        change = float(evaluation.noise.diffusion[i] / believed[i] - 1)
+        error_of = {"change": float(max(spread, evaluation.noise.error[i]) / believed[i])}
         law = Law(LEVEL, AXES[i], {"change": change}, gain[i], errors=error_of)
         found.append(law)
     return found
 
 
-def beside_slow(levels: Sequence[Law], bench: Bench, look: Look, least: float) -> list[Law]:
+def levels_with_slow_noise(
+    levels: Sequence[Law], problem: DiagnosisProblem, evaluation: Evaluation, least: float
+) -> list[Law]:
     """Levels that hold in a fit with slow disturbances, with the level estimated there.
 
     Holding the believed one loses more than `least` nats, and the change keeps its sign.
     """
-    data, believed = bench.data, believed_levels(bench)
-    p = look.predictions
+    data, believed = problem.data, believed_levels(problem)
+    p = evaluation.predictions
     steps = Transition.along(np.asarray(p.jacobian), data.weight, p.late)
-    inverse = np.linalg.inv(bench.mass(look.theta))
-    left, lost = beside_pushes(
+    inverse = np.linalg.inv(problem.mass(evaluation.theta))
+    left, lost = fit_with_slow_noise(
         np.asarray(p.error),
         data.weight,
         steps,
         unit_processes(steps, inverse, data.dt),
         _pushed(steps, inverse, data.dt),
         data.dt,
-        np.concatenate([look.noise.record, look.noise.diffusion]) ** 2,
+        np.concatenate([evaluation.noise.record, evaluation.noise.diffusion]) ** 2,
         believed,
         [AXES.index(law.where) for law in levels],
     )
@@ -102,17 +107,17 @@ def beside_slow(levels: Sequence[Law], bench: Bench, look: Look, least: float) -
     return found
 
 
-def process_share(bench: Bench, look: Look) -> Float[np.ndarray, "6"]:
+def process_share(problem: DiagnosisProblem, evaluation: Evaluation) -> Float[np.ndarray, "6"]:
     """Share of the variance of each twist's innovation due to process noise on its axis."""
-    p = look.predictions
-    steps = Transition.along(np.asarray(p.jacobian), bench.data.weight, p.late)
-    inverse = np.linalg.inv(bench.mass(look.theta))
-    own = unit_processes(steps, inverse, bench.data.dt)
-    own *= look.noise.diffusion[:, None, None] ** 2
+    p = evaluation.predictions
+    steps = Transition.along(np.asarray(p.jacobian), problem.data.weight, p.late)
+    inverse = np.linalg.inv(problem.mass(evaluation.theta))
+    own = unit_processes(steps, inverse, problem.data.dt)
+    own *= evaluation.noise.diffusion[:, None, None] ** 2
     # whitened squares are divided by `memory`: undo that
-    whiten = look.kalman.whiten.mean(axis=-1) * np.sqrt(look.kalman.memory)[:, None]
+    whiten = evaluation.kalman.whiten.mean(axis=-1) * np.sqrt(evaluation.kalman.memory)[:, None]
     P = np.zeros_like(own)
-    for keep in look.kalman.keep.mean(axis=-1):
+    for keep in evaluation.kalman.keep.mean(axis=-1):
         A = steps.mean @ keep
         P = A @ P @ A.T + own
     axis = np.arange(6)

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from ....models.se3 import AXES
 from ..candidates.structures import Screen
 from ..filter.gram import gram
-from ..filter.problem import Bench, Look
-from ..selection.correlated_noise import Beside
-from .laws import Law, Told, estimated, run_constants
+from ..filter.problem import DiagnosisProblem, Evaluation
+from ..selection.correlated_noise import CorrelatedNoise
+from .laws import Law, LawFit, estimated, run_constants
 
 _OMEGAS = np.arange(0.6, 5.3, 0.2)
 """Frequencies that are tried (rad/s); runs of ten seconds resolve 0.6 rad/s."""
@@ -39,30 +39,32 @@ _LONG = 10.0
 """Lengths of a piece: a longer time constant is only known to exceed a piece."""
 
 
-def beside_laws(bench: Bench, look: Look, laws: Sequence[Law]) -> Beside:
+def correlated_noise_of(
+    problem: DiagnosisProblem, evaluation: Evaluation, laws: Sequence[Law]
+) -> CorrelatedNoise:
     """The correlated noise that wins most: slow disturbances by axis, a current, or swell."""
     slow = [law for law in laws if law.name == "disturbance_colour" and law.heldout_gain > _LEAST]
     pushes = sum(law.heldout_gain for law in slow)
     stays = max((law.heldout_gain for law in laws if law.name == "current_varying"), default=0.0)
-    wanders = find_current(bench, look)
+    wanders = find_current(problem, evaluation)
     if max(stays, wanders.heldout_gain) > pushes:
-        whole = Screen(bench, look, None, whole=True)
-        v = _flow(bench, whole.kept)
-        length = float(np.median(bench.data.times[-1, whole.kept]))
+        whole = Screen(problem, evaluation, None, whole=True)
+        v = _flow(problem, whole.kept)
+        length = float(np.median(problem.data.times[-1, whole.kept]))
         return _drawn(
             whole, v, np.zeros_like(v), _bends(wanders.parameters["time_constant"] / length)
         )
     if slow:
-        swell, waves = _found(bench, look)
+        swell, waves = _found(problem, evaluation)
         if are_waves(waves, slow):
-            whole = Screen(bench, look, None, whole=True)
-            return _drawn(whole, *swell.water(bench, whole.kept), swell.spread)
+            whole = Screen(problem, evaluation, None, whole=True)
+            return _drawn(whole, *swell.water(problem, whole.kept), swell.spread)
     numbers = {}
     for law in slow:
-        tau, kappa = np.exp(estimated(law, bench.data.cluster)[0])
-        rho = np.exp(-bench.data.dt / tau)
+        tau, kappa = np.exp(estimated(law, problem.data.cluster)[0])
+        rho = np.exp(-problem.data.dt / tau)
         numbers[AXES.index(law.where)] = float(rho), float(min(kappa, 0.99))
-    return Beside.slowly(look.z.astype(float), numbers)
+    return CorrelatedNoise.from_slow(evaluation.z.astype(float), numbers)
 
 
 def are_waves(waves: Law, slow: Sequence[Law]) -> bool:
@@ -77,31 +79,31 @@ def are_waves(waves: Law, slow: Sequence[Law]) -> bool:
     return waves.heldout_gain > max(_TIMES * forces, all_axes)
 
 
-def _drawn(screen: Screen, v: np.ndarray, a: np.ndarray, spread: np.ndarray) -> Beside:
+def _drawn(screen: Screen, v: np.ndarray, a: np.ndarray, spread: np.ndarray) -> CorrelatedNoise:
     """Water motion drawn anew for each piece; `spread` has its terms' relative deviations."""
-    J = _responses(screen, v, a)
+    J = _sensitivities(screen, v, a)
     G = _products(screen.z[0], J)
     std = run_constants(G, list(range(1, len(J) + 1)), spread, screen.fold)[1]["std"] / spread[0]
-    return Beside(drawn=J, precision=1 / (max(std, 1e-9) * spread) ** 2)
+    return CorrelatedNoise(amplitudes=J, precision=1 / (max(std, 1e-9) * spread) ** 2)
 
 
-def _responses(screen: Screen, v: np.ndarray, a: np.ndarray) -> Float[np.ndarray, "k N12 R"]:
+def _sensitivities(screen: Screen, v: np.ndarray, a: np.ndarray) -> Float[np.ndarray, "k N12 R"]:
     """Whitened sensitivities to velocities and accelerations of the water in W (N, 3, k, R)."""
     by_v, by_a = screen.water
-    return screen.passed(
+    return screen.whitened(
         np.einsum("nijr,njkr->nikr", by_v, v) + np.einsum("nijr,njkr->nikr", by_a, a)
     )
 
 
-def _about(
+def _linearised(
     screen: Screen, v: np.ndarray, a: np.ndarray, likely: Float[np.ndarray, "R k"]
 ) -> tuple[Float[np.ndarray, "N12 R"], Float[np.ndarray, "k N12 R"]]:
     """Innovations in still water and sensitivities, linearised at a likely motion of the water."""
     push, slope = screen.in_current(np.einsum("nikr,rk->nir", v, likely))
     by_a = np.einsum("nijr,njkr->nikr", screen.water[1], a)
-    J = screen.passed(np.einsum("nijr,njkr->nikr", slope, v) + by_a)
+    J = screen.whitened(np.einsum("nijr,njkr->nikr", slope, v) + by_a)
     push = push + np.einsum("nikr,rk->nir", by_a, likely)
-    there = screen.z[0] + screen.passed(push[:, :, None])[0]
+    there = screen.z[0] + screen.whitened(push[:, :, None])[0]
     return there - np.einsum("kar,rk->ar", J, likely), J
 
 
@@ -109,25 +111,25 @@ def _refined(
     screen: Screen,
     v: np.ndarray,
     a: np.ndarray,
-    fit: Callable[[np.ndarray], tuple[Told, Float[np.ndarray, " k"]]],
-) -> tuple[Float[np.ndarray, "R m m"], Told]:
+    fit: Callable[[np.ndarray], tuple[LawFit, Float[np.ndarray, " k"]]],
+) -> tuple[Float[np.ndarray, "R m m"], LawFit]:
     """Products and fit, relinearised at the most likely motion of each piece (Laplace's method).
 
     `fit` maps products to its result and to the standard deviations that it finds.
     """
     still = _squares(screen.z[0])
 
-    def about(likely: np.ndarray) -> tuple[np.ndarray, Told, np.ndarray]:
-        z, J = _about(screen, v, a, likely)
+    def linearised(likely: np.ndarray) -> tuple[np.ndarray, LawFit, np.ndarray]:
+        z, J = _linearised(screen, v, a, likely)
         G = _products(z, J)
         (gain, values, loss), spread = fit(G)
-        told = gain + (still - _squares(z)) / 2, values, loss
-        return G, told, _most_likely(G, spread)
+        fitted = gain + (still - _squares(z)) / 2, values, loss
+        return G, fitted, _most_likely(G, spread)
 
-    G, told, likely = about(np.zeros((v.shape[3], v.shape[2])))
+    G, fitted, likely = linearised(np.zeros((v.shape[3], v.shape[2])))
     for _ in range(_ROUNDS - 1):
-        G, told, likely = about(likely)
-    return G, told
+        G, fitted, likely = linearised(likely)
+    return G, fitted
 
 
 def _squares(z: np.ndarray) -> Float[np.ndarray, " R"]:
@@ -144,14 +146,14 @@ def _products(z: np.ndarray, J: np.ndarray) -> Float[np.ndarray, "R m m"]:
     return gram(np.concatenate([z[None], J]).astype(np.float64))
 
 
-def _times(bench: Bench, kept: np.ndarray) -> Float[np.ndarray, "N R"]:
+def _times(problem: DiagnosisProblem, kept: np.ndarray) -> Float[np.ndarray, "N R"]:
     """Mid-step times since the start of each piece (s)."""
-    return (bench.data.times[:-1] + bench.data.step / 2)[:, kept]
+    return (problem.data.times[:-1] + problem.data.step / 2)[:, kept]
 
 
-def _flow(bench: Bench, kept: np.ndarray) -> Float[np.ndarray, "N 3 k R"]:
+def _flow(problem: DiagnosisProblem, kept: np.ndarray) -> Float[np.ndarray, "N 3 k R"]:
     """East and north flow of 1 m/s: a constant and `_BENDS` cosines of time each."""
-    t = _times(bench, kept) / np.maximum(bench.data.times[-1, kept], 1e-9)
+    t = _times(problem, kept) / np.maximum(problem.data.times[-1, kept], 1e-9)
     found = np.zeros((len(t), 3, 2 * (_BENDS + 1), len(kept)))
     for k in range(_BENDS + 1):
         for way in range(2):
@@ -159,7 +161,7 @@ def _flow(bench: Bench, kept: np.ndarray) -> Float[np.ndarray, "N 3 k R"]:
     return found
 
 
-def find_current(bench: Bench, look: Look) -> Law:
+def find_current(problem: DiagnosisProblem, evaluation: Evaluation) -> Law:
     """A horizontal current that varies within runs: Gauss–Markov in W, drawn anew for each piece.
 
     Its Karhunen–Loève series is truncated after `_BENDS` cosines. Drag is nonlinear in the current,
@@ -167,14 +169,14 @@ def find_current(bench: Bench, look: Look) -> Law:
     method). The time constant with the largest gain is taken; one of ten pieces and more is only
     known to be longer than a piece.
     """
-    screen = Screen(bench, look, None)
-    v = _flow(bench, screen.kept)
-    length = float(np.median(bench.data.times[-1, screen.kept]))
+    screen = Screen(problem, evaluation, None)
+    v = _flow(problem, screen.kept)
+    length = float(np.median(problem.data.times[-1, screen.kept]))
     columns = list(range(1, v.shape[2] + 1))
 
-    def fit(G: np.ndarray) -> tuple[Told, np.ndarray]:
+    def fit(G: np.ndarray) -> tuple[LawFit, np.ndarray]:
         tried = [run_constants(G, columns, _bends(tau), screen.fold) for tau in _WANDER]
-        best = int(np.argmax([told[0].sum() for told in tried]))
+        best = int(np.argmax([fitted[0].sum() for fitted in tried]))
         gain, values, loss = tried[best]
         bends = _bends(_WANDER[best])
         std = values["std"] / bends[0]
@@ -188,7 +190,7 @@ def find_current(bench: Bench, look: Look) -> Law:
         spread = _bends(float(np.exp(logs[1])) / length)
         return run_constants(G, columns, spread, screen.fold)[2](logs[:1] + np.log(spread[0]))
 
-    share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
+    share = problem.data.steps / problem.data.weight[:, screen.kept].sum()
     law = Law("current_varying", "W", numbers, heldout * share, loss=lost)
     logs, covariance = estimated(law, np.arange(len(screen.kept)))
     numbers = dict(zip(numbers, np.exp(logs).tolist(), strict=True))
@@ -236,10 +238,10 @@ class Swell:
         return _FIRST * np.repeat(share, 4 if self.flat else 2)
 
     def water(
-        self, bench: Bench, kept: np.ndarray
+        self, problem: DiagnosisProblem, kept: np.ndarray
     ) -> tuple[Float[np.ndarray, "N 3 k R"], Float[np.ndarray, "N 3 k R"]]:
         """Velocities for amplitudes of 1 m/s at the surface, and accelerations, in W."""
-        X, t = bench.data.X[:-1][..., kept], _times(bench, kept)
+        X, t = problem.data.X[:-1][..., kept], _times(problem, kept)
         way = np.array([np.cos(self.direction), np.sin(self.direction), 0.0])
         ahead = way[0] * X[:, 4] + way[1] * X[:, 5]
         along, up = way[:, None], np.array([[0.0], [0.0], [1.0]])
@@ -268,22 +270,22 @@ def _sea() -> Float[np.ndarray, " k"]:
     return x**-3.0 * np.exp(-1.25 * x**-4.0) * peak * np.gradient(x)
 
 
-def find_waves(bench: Bench, look: Look) -> Law:
+def find_waves(problem: DiagnosisProblem, evaluation: Evaluation) -> Law:
     """Waves from one direction, of one frequency or a sea, amplitudes drawn anew for each piece."""
-    return _found(bench, look)[1]
+    return _found(problem, evaluation)[1]
 
 
-def _found(bench: Bench, look: Look) -> tuple[Swell, Law]:
+def _found(problem: DiagnosisProblem, evaluation: Evaluation) -> tuple[Swell, Law]:
     """The waves with the largest gain, z ~ N(0, I + σ² J Jᵀ).
 
     Frequency and direction from a grid, then from finer ones; then a sea of about that frequency.
     """
-    screen = Screen(bench, look, None)
+    screen = Screen(problem, evaluation, None)
 
-    def tried(swells: list[Swell]) -> list[Told]:
+    def tried(swells: list[Swell]) -> list[LawFit]:
         """The result of each; all have the same number of frequencies."""
-        water = [swell.water(bench, screen.kept) for swell in swells]
-        J = _responses(screen, *(np.concatenate(w, axis=2) for w in zip(*water, strict=True)))
+        water = [swell.water(problem, screen.kept) for swell in swells]
+        J = _sensitivities(screen, *(np.concatenate(w, axis=2) for w in zip(*water, strict=True)))
         found, spread = [], swells[0].spread
         for own in np.split(J, len(swells)):
             G = _products(screen.z[0], own)
@@ -292,7 +294,7 @@ def _found(bench: Bench, look: Look) -> tuple[Swell, Law]:
         return found
 
     def gains(swells: list[Swell]) -> np.ndarray:
-        return np.array([told[0].sum() for told in tried(swells)])
+        return np.array([fitted[0].sum() for fitted in tried(swells)])
 
     ways = np.arange(_WAYS) * 2 * np.pi / _WAYS
     few = [Swell(omega, way) for omega in _OMEGAS for way in ways[:: _WAYS // 4]]
@@ -307,17 +309,17 @@ def _found(bench: Bench, look: Look) -> tuple[Swell, Law]:
     best = Swell(omega, direction)
     heldout, values, loss = tried([best])[0]
     for alike in _others(omega, direction):
-        for other, told in zip(alike, tried(alike), strict=True):
-            if told[0].sum() > heldout.sum():
-                best, (heldout, values, loss) = other, told
+        for other, fitted in zip(alike, tried(alike), strict=True):
+            if fitted[0].sum() > heldout.sum():
+                best, (heldout, values, loss) = other, fitted
     if best.sea:
         error = 0.05 * best.frequency
-    v, a = best.water(bench, screen.kept)
+    v, a = best.water(problem, screen.kept)
     columns = list(range(1, v.shape[2] + 1))
 
-    def fit(G: np.ndarray) -> tuple[Told, np.ndarray]:
-        told = run_constants(G, columns, best.spread, screen.fold)
-        return told, told[1]["std"] / best.spread[0] * best.spread
+    def fit(G: np.ndarray) -> tuple[LawFit, np.ndarray]:
+        fitted = run_constants(G, columns, best.spread, screen.fold)
+        return fitted, fitted[1]["std"] / best.spread[0] * best.spread
 
     heldout, values, loss = _refined(screen, v, a, fit)[1]
     speed, spread = _size(values["std"], loss, best.spread[0] / _FIRST)
@@ -325,7 +327,7 @@ def _found(bench: Bench, look: Look) -> tuple[Swell, Law]:
     turned = float(np.angle(np.exp(1j * best.direction)))
     numbers = {"amplitude": size * speed, "frequency": best.frequency, "direction": turned}
     errors = {"amplitude": size * spread, "frequency": error, "direction": unsure}
-    share = bench.data.steps / bench.data.weight[:, screen.kept].sum()
+    share = problem.data.steps / problem.data.weight[:, screen.kept].sum()
     return best, Law("waves", "W", numbers, heldout * share, errors=errors)
 
 

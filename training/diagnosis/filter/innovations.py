@@ -170,5 +170,7 @@ def predict(model: Extended, library: Library, theta: np.ndarray, data: Data) ->
     found = _predict(model, effects, as_arrays(data), substeps(data.longest))
     found = found._replace(late=_late(library, theta))
     return (
-        found._replace(error=found.error * data.told[None, :, None]) if data.unmeasured else found
+        found._replace(error=found.error * data.measured[None, :, None])
+        if data.unmeasured
+        else found
     )

@@ -119,10 +119,10 @@ def most_likely(
     blocks = _blocks(error, weight, _BLOCK)
     if len(blocks) < _LEAST:
         return start, start[12:]
-    heard = _heard(blocks, units, start)
-    model = _likelihood(blocks, transition, units, heard)
+    used = _used_axes(blocks, units, start)
+    model = _likelihood(blocks, transition, units, used)
     held = np.zeros(6, bool) if held is None else held
-    moved = np.concatenate([heard, ~held])
+    moved = np.concatenate([used, ~held])
     x = model.likeliest(np.log(start), np.log(least), moved)
     found = np.exp(x)
     loss, inverse = model.loss(x)
@@ -138,7 +138,7 @@ def most_likely(
     return np.concatenate([found[:12], wrench]), errors
 
 
-def beside_pushes(
+def fit_with_slow_noise(
     error: Float[np.ndarray, "N 12 R"],
     weight: Float[np.ndarray, "N R"],
     transition: Transition,
@@ -162,11 +162,11 @@ def beside_pushes(
     blocks, lost = _blocks(error, weight, _LONGER), np.zeros(6)
     if len(blocks) < _LEAST:
         return np.sqrt(start[12:]), lost
-    heard = _heard(blocks, units, start)
-    model = _likelihood(blocks, transition, units, heard, (push, dt))
+    used = _used_axes(blocks, units, start)
+    model = _likelihood(blocks, transition, units, used, (push, dt))
     often = np.repeat(start[12:], len(_TIMES)) / dt / 10
     x = np.log(np.concatenate([start, often]))
-    low, moved = x - _DEEP, np.concatenate([heard, np.ones(len(x) - 12, bool)])
+    low, moved = x - _DEEP, np.concatenate([used, np.ones(len(x) - 12, bool)])
     x = model.likeliest(x, low, moved)
     best = model.loss(x)[0]
     for i in axes:
@@ -186,29 +186,29 @@ def _blocks(error: np.ndarray, weight: np.ndarray, length: int) -> Float[np.ndar
     return np.concatenate(found).astype(float) if found else np.zeros((0, length, 12))
 
 
-def _heard(
+def _used_axes(
     blocks: Float[np.ndarray, "K n 12"],
     units: Float[np.ndarray, "6 12 12"],
     start: Float[np.ndarray, "18"],
 ) -> Bool[np.ndarray, "12"]:
     """Axes that are used: twists, and poses with clearly more measurement than process noise."""
     made = np.diagonal(units, axis1=1, axis2=2)[:, :6].T @ start[12:]
-    heard = np.concatenate([start[:6] > _CLEAR * made, np.ones(6, bool)])
-    return heard & np.any(blocks != blocks[:, :1], axis=(0, 1))
+    used = np.concatenate([start[:6] > _CLEAR * made, np.ones(6, bool)])
+    return used & np.any(blocks != blocks[:, :1], axis=(0, 1))
 
 
 def _likelihood(
     blocks: Float[np.ndarray, "K n 12"],
     transition: Transition,
     units: Float[np.ndarray, "6 12 12"],
-    heard: Bool[np.ndarray, "12"],
+    used: Bool[np.ndarray, "12"],
     pushes: tuple[np.ndarray, float] | None = None,
 ) -> Likelihood:
     """Likelihood of the `heard` axes: records, white processes, optionally slow disturbances."""
     n = blocks.shape[1]
     basis = scipy.linalg.null_space(np.ones((1, n)))
-    y = np.einsum("kna,nm->kma", blocks[:, :, heard], basis).reshape(len(blocks), -1)
-    rows = np.ix_(heard, heard)
+    y = np.einsum("kna,nm->kma", blocks[:, :, used], basis).reshape(len(blocks), -1)
+    rows = np.ix_(used, used)
     same, next_ = basis.T @ basis, basis.T @ np.eye(n, k=-1) @ basis
     G = []
     for i in range(12):

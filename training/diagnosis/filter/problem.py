@@ -19,13 +19,13 @@ from ....models.rigid_body import FossenDynamics
 from ....models.se3 import AXES, XYZ
 from ....models.vehicles.vehicle import Vehicle
 from ..data.arrays import Data, make_data
-from ..selection.correlated_noise import Beside
+from ..selection.correlated_noise import CorrelatedNoise
 from ..selection.hypotheses import Design, Evidence, Fit
 from ..selection.model_selection import parameters_of
 from .gram import gram
 from .innovations import Predictions, predict
 from .noise import Filter, Noise, estimate, judging_filter
-from .sensitivities import respond
+from .sensitivities import whitened_sensitivities
 from .transition import Transition
 
 _RANDOM = ("waves", "current_varying")
@@ -45,7 +45,7 @@ _LIGHTEST = 0.1
 """Least share of the believed mass matrix, along any direction, that a step may leave."""
 
 
-class Look(NamedTuple):
+class Evaluation(NamedTuple):
     """Evaluation of one θ; `z` are the whitened innovations, not divided by `Filter.memory`.
 
     `evidence` accounts for the problem's correlated noise, `plain` does not.
@@ -74,7 +74,7 @@ class Look(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Bench:
+class DiagnosisProblem:
     """One recording and one believed model: the problem that a diagnosis solves.
 
     Attributes:
@@ -84,7 +84,7 @@ class Bench:
         library: every effect that may explain a difference.
         believed: θ of the believed model: zero except for effects that it already has (p,).
         bounds: ranges of parameters that are narrower than those of their effects.
-        beside: correlated noise that fits and tests of causes account for.
+        correlated_noise: correlated noise that fits and tests of causes account for.
     """
 
     data: Data
@@ -93,7 +93,7 @@ class Bench:
     library: Library
     believed: Float[np.ndarray, " p"]
     bounds: Mapping[tuple[str, str, str], tuple[float, float]] = field(default_factory=dict)
-    beside: Beside | None = None
+    correlated_noise: CorrelatedNoise | None = None
 
     @classmethod
     def of(
@@ -102,7 +102,7 @@ class Bench:
         vehicle: Vehicle,
         base: Dynamics | None = None,
         without: Sequence[int] = (),
-    ) -> "Bench":
+    ) -> "DiagnosisProblem":
         """The problem of `base` (default: the vehicle's preset), `without` the faulty runs.
 
         Raises:
@@ -116,7 +116,7 @@ class Bench:
         library, theta = _library(data, effects)
         return cls(data, vehicle, Extended.create(core, (), vehicle.thrusters()), library, theta)
 
-    def with_effect(self, effect: Effect) -> "Bench":
+    def with_effect(self, effect: Effect) -> "DiagnosisProblem":
         """The problem with one more effect, zero in θ, appended to the library."""
         library = Library([*self.library.effects, effect])
         old = [library.index(*_key(e)) for e in self.library.entries]
@@ -124,7 +124,7 @@ class Bench:
         theta[old] = self.believed
         return replace(self, library=library, believed=theta)
 
-    def within(self, bounds: Mapping[int, tuple[float, float]]) -> "Bench":
+    def within(self, bounds: Mapping[int, tuple[float, float]]) -> "DiagnosisProblem":
         """The problem with narrower bounds of some parameters, by index in θ."""
         named = {_key(self.library.entries[i]): both for i, both in bounds.items()}
         return replace(self, bounds={**self.bounds, **named})
@@ -191,38 +191,44 @@ class Bench:
         p = predict(self.model, self.library, theta, self.data)
         return np.asarray(p.error) * self.data.weight[:, None]
 
-    def look(
+    def evaluate(
         self,
         theta: Float[np.ndarray, " p"],
         chosen: Sequence[int] | None = None,
         kalman: Filter | None = None,
-        again: Look | None = None,
-    ) -> Look:
+        previous: Evaluation | None = None,
+    ) -> Evaluation:
         """Evaluate θ: innovations, and sensitivities to the parameters chosen.
 
         By default these are all causes (in single thrusters only if they can't be in all of them),
         parameters in use, and those with bounds of their own (`within`). An evaluation at the same
-        θ may be passed as `again`: its predictions, noise and filter are reused.
+        θ may be passed as `previous`: its predictions, noise and filter are reused.
         """
-        if again is None:
+        if previous is None:
             p, noise, kalman = self.predict(theta, kalman)
         else:
-            p, noise, kalman = again.predictions, again.noise, again.kalman
+            p, noise, kalman = previous.predictions, previous.noise, previous.kalman
         if chosen is None:
             first = parameters_of(self.library, self.library.hypotheses(single=False))
             ranged = (i for i, e in enumerate(self.library.entries) if _key(e) in self.bounds)
             chosen = sorted({*first, *np.flatnonzero(theta).tolist(), *ranged})
         design = Design.of(self.library, theta, chosen)
-        z = respond(self.model, self.library, theta, design.probes, self.data, p, kalman)
+        z = whitened_sensitivities(
+            self.model, self.library, theta, design.probes, self.data, p, kalman
+        )
         data = self.data
 
         def evidence(products: np.ndarray) -> Evidence:
             return Evidence(self.library, theta, design, products, data.cluster, data.fold)
 
         plain = evidence(gram(z))
-        judged = plain if self.beside is None else evidence(self.beside.products(z))
+        judged = (
+            plain if self.correlated_noise is None else evidence(self.correlated_noise.products(z))
+        )
         own_z = z[0].reshape(len(data.u), 12, -1) * np.sqrt(kalman.memory)[:, None]
-        return Look(theta, p, noise, kalman, judged, plain, own_z, float(judged.total[0, 0]) / 2)
+        return Evaluation(
+            theta, p, noise, kalman, judged, plain, own_z, float(judged.total[0, 0]) / 2
+        )
 
     def polish(
         self,
@@ -230,8 +236,8 @@ class Bench:
         chosen: Sequence[int],
         kalman: Filter | None = None,
         rounds: int = 4,
-        origin: Look | None = None,
-    ) -> tuple[np.ndarray, Look, Fit]:
+        origin: Evaluation | None = None,
+    ) -> tuple[np.ndarray, Evaluation, Fit]:
         """Gauss–Newton on the parameters chosen, with exact predictions at every step.
 
         A step that makes one-step errors clearly less likely is halved; so is the first one, from
@@ -242,12 +248,12 @@ class Bench:
         low, high = self.limits(chosen)
         theta = theta.copy()
         theta[chosen] = np.clip(theta[chosen], low, high)
-        best: tuple[np.ndarray, Look, Fit] | None = None
+        best: tuple[np.ndarray, Evaluation, Fit] | None = None
         back = self.believed if origin is None else origin.theta
         bar = np.inf if origin is None else self.loss_of(origin)
         done = failed = 0
         while done < rounds and failed < _HALVINGS:
-            seen = self._seen(theta, chosen, kalman)
+            seen = self._try_evaluate(theta, chosen, kalman)
             if seen is None or not self.loss_of(seen) <= bar + _WORSE:
                 # the step is too long: go back halfway to the last good θ
                 theta = (theta + (back if best is None else best[0])) / 2
@@ -261,18 +267,20 @@ class Bench:
             if np.all(np.abs(step) < 0.15 * fit.errors + 1e-12):
                 break
         if best is None:
-            seen = self.look(back, chosen, kalman)
+            seen = self.evaluate(back, chosen, kalman)
             best = back.copy(), seen, seen.evidence.fit(chosen)
         return best
 
-    def _seen(self, theta: np.ndarray, chosen: list[int], kalman: Filter | None) -> Look | None:
+    def _try_evaluate(
+        self, theta: np.ndarray, chosen: list[int], kalman: Filter | None
+    ) -> Evaluation | None:
         """An evaluation, or None where predictions diverge."""
         try:
-            return self.look(theta, chosen, kalman)
+            return self.evaluate(theta, chosen, kalman)
         except (FloatingPointError, np.linalg.LinAlgError):
             return None
 
-    def loss_of(self, seen: Look) -> float:
+    def loss_of(self, seen: Evaluation) -> float:
         """Negative log likelihood of one-step errors under their own sample covariance.
 
         It needs no filter, whose noise levels would change with the fit.
@@ -289,7 +297,7 @@ class Bench:
         C = np.einsum("nir,njr->ij", error, error) / self.data.weight.sum()
         if apart:
             C[:6, 6:], C[6:, :6] = 0.0, 0.0
-        return C + np.diag(self.data.told == 0)
+        return C + np.diag(self.data.measured == 0)
 
     def merit(self, C: Float[np.ndarray, "12 12"]) -> float:
         """Negative log likelihood of errors with the sample covariance C."""
@@ -311,27 +319,29 @@ class Bench:
                 return moved[chosen] if least > 0 else theta[chosen]
             share /= 2
 
-    def without_each(self, look: Look, chosen: Sequence[int]) -> Float[np.ndarray, "p R"]:
+    def without_each(
+        self, evaluation: Evaluation, chosen: Sequence[int]
+    ) -> Float[np.ndarray, "p R"]:
         """θ of each piece, with the parameters chosen refitted without the piece's fold.
 
         One Gauss–Newton step from the fit to all data, which is exact to first order in a fold's
         weight; values stay within bounds, and steps whose predictions diverge are halved.
         """
         data, chosen = self.data, list(chosen)
-        theta = np.repeat(look.theta[:, None], len(data.fold), axis=1)
-        evidence = look.evidence
+        theta = np.repeat(evaluation.theta[:, None], len(data.fold), axis=1)
+        evidence = evaluation.evidence
         if not chosen or len(evidence.folds) < 2:
             return theta
-        low, high = (bound - look.theta[chosen] for bound in self.limits(chosen))
+        low, high = (bound - evaluation.theta[chosen] for bound in self.limits(chosen))
         low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
         for number, label in enumerate(np.unique(data.fold)):
-            values = look.theta[chosen] + evidence.step(chosen, low, high, without=number)
+            values = evaluation.theta[chosen] + evidence.step(chosen, low, high, without=number)
             theta[np.ix_(chosen, data.fold == label)] = values[:, None]
         for share in (*(0.5 for _ in range(_HALVINGS)), 1.0):
             wild = np.isin(data.fold, data.fold[self._wild(theta)])
             if not wild.any():
                 break
-            theta[:, wild] += share * (look.theta[:, None] - theta[:, wild])
+            theta[:, wild] += share * (evaluation.theta[:, None] - theta[:, wild])
         return theta
 
     def _wild(self, theta: Float[np.ndarray, "p R"]) -> Bool[np.ndarray, " R"]:

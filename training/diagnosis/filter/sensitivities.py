@@ -29,11 +29,11 @@ AHEAD = 4
 @cache
 def _threads() -> ThreadPoolExecutor:
     """Threads for compiled calls: one call uses one core."""
-    return ThreadPoolExecutor(AHEAD, thread_name_prefix="responses")
+    return ThreadPoolExecutor(AHEAD, thread_name_prefix="sensitivities")
 
 
 @eqx.filter_jit
-def _respond(
+def _whitened(
     model: Extended,
     effects: Any,
     predictions: Predictions,
@@ -102,7 +102,7 @@ def through(M: Float[Array, "12 12 #R"], x: Float[Array, "12 L R"]) -> Float[Arr
     return jnp.einsum("ijr,jlr->ilr", M, x)
 
 
-def respond(
+def whitened_sensitivities(
     model: Extended,
     library: Library,
     theta: Float[np.ndarray, " p"],
@@ -127,7 +127,7 @@ def respond(
     running: deque[tuple[np.ndarray, Future[np.ndarray]]] = deque()
 
     def run(*arguments: Any) -> np.ndarray:
-        return np.asarray(_respond(*arguments))
+        return np.asarray(_whitened(*arguments))
 
     def collect() -> None:
         some, z = running.popleft()

@@ -22,12 +22,12 @@ from ..disturbance.laws import Law
 from ..filter.gram import gram
 from ..filter.innovations import predict
 from ..filter.noise import judging_filter
-from ..filter.problem import WILD, Bench, Look
-from ..filter.sensitivities import respond
+from ..filter.problem import WILD, DiagnosisProblem, Evaluation
+from ..filter.sensitivities import whitened_sensitivities
 from ..filter.transition import Transition
 from ..selection.hypotheses import Evidence
 from ..selection.model_selection import Choice, Hypothesis, parameters_of
-from .maneuver_library import TRIALS, simulated
+from .maneuver_library import MANEUVERS, simulate_maneuvers
 
 _NOTHING = 1.0
 """Nats a minute below which a maneuver counts as uninformative."""
@@ -61,7 +61,10 @@ class Experiment:
 
 
 def experiments(
-    bench: Bench, final: Look, accepted: Sequence[Choice], nuisance: Sequence[int]
+    problem: DiagnosisProblem,
+    final: Evaluation,
+    accepted: Sequence[Choice],
+    nuisance: Sequence[int],
 ) -> dict[Hypothesis, Experiment]:
     """The next experiment for every accepted cause; `final` is the evaluation with all of them.
 
@@ -72,32 +75,34 @@ def experiments(
     names = [choice.hypothesis for choice in accepted]
     against = {choice.hypothesis: _opponents(choice, names) for choice in accepted}
     tried = [*names, *(other for others in against.values() for other in others)]
-    rows = sorted({*nuisance, *parameters_of(bench.library, tried)})
-    there = bench.look(final.theta, rows, final.kalman, again=final).plain
-    flown = _looked_at(bench, final, there)
-    change = final.theta - bench.believed
+    rows = sorted({*nuisance, *parameters_of(problem.library, tried)})
+    there = problem.evaluate(final.theta, rows, final.kalman, previous=final).plain
+    flown = _products_of_maneuvers(problem, final, there)
+    change = final.theta - problem.believed
     found = {}
     for a in names:
-        own = bench.library.at(*a)
-        beside = [i for i in rows if i not in own and (i in nuisance or _of(bench, i) in names)]
+        own = problem.library.at(*a)
+        free_rows = [
+            i for i in rows if i not in own and (i in nuisance or _of(problem, i) in names)
+        ]
         opponents = against[a]
         value = {
-            trial: min(
-                _added(there, T, own, [*beside, *_rows(bench, b, beside)], change)
+            maneuver: min(
+                _added(there, T, own, [*free_rows, *_rows(problem, b, free_rows)], change)
                 for b in (opponents or [None])
             ) / minutes
-            for trial, (T, minutes) in flown.items()
+            for maneuver, (T, minutes) in flown.items()
         }  # fmt: skip
-        found[a] = Experiment(_told(a, opponents, value), value)
+        found[a] = Experiment(_advice(a, opponents, value), value)
     return found
 
 
-def _of(bench: Bench, i: int) -> Hypothesis:
-    return bench.library.entries[i][:2]
+def _of(problem: DiagnosisProblem, i: int) -> Hypothesis:
+    return problem.library.entries[i][:2]
 
 
-def _rows(bench: Bench, b: Hypothesis | None, taken: Sequence[int]) -> list[int]:
-    return [] if b is None else [i for i in bench.library.at(*b) if i not in taken]
+def _rows(problem: DiagnosisProblem, b: Hypothesis | None, taken: Sequence[int]) -> list[int]:
+    return [] if b is None else [i for i in problem.library.at(*b) if i not in taken]
 
 
 def _opponents(choice: Choice, named: Sequence[Hypothesis]) -> list[Hypothesis]:
@@ -114,15 +119,15 @@ def _opponents(choice: Choice, named: Sequence[Hypothesis]) -> list[Hypothesis]:
     return ties[:_MOST] or [h for h, _ in choice.rivals if apart(h)][:1]
 
 
-def _looked_at(
-    bench: Bench, final: Look, there: Evidence
+def _products_of_maneuvers(
+    problem: DiagnosisProblem, final: Evaluation, there: Evidence
 ) -> dict[str, tuple[Float[np.ndarray, "m m"], float]]:
     """Products of sensitivities in each maneuver, with the design of `there`, and its minutes."""
-    inverse, design = np.linalg.inv(bench.mass(final.theta)), there.design
+    inverse, design = np.linalg.inv(problem.mass(final.theta)), there.design
     products: dict[str, np.ndarray] = {}
     minutes: dict[str, float] = {}
-    for names, data in simulated(bench, final.theta):
-        p = predict(bench.model, bench.library, final.theta, data)
+    for names, data in simulate_maneuvers(problem, final.theta):
+        p = predict(problem.model, problem.library, final.theta, data)
         tame = (np.abs(np.asarray(p.jacobian)) < WILD).all(axis=(0, 1, 2))
         jacobian = np.where(tame, np.asarray(p.jacobian), 0.0)
         data = replace(data, weight=data.weight * tame)
@@ -130,7 +135,9 @@ def _looked_at(
             continue
         steps = Transition.along(jacobian, data.weight, p.late)
         kalman = judging_filter(final.noise, steps, inverse, data.dt, data.step, jacobian)
-        z = respond(bench.model, bench.library, final.theta, design.probes, data, p, kalman)
+        z = whitened_sensitivities(
+            problem.model, problem.library, final.theta, design.probes, data, p, kalman
+        )
         seconds = (data.step * data.weight).sum(axis=0)
         for r, (name, G) in enumerate(zip(names, there.scaled(gram(z)), strict=True)):
             if name and np.isfinite(G).all():
@@ -158,17 +165,19 @@ def _added(
     return max(there.least(before + new, free) - there.least(before, free), 0.0)
 
 
-def _told(a: Hypothesis, opponents: Sequence[Hypothesis], value: Mapping[str, float]) -> str:
-    best = max(value, key=lambda trial: value[trial])
+def _advice(a: Hypothesis, opponents: Sequence[Hypothesis], value: Mapping[str, float]) -> str:
+    best = max(value, key=lambda maneuver: value[maneuver])
     family = kind(a[0]).family
     names = list(dict.fromkeys(name for name, _ in opponents))
     apart = f"to tell it from {', '.join(names)}" if names else "to measure it better"
     if value[best] < _NOTHING:
         return f"{apart}: {_BY_ITSELF[family]}; no maneuver of the set does"
-    return f"{apart}: {TRIALS[best].text} (expected: {value[best]:.0f} nats a minute)"
+    return f"{apart}: {MANEUVERS[best].text} (expected: {value[best]:.0f} nats a minute)"
 
 
-def of_law(law: Law, rivals: Sequence[Law], bench: Bench, final: Look) -> Experiment:
+def of_law(
+    law: Law, rivals: Sequence[Law], problem: DiagnosisProblem, final: Evaluation
+) -> Experiment:
     """The next experiment for a law of the disturbance.
 
     Noise does not depend on the maneuver, except for growth with the speed: there the maneuver is
@@ -180,9 +189,11 @@ def of_law(law: Law, rivals: Sequence[Law], bench: Bench, final: Look) -> Experi
         return Experiment(f"to tell it from {slow[0]}: {_DEPTHS}", {})
     if law.name == "disturbance_state_dependence":
         k = law.parameters["growth"]
-        value = {t: _of_growth(k, v) / bench.data.dt * 60 for t, v in _speeds(bench, final).items()}
-        best = max(value, key=lambda trial: value[trial])
-        text = f"{TRIALS[best].text} (expected: {value[best]:.0f} nats a minute)"
+        value = {
+            t: _of_growth(k, v) / problem.data.dt * 60 for t, v in _speeds(problem, final).items()
+        }
+        best = max(value, key=lambda maneuver: value[maneuver])
+        text = f"{MANEUVERS[best].text} (expected: {value[best]:.0f} nats a minute)"
         return Experiment(f"to measure it better: {text}", value)
     return Experiment(_BY_ITSELF[kind(law.name).family], {})
 
@@ -193,9 +204,9 @@ def _of_growth(k: float, speed: Float[np.ndarray, " n"]) -> float:
     return float(np.mean(ratio - 1 - np.log(ratio)) / 2)
 
 
-def _speeds(bench: Bench, final: Look) -> dict[str, Float[np.ndarray, " n"]]:
+def _speeds(problem: DiagnosisProblem, final: Evaluation) -> dict[str, Float[np.ndarray, " n"]]:
     found: dict[str, list[np.ndarray]] = {}
-    for names, data in simulated(bench, final.theta):
+    for names, data in simulate_maneuvers(problem, final.theta):
         speed = np.linalg.norm(data.V[:-1, :3], axis=1)
         for r, name in enumerate(names):
             if name:

@@ -16,7 +16,7 @@ from ....models.effects.extended import Extended
 from ....models.se3 import AXES
 from ...data.maneuvers import largest
 from ..data.arrays import Data
-from ..filter.problem import Bench
+from ..filter.problem import DiagnosisProblem
 from ..validation.forecast import forecast
 
 VARIANTS = 8
@@ -89,7 +89,7 @@ def _nothing(t: np.ndarray, k: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Trial:
+class Maneuver:
     """One maneuver of the library.
 
     Attributes:
@@ -105,55 +105,57 @@ class Trial:
     apart: bool = False
 
 
-TRIALS: dict[str, Trial] = {
-    "chirp": Trial(
+MANEUVERS: dict[str, Maneuver] = {
+    "chirp": Maneuver(
         "chirp one axis after the other from 0.5 to 4 Hz at half effort", _chirp
     ),
-    "steps": Trial(
+    "steps": Maneuver(
         "step each axis from rest to half and to full effort and back",
         lambda t, k: _axis(k, _levels(t, 0.0, 0.5, 1.0, 0.0)),
     ),
-    "thrusters": Trial(
+    "thrusters": Maneuver(
         "step each thruster alone from rest to a quarter and to half effort, both ways",
         _each_thruster,
     ),
-    "sweep": Trial(
+    "sweep": Maneuver(
         "sweep one axis after the other slowly through its full range",
         lambda t, k: _axis(k, np.interp(_phase(t), (0, 0.25, 0.75, 1), (0, 1, -1, 0))),
     ),
-    "speeds": Trial(
+    "speeds": Maneuver(
         "drive each axis at a tenth of its speed, then at full speed",
         lambda t, k: _axis(k, _levels(t, 0.01, 1.0)),
     ),
-    "coast": Trial(
+    "coast": Maneuver(
         "drive each axis up to speed and let it coast down without thrust",
         lambda t, k: _axis(k, _levels(t, 0.7, 0.0, 0.0)),
     ),
-    "curves": Trial("drive and turn at full effort, both ways", _curves),
-    "square": Trial("drive a square and turn on the spot at each corner", _square),
-    "lines": Trial("drive straight lines along four headings", _lines),
-    "bounce": Trial("accelerate up and down", _bounce),
-    "places": Trial("repeat the same pushes at other places, depths and headings", _pushes,
+    "curves": Maneuver("drive and turn at full effort, both ways", _curves),
+    "square": Maneuver("drive a square and turn on the spot at each corner", _square),
+    "lines": Maneuver("drive straight lines along four headings", _lines),
+    "bounce": Maneuver("accelerate up and down", _bounce),
+    "places": Maneuver("repeat the same pushes at other places, depths and headings", _pushes,
                     apart=True),
-    "battery": Trial("repeat the same run with a full and with an empty battery", _pushes,
+    "battery": Maneuver("repeat the same run with a full and with an empty battery", _pushes,
                      voltage=(1.05, 0.8)),
-    "drift": Trial("let it drift without commands", _nothing),
+    "drift": Maneuver("let it drift without commands", _nothing),
 }  # fmt: skip
 
 
-def simulated(bench: Bench, theta: Float[np.ndarray, " p"]) -> Iterator[tuple[list[str], Data]]:
+def simulate_maneuvers(
+    problem: DiagnosisProblem, theta: Float[np.ndarray, " p"]
+) -> Iterator[tuple[list[str], Data]]:
     """Noise-free data of all maneuvers under θ, with the maneuver of each piece ('' for padding).
 
     Shapes are those of the problem's own data, so that programs compiled for these are reused.
     """
-    own = bench.data
+    own = problem.data
     R, n = own.u.shape[2], own.u.shape[1]
-    thrusters = bench.vehicle.thrusters()
-    model = bench.model.with_effects(bench.library.used(theta))
+    thrusters = problem.vehicle.thrusters()
+    model = problem.model.with_effects(problem.library.used(theta))
     middle = np.median(own.X[:, 4:].transpose(0, 2, 1).reshape(-1, 3), axis=0)
     left_out = set() if own.has_voltage else {"battery"}
     left_out |= {"thrusters"} if own.command == "F_Bo_B" else set()
-    every = list(itertools.product([t for t in TRIALS if t not in left_out], range(VARIANTS)))
+    every = list(itertools.product([t for t in MANEUVERS if t not in left_out], range(VARIANTS)))
     full = _GENTLE * [largest(thrusters, axis) for axis in np.eye(6)]
     alone = np.min(np.abs(thrusters.curve.limits(thrusters.nominal_voltage)), axis=0) * np.ones(n)
     for first in range(0, len(every), R):
@@ -164,20 +166,20 @@ def simulated(bench: Bench, theta: Float[np.ndarray, " p"]) -> Iterator[tuple[li
         X[:, 0] = 1.0
         X[:, 4:] = middle[:, None]
         for r, (name, k) in enumerate(some):
-            trial, half = TRIALS[name], np.pi / _HEADINGS * (k % _HEADINGS) + 0.15
+            maneuver, half = MANEUVERS[name], np.pi / _HEADINGS * (k % _HEADINGS) + 0.15
             X[:, 0, r], X[:, 3, r] = np.cos(half), np.sin(half)
-            if trial.apart:
+            if maneuver.apart:
                 X[:, 4, r] += _APART * np.cos(2.4 * k)
                 X[:, 5, r] += _APART * np.sin(2.4 * k)
                 X[:, 6, r] = (0.3 + 0.2 * k) * middle[2]
-            share = trial.effort(own.times[:-1, r], k)
+            share = maneuver.effort(own.times[:-1, r], k)
             if share.shape[1] == 1:
                 single[:, k % n, r] = share[:, 0] * alone[k % n]
             else:
                 wrench[..., r] = share * full
-            voltage[:, r] = trial.voltage[k % len(trial.voltage)]
-        together = thrusters.allocate(jnp.asarray(wrench.swapaxes(0, 1), thrusters.inverse.dtype))
-        u = single + np.asarray(together).swapaxes(0, 1)
+            voltage[:, r] = maneuver.voltage[k % len(maneuver.voltage)]
+        allocated = thrusters.allocate(jnp.asarray(wrench.swapaxes(0, 1), thrusters.inverse.dtype))
+        u = single + np.asarray(allocated).swapaxes(0, 1)
         names = [name for name, _ in some] + [""] * (R - len(some))
         data = replace(
             own, X=X, V=np.zeros_like(own.V), u=u, past=np.zeros_like(own.past), voltage=voltage,

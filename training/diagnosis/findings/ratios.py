@@ -19,7 +19,7 @@ from ....models import se3
 from ....models.effects.extended import Extended
 from ....models.rigid_body import FossenDynamics
 from ....models.se3 import AXES
-from ..filter.problem import Bench, Look
+from ..filter.problem import DiagnosisProblem, Evaluation
 from . import result
 
 _TILT = 1e-3
@@ -40,7 +40,9 @@ _UNITS = {
 """Units of translations and of rotations."""
 
 
-def ratios(bench: Bench, look: Look, rows: Sequence[int]) -> list[result.Ratio]:
+def ratios(
+    problem: DiagnosisProblem, evaluation: Evaluation, rows: Sequence[int]
+) -> list[result.Ratio]:
     """Believed and found ratios by axis; `rows` are the parameters that were fitted.
 
     `inertia` is relative to surge's (of rotations to roll's), everything else over the
@@ -48,21 +50,23 @@ def ratios(bench: Bench, look: Look, rows: Sequence[int]) -> list[result.Ratio]:
     half command, for commands by PWM, `thrust` that at the commands' RMS where they are forces or
     wrenches. Empty for a base without constant coefficients.
     """
-    if not isinstance(bench.model.base, FossenDynamics) or not rows:
+    if not isinstance(problem.model.base, FossenDynamics) or not rows:
         return []
-    numbers, theta = _numbers(bench), look.theta
-    mean, before = numbers(theta), numbers(bench.believed)
-    low, high = bench.limits(rows)
+    numbers, theta = _numbers(problem), evaluation.theta
+    mean, before = numbers(theta), numbers(problem.believed)
+    low, high = problem.limits(rows)
     at = theta[list(rows)]
     free = [
         i for i, a, b, x in zip(rows, low, high, at, strict=True) if a < x - _SMALL < b - _SMALL
     ]
-    columns = [look.evidence.column(i) for i in free]
-    H = look.evidence.total[np.ix_(columns, columns)] + np.diag(look.evidence.prior(free))
+    columns = [evaluation.evidence.column(i) for i in free]
+    H = evaluation.evidence.total[np.ix_(columns, columns)] + np.diag(
+        evaluation.evidence.prior(free)
+    )
     # principal directions, each moved by a share of its standard error
     values, vectors = np.linalg.eigh(H)
     roots = vectors / np.sqrt(np.maximum(values, 1e-300))
-    scores = look.evidence.runs[:, columns, 0] @ roots
+    scores = evaluation.evidence.runs[:, columns, 0] @ roots
     scores = scores - scores.mean(axis=0)
     slopes: dict[tuple[str, str], list[float]] = {key: [] for key in mean}
     for direction in roots.T:
@@ -75,19 +79,19 @@ def ratios(bench: Bench, look: Look, rows: Sequence[int]) -> list[result.Ratio]:
         slope = np.array(slopes[name, where])
         error = 1.96 * float(np.sqrt(max(slope @ slope, np.sum((scores @ slope) ** 2))))
         unit = _UNITS[name][where in AXES[3:]]
-        told = result.Value(value, unit, (value - error, value + error))
-        found.append(result.Ratio(name, where, before[name, where], told))
+        fitted = result.Value(value, unit, (value - error, value + error))
+        found.append(result.Ratio(name, where, before[name, where], fitted))
     return found
 
 
-def _numbers(bench: Bench) -> Callable[[np.ndarray], dict[tuple[str, str], float]]:
+def _numbers(problem: DiagnosisProblem) -> Callable[[np.ndarray], dict[tuple[str, str], float]]:
     """A function from θ to all ratios."""
-    data = bench.data
-    thrusters = bench.vehicle.thrusters()
+    data = problem.data
+    thrusters = problem.vehicle.thrusters()
     volts = float((data.voltage * data.weight).sum() / data.weight.sum())
     nominal = float(thrusters.nominal_voltage)
     identity = se3.identity(jnp.float64)
-    B = np.asarray(bench.model.allocate(jnp.eye(data.u.shape[1])))
+    B = np.asarray(problem.model.allocate(jnp.eye(data.u.shape[1])))
     along = np.sign(np.round(B, 9))
     usual = np.sqrt((data.u**2 * data.weight[:, None]).sum(axis=(0, 2)) / data.weight.sum())
 
@@ -112,23 +116,23 @@ def _numbers(bench: Bench) -> Callable[[np.ndarray], dict[tuple[str, str], float
         return jax.vmap(wrench)(commands)
 
     def numbers(theta: Float[np.ndarray, " p"]) -> dict[tuple[str, str], float]:
-        effects = bench.library.filled(theta)
-        inertia = np.diag(bench.mass(theta))
-        level = at_rest(bench.model, effects, identity)
+        effects = problem.library.filled(theta)
+        inertia = np.diag(problem.mass(theta))
+        level = at_rest(problem.model, effects, identity)
         found = {("inertia", a): inertia[i] / inertia[i // 3 * 3] for i, a in enumerate(AXES)}
         for name in ("quadratic_drag", "linear_drag"):
             for i, axis in enumerate(AXES):
-                change = theta[bench.library.index(name, axis, "change")]
-                value = bench.believes(name, axis) + change
+                change = theta[problem.library.index(name, axis, "change")]
+                value = problem.believes(name, axis) + change
                 found[name, axis] = float(value / inertia[i])
         pwm = data.command == "pwm"
         commands = 1500.0 + _HALF * along if pwm else usual * along
-        F = np.asarray(pushed(bench.model, effects, jnp.asarray(commands)))
+        F = np.asarray(pushed(problem.model, effects, jnp.asarray(commands)))
         for i, axis in enumerate(AXES):
             found["half_thrust" if pwm else "thrust", axis] = float(F[i, i] / inertia[i])
         for i, axis in ((3, "roll"), (4, "pitch")):
             tilted = se3.retract(identity, jnp.zeros(6).at[i].set(_TILT))
-            less = level[i] - at_rest(bench.model, effects, tilted)[i]
+            less = level[i] - at_rest(problem.model, effects, tilted)[i]
             found["restoring", axis] = float(less / _TILT / inertia[i])
         found["net_buoyancy", "heave"] = float(level[2] / inertia[2])
         return found

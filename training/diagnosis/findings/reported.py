@@ -13,7 +13,7 @@ from ....models.effects.library import kind
 from ....models.se3 import AXES, CHANNELS
 from ..data.repeats import repeating
 from ..disturbance.laws import Law, estimated, run_constants
-from ..filter.problem import Bench, Look
+from ..filter.problem import DiagnosisProblem, Evaluation
 from ..selection.hypotheses import Fit
 from ..selection.model_selection import Choice, parameters_of
 from ..selection.search import Found
@@ -50,31 +50,31 @@ def unit(of: str, where: str) -> str:
 
 
 def values_of(
-    bench: Bench, theta: Float[np.ndarray, " p"], rows: Sequence[int], joint: Fit
+    problem: DiagnosisProblem, theta: Float[np.ndarray, " p"], rows: Sequence[int], joint: Fit
 ) -> dict[str, result.Value]:
     """Parameters with intervals from the joint fit of all free ones, clustered by run."""
     t = quantile(joint)
     found = {}
     for i in rows:
-        p = bench.library.entries[i].parameter
+        p = problem.library.entries[i].parameter
         v = p.usual + float(theta[i])
         error = t * float(joint.errors[joint.parameters.index(i)])
-        told = unit(p.unit, bench.library.entries[i].where)
-        found[p.name] = result.Value(v, told, (v - error, v + error))
+        its_unit = unit(p.unit, problem.library.entries[i].where)
+        found[p.name] = result.Value(v, its_unit, (v - error, v + error))
     return found
 
 
-def _assumed(bench: Bench, name: str, where: str) -> dict[str, result.Value]:
+def _assumed(problem: DiagnosisProblem, name: str, where: str) -> dict[str, result.Value]:
     """Assumed values that a cause's parameters refer to, without intervals."""
-    own = (e for e in bench.library.effects if e.name == name and where in e.places)
-    told = next(own).assumed(where)
-    return {what: result.Value(at, unit, (_NAN, _NAN)) for what, (at, unit) in told.items()}
+    own = (e for e in problem.library.effects if e.name == name and where in e.places)
+    assumed = next(own).assumed(where)
+    return {what: result.Value(at, unit, (_NAN, _NAN)) for what, (at, unit) in assumed.items()}
 
 
 def cause(
     choice: Choice,
-    bench: Bench,
-    look: Look,
+    problem: DiagnosisProblem,
+    evaluation: Evaluation,
     joint: Fit,
     experiment: Experiment,
     structure: result.Structure | None = None,
@@ -85,8 +85,8 @@ def cause(
     return result.Cause(
         name=name,
         where=where,
-        parameters=values_of(bench, look.theta, bench.library.at(name, where), joint)
-        | _assumed(bench, name, where),
+        parameters=values_of(problem, evaluation.theta, problem.library.at(name, where), joint)
+        | _assumed(problem, name, where),
         evidence=result.Support(choice.p_value, choice.fit.heldout_gain),
         rivals=rivals,
         indistinguishable_from=list(
@@ -98,53 +98,55 @@ def cause(
     )
 
 
-def refitted(bench: Bench, look: Look, rows: Sequence[int], joint: Fit) -> list[result.Refitted]:
+def refitted(
+    problem: DiagnosisProblem, evaluation: Evaluation, rows: Sequence[int], joint: Fit
+) -> list[result.Refitted]:
     """Coefficients that were fitted with the causes: believed and found values."""
     found = []
     t = quantile(joint) if rows else 0.0
     for i in rows:
-        e = bench.library.entries[i]
-        old = bench.believes(e.cause, e.where)
-        new = old + float(look.theta[i] - bench.believed[i])
+        e = problem.library.entries[i]
+        old = problem.believes(e.cause, e.where)
+        new = old + float(evaluation.theta[i] - problem.believed[i])
         error = t * float(joint.errors[joint.parameters.index(i)])
         value = result.Value(new, unit(e.parameter.unit, e.where), (new - error, new + error))
         found.append(result.Refitted(e.cause, e.where, e.parameter.name, old, value))
     return found
 
 
-def residual(bench: Bench, look: Look) -> dict[str, result.AxisResidual]:
+def residual(problem: DiagnosisProblem, evaluation: Evaluation) -> dict[str, result.AxisResidual]:
     """Statistics of the residual by channel; NaN where nothing was measured."""
-    n, correlation = bench.data.weight.sum(), look.correlation
+    n, correlation = problem.data.weight.sum(), evaluation.correlation
     found = {}
     for i, name in enumerate(CHANNELS):
-        z = look.z[:, i]
+        z = evaluation.z[:, i]
         mean = float(z.sum() / np.sqrt(n))
         values = float((z**2).sum()) / n, float(correlation[i]), mean
-        found[name] = result.AxisResidual(*(values if bench.data.told[i] else [np.nan] * 3))
+        found[name] = result.AxisResidual(*(values if problem.data.measured[i] else [np.nan] * 3))
     return found
 
 
 def left_over(
     residual: Mapping[str, result.AxisResidual],
     causes: Sequence[result.Cause],
-    bench: Bench,
-    look: Look,
+    problem: DiagnosisProblem,
+    evaluation: Evaluation,
     least: float,
 ) -> list[str]:
     """Systematic residuals that the causes leave, in words."""
     left = following(residual, causes)
-    if look.noise.estimated:
+    if evaluation.noise.estimated:
         return left
-    alike = repeating(look.z, bench.data)
+    alike = repeating(evaluation.z, problem.data)
     if alike:
         left.append(
             f"errors of {', '.join(alike)} repeat from run to run under the same commands (up to "
             f"{max(alike.values()):.1f} times what chance makes): the simulation lacks something "
             "there that follows the commands"
         )
-    gain, std = thrust_by_run(bench, look)
+    gain, std = thrust_by_run(problem, evaluation)
     if gain > max(least, *(c.evidence.heldout_gain for c in causes if _is_random(c.name)), 0.0):
-        when = "within the run" if bench.data.left_out == "block" else "from run to run"
+        when = "within the run" if problem.data.left_out == "block" else "from run to run"
         left.append(
             f"thrust differs {when} (by {100 * std:.1f} %, standard deviation), as with a supply "
             "voltage that was not recorded or a thruster that fails"
@@ -156,9 +158,9 @@ def _is_random(name: str) -> bool:
     return name in ("waves", "current_varying") or kind(name).family == "disturbance"
 
 
-def thrust_by_run(bench: Bench, look: Look) -> tuple[float, float]:
+def thrust_by_run(problem: DiagnosisProblem, evaluation: Evaluation) -> tuple[float, float]:
     """Held-out nats that a thrust scale by run wins, and the scales' standard deviation."""
-    evidence, at = look.plain, bench.library.at("thrust_scale", "all")
+    evidence, at = evaluation.plain, problem.library.at("thrust_scale", "all")
     if not set(at) <= set(evidence.design.owner.tolist()) or len(evidence.runs) < 3:
         return 0.0, 0.0
     columns, size = [evidence.column(i) for i in at], np.array([_SCALE])
@@ -191,19 +193,19 @@ def following(
 
 
 def law_cause(
-    laws: Sequence[Law], rivals: Sequence[Law], bench: Bench, look: Look
+    laws: Sequence[Law], rivals: Sequence[Law], problem: DiagnosisProblem, evaluation: Evaluation
 ) -> tuple[result.Cause, Effect]:
     """Laws of one name as a cause, axis by axis, and their effect."""
     same = sorted(laws, key=lambda law: law.where in AXES[3:])  # newtons before newton metres
     top = max(laws, key=lambda law: law.heldout_gain)
-    experiment = of_law(top, rivals, bench, look)
+    experiment = of_law(top, rivals, problem, evaluation)
     parameters: dict[str, result.Value] = {}
     cls = kind(top.name)
     values = np.zeros(cls.size())
     for number, law in enumerate(same):
-        for name, told in _law_values(law, bench, look).items():
-            parameters[name if number == 0 else f"{name}_{law.where}"] = told
-            values[cls.index(law.where, name)] = told.value
+        for name, value in _law_values(law, problem, evaluation).items():
+            parameters[name if number == 0 else f"{name}_{law.where}"] = value
+            values[cls.index(law.where, name)] = value.value
     named = result.Cause(
         name=top.name,
         where=", ".join(law.where for law in same),
@@ -217,9 +219,11 @@ def law_cause(
     return named, cls(jnp.asarray(values))
 
 
-def _law_values(law: Law, bench: Bench, look: Look) -> dict[str, result.Value]:
+def _law_values(
+    law: Law, problem: DiagnosisProblem, evaluation: Evaluation
+) -> dict[str, result.Value]:
     """A law's parameters in the units of its effect, with intervals by the delta method."""
-    data = bench.data
+    data = problem.data
     units = {p.name: unit(p.unit, law.where) for p in kind(law.name).parameters}
     if law.errors is not None:
         spreads = {name: 1.96 * law.errors[name] for name in law.parameters}
@@ -231,7 +235,7 @@ def _law_values(law: Law, bench: Bench, look: Look) -> dict[str, result.Value]:
     if law.loss is not None and len(law.heldout) != len(cluster):
         cluster = np.arange(len(law.heldout))
     at, covariance = estimated(law, cluster)
-    once, steady = _responses(bench, look, law.where)
+    once, steady = _unit_responses(problem, evaluation, law.where)
 
     def physical(x: np.ndarray) -> np.ndarray:
         v = np.exp(x)
@@ -259,16 +263,18 @@ def _law_values(law: Law, bench: Bench, look: Look) -> dict[str, result.Value]:
     return found
 
 
-def _responses(bench: Bench, look: Look, axis: str) -> tuple[float, float]:
+def _unit_responses(
+    problem: DiagnosisProblem, evaluation: Evaluation, axis: str
+) -> tuple[float, float]:
     """Whitened innovation on an axis after a unit impulse; its steady state under a unit wrench."""
     if axis not in AXES:
         return 1.0, 1.0
-    i, dt = AXES.index(axis), bench.data.dt
-    a = np.linalg.inv(bench.mass(look.theta))[:, i]
+    i, dt = AXES.index(axis), problem.data.dt
+    a = np.linalg.inv(problem.mass(evaluation.theta))[:, i]
     d = np.concatenate([dt * dt / 2 * a, dt * a])
-    w = bench.data.weight
-    A = np.einsum("nijr,nr->ij", np.asarray(look.predictions.jacobian), w) / w.sum()
-    white, keep = (k[-1].mean(axis=-1) for k in (look.kalman.whiten, look.kalman.keep))
+    w = problem.data.weight
+    A = np.einsum("nijr,nr->ij", np.asarray(evaluation.predictions.jacobian), w) / w.sum()
+    white, keep = (k[-1].mean(axis=-1) for k in (evaluation.kalman.whiten, evaluation.kalman.keep))
     lasting = np.linalg.solve(np.eye(12) - A @ keep, d)
     return abs(float((white @ d)[6 + i])) / dt, abs(float((white @ lasting)[6 + i]))
 
@@ -303,12 +309,12 @@ def sentence(
         return first + "Your model is adequate at this noise."
     named = ", ".join(f"{c.name} ({c.where})" for c in causes if c.name != "unknown")
     subject = "your model, its coefficients refitted," if refitted else "your model"
-    told = f"The data differ from {subject} by: {named}." if named else ""
+    text = f"The data differ from {subject} by: {named}." if named else ""
     for c in causes:
         if c.structure is not None:
-            told += f" No name explains {c.structure.description}."
-    told += "".join(f" But {one}." for one in left)
-    return first + told.strip()
+            text += f" No name explains {c.structure.description}."
+    text += "".join(f" But {one}." for one in left)
+    return first + text.strip()
 
 
 def with_coefficients_off(diagnosis: result.Diagnosis) -> result.Diagnosis:
@@ -326,12 +332,12 @@ def with_coefficients_off(diagnosis: result.Diagnosis) -> result.Diagnosis:
         if turned or (r.believed * r.found.value > 0 and not low <= r.believed <= high):
             off[r.name] = max(off.get(r.name, r), r, key=factor)
     units = {"1": ""}
-    told = "; ".join(
+    listed = "; ".join(
         f"{r.name} of {r.where} {r.found.value:.3g} {units.get(r.found.unit, r.found.unit + ' ')}"
         f"(believed: {r.believed:.3g})"
         for r in sorted(off.values(), key=factor, reverse=True)
     )
-    most = f" Over inertia, of each kind the most: {told}." if told else ""
+    most = f" Over inertia, of each kind the most: {listed}." if listed else ""
     return replace(
         diagnosis,
         sentence=f"Your model is wrong in most of its coefficients.{most} {diagnosis.sentence}",
@@ -339,18 +345,20 @@ def with_coefficients_off(diagnosis: result.Diagnosis) -> result.Diagnosis:
     )
 
 
-def noise_words(bench: Bench, look: Look) -> dict[str, float]:
+def noise_levels(problem: DiagnosisProblem, evaluation: Evaluation) -> dict[str, float]:
     """Levels of noise, mean over the axes of a sensor."""
     groups = ("position_m", "attitude_rad", "velocity_m_s", "rate_rad_s")
-    found = {g: float(np.mean(look.noise.record[3 * i : 3 * i + 3])) for i, g in enumerate(groups)}
-    if bench.data.unmeasured:
+    found = {
+        g: float(np.mean(evaluation.noise.record[3 * i : 3 * i + 3])) for i, g in enumerate(groups)
+    }
+    if problem.data.unmeasured:
         del found["position_m"]
     return found | {
-        f"diffusion_{a}": float(b) for a, b in zip(AXES, look.noise.diffusion, strict=True)
+        f"diffusion_{a}": float(b) for a, b in zip(AXES, evaluation.noise.diffusion, strict=True)
     }
 
 
-def joint_rows(found: Found, nuisance: Sequence[int], bench: Bench) -> list[int]:
+def joint_rows(found: Found, nuisance: Sequence[int], problem: DiagnosisProblem) -> list[int]:
     """All parameters of the final joint fit."""
-    rows = [*parameters_of(bench.library, found.hypotheses), *nuisance]
+    rows = [*parameters_of(problem.library, found.hypotheses), *nuisance]
     return list(dict.fromkeys(rows))

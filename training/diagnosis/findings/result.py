@@ -312,12 +312,12 @@ def _schema(kind: Any, definitions: dict[str, Any]) -> dict[str, Any]:
         name = kind.__name__
         if name not in definitions:
             definitions[name] = {}
-            hints, told = get_type_hints(kind), described(kind)
+            hints, descriptions = get_type_hints(kind), described(kind)
             definitions[name] = {
                 "type": "object",
                 "description": (kind.__doc__ or "").split("\n")[0],
                 "properties": {
-                    k: {**_schema(v, definitions), "description": told.get(k, "")}
+                    k: {**_schema(v, definitions), "description": descriptions.get(k, "")}
                     for k, v in hints.items()
                 },
                 "required": [f.name for f in dataclasses.fields(kind)],

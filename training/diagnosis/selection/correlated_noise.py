@@ -16,7 +16,7 @@ from ..filter.gram import gram
 
 
 @dataclass(frozen=True)
-class Beside:
+class CorrelatedNoise:
     """Correlated noise with known parameters.
 
     Attributes:
@@ -29,29 +29,29 @@ class Beside:
 
     slow: dict[int, tuple[float, float, Float[np.ndarray, "12"]]] = field(default_factory=dict)
     scale: Float[np.ndarray, "12"] = field(default_factory=lambda: np.ones(12))
-    drawn: Float[np.ndarray, "k N12 R"] | None = None
+    amplitudes: Float[np.ndarray, "k N12 R"] | None = None
     precision: Float[np.ndarray, " k"] = field(default_factory=lambda: np.zeros(0))
 
     def products(self, z: Float[np.ndarray, "m N12 R"]) -> Float[np.ndarray, "R m m"]:
         """Inner products of innovations and sensitivities by piece, after whitening."""
-        if self.drawn is not None:
-            z = np.concatenate([z, self.drawn])
-        G = gram(self._unslowed(z))
-        if self.drawn is None:
+        if self.amplitudes is not None:
+            z = np.concatenate([z, self.amplitudes])
+        G = gram(self._without_slow(z))
+        if self.amplitudes is None:
             return G
-        m = len(z) - len(self.drawn)
+        m = len(z) - len(self.amplitudes)
         own, cross = G[:, :m, :m], G[:, m:, :m]
         inner = G[:, m:, m:] + np.diag(self.precision)
         return own - cross.swapaxes(1, 2) @ np.linalg.solve(inner, cross)
 
     @classmethod
-    def slowly(
+    def from_slow(
         cls, z: Float[np.ndarray, "N 12 R"], numbers: dict[int, tuple[float, float]]
-    ) -> "Beside":
+    ) -> "CorrelatedNoise":
         """Slow disturbances with ρ and κ by axis; the rest is estimated from innovations `z`."""
         slow, left = {}, z.copy()
         for axis, (rho, kappa) in numbers.items():
-            m = _predicted(z[None, :, 6 + axis], rho, kappa)[0]
+            m = _slow_prediction(z[None, :, 6 + axis], rho, kappa)[0]
             share = np.einsum("njr,nr->j", z, m) / max(float((m**2).sum()), 1e-300)
             share[6 + axis] = 1.0
             slow[axis] = rho, kappa, share
@@ -61,19 +61,19 @@ class Beside:
         scale = np.where(before > 0, np.maximum(after / count, 1.0), 1.0)
         return cls(slow, scale)
 
-    def _unslowed(self, z: np.ndarray) -> np.ndarray:
+    def _without_slow(self, z: np.ndarray) -> np.ndarray:
         if not self.slow:
             return z
         before = z.reshape(len(z), -1, 12, z.shape[2])
         found = before / self.scale[:, None].astype(z.dtype)
         for axis, (rho, kappa, share) in self.slow.items():
-            m = _predicted(before[:, :, 6 + axis], rho, kappa)
+            m = _slow_prediction(before[:, :, 6 + axis], rho, kappa)
             for j in np.flatnonzero(share):
                 found[:, :, j] -= float(share[j] / self.scale[j]) * m
         return found.reshape(z.shape)
 
 
-def _predicted(
+def _slow_prediction(
     z: Float[np.ndarray, "m N R"], rho: float, kappa: float
 ) -> Float[np.ndarray, "m N R"]:
     """Prediction of the slow disturbance before each step."""

@@ -30,7 +30,7 @@ from ....models.effects.library import Library
 from ....models.effects.recent import Recent
 from ..data.arrays import Data
 from ..filter.innovations import at_first, settle, substeps
-from ..filter.problem import Bench, mass
+from ..filter.problem import DiagnosisProblem, mass
 
 _ENOUGH = 1e-3
 """Relative gain of a step below which a fit has ended."""
@@ -68,7 +68,7 @@ class Windows:
 
 
 @dataclass(frozen=True)
-class HorizonFit:
+class MultiStepFit:
     """Values of all parameters, standard errors of those fitted (`rows`), loss on the windows."""
 
     theta: Float[np.ndarray, " p"]
@@ -145,46 +145,48 @@ def _arrays(w: Windows) -> tuple:
     return tuple(jnp.asarray(a) for a in (w.X, w.V, w.u, w.past, w.past_step, w.voltage, w.step))
 
 
-def small(bench: Bench, rows: Sequence[int], theta: np.ndarray) -> tuple[Library, list[int]]:
+def small(
+    problem: DiagnosisProblem, rows: Sequence[int], theta: np.ndarray
+) -> tuple[Library, list[int]]:
     """The library of the effects in use, and its parameters' indices in the problem's library."""
-    used = {bench.library.entries[i].cause for i in rows}
-    used |= {bench.library.entries[i].cause for i in np.flatnonzero(theta)}
-    library = Library([e for e in bench.library.effects if e.name in used])
-    index = {(e.cause, e.where, e.parameter.name): i for i, e in enumerate(bench.library.entries)}
+    used = {problem.library.entries[i].cause for i in rows}
+    used |= {problem.library.entries[i].cause for i in np.flatnonzero(theta)}
+    library = Library([e for e in problem.library.effects if e.name in used])
+    index = {(e.cause, e.where, e.parameter.name): i for i, e in enumerate(problem.library.entries)}
     return library, [index[e.cause, e.where, e.parameter.name] for e in library.entries]
 
 
 def forecast_errors(
-    bench: Bench, theta: Float[np.ndarray, " p"], w: Windows
+    problem: DiagnosisProblem, theta: Float[np.ndarray, " p"], w: Windows
 ) -> Float[np.ndarray, "M 12 K"]:
     """Forecast minus record: pose in the recorded body frame (m, rad), then twist."""
-    library, at = small(bench, (), theta)
+    library, at = small(problem, (), theta)
     effects = library.filled(theta[at])
-    return np.asarray(_apart(bench.model, effects, _arrays(w), w.count))
+    return np.asarray(_apart(problem.model, effects, _arrays(w), w.count))
 
 
 def fit_forecasts(
-    bench: Bench,
+    problem: DiagnosisProblem,
     w: Windows,
     rows: Sequence[int],
     kept: Bool[np.ndarray, " K"] | None = None,
     rounds: int = 12,
-) -> HorizonFit:
+) -> MultiStepFit:
     """Gauss–Newton with damping (Levenberg 1944; Marquardt 1963) on the parameters chosen.
 
     Only windows `kept` are fitted to (all by default). Drag stays passive: neither the linear nor
     the quadratic coefficient of an axis becomes negative.
     """
-    theta, rows = bench.believed.copy(), list(rows)
+    theta, rows = problem.believed.copy(), list(rows)
     kept = np.ones(len(w.block), bool) if kept is None else kept
-    belief = forecast_errors(bench, theta, w)[..., kept]
+    belief = forecast_errors(problem, theta, w)[..., kept]
     size = np.maximum(1.4826 * np.median(np.abs(belief), axis=(0, 2)), 1e-4)
     if not rows:
-        return HorizonFit(theta, (), np.zeros(0), _loss(belief, size))
-    library, at = small(bench, rows, theta)
+        return MultiStepFit(theta, (), np.zeros(0), _loss(belief, size))
+    library, at = small(problem, rows, theta)
     own = [at.index(i) for i in rows]
     entries = [library.entries[i].parameter for i in own]
-    low, high = bench.limits(rows)
+    low, high = problem.limits(rows)
     probe = np.array([abs(p.probes[0]) for p in entries])
     arrays = _arrays(w)
     best = theta[at]
@@ -194,11 +196,11 @@ def fit_forecasts(
     best[own] = np.clip(np.where(flat, probe, start), low, high)
 
     def tried(values: np.ndarray) -> float:
-        e = _apart(bench.model, library.filled(values), arrays, w.count)
+        e = _apart(problem.model, library.filled(values), arrays, w.count)
         return _loss(np.asarray(e)[..., kept], size)
 
     def seen(values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        e, J = _slopes(library=library, model=bench.model, theta=jnp.asarray(values),
+        e, J = _slopes(library=library, model=problem.model, theta=jnp.asarray(values),
                        rows=jnp.asarray(own), arrays=arrays, count=w.count)  # fmt: skip
         e, J = np.asarray(e)[..., kept], np.asarray(J)[..., kept]
         return _loss(e, size), e, J
@@ -212,7 +214,7 @@ def fit_forecasts(
             step = -np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-9), g) * probe
             trial = best.copy()
             trial[own] = np.clip(best[own] + step, low, high)
-            if _is_body(bench, library, trial) and tried(trial) < loss:
+            if _is_body(problem, library, trial) and tried(trial) < loss:
                 best, damping = trial, max(damping / 5, 1e-7)
                 loss, e, J = seen(best)
                 break
@@ -220,11 +222,11 @@ def fit_forecasts(
         if before - loss < _ENOUGH * before:
             break
     theta[at] = best
-    return HorizonFit(theta, tuple(rows), _spread(e, J, size, probe, w.block[kept]), loss)
+    return MultiStepFit(theta, tuple(rows), _spread(e, J, size, probe, w.block[kept]), loss)
 
 
-def _is_body(bench: Bench, library: Library, values: np.ndarray) -> bool:
-    return bool(np.linalg.eigvalsh(mass(bench.model, library, values))[0] > 0)
+def _is_body(problem: DiagnosisProblem, library: Library, values: np.ndarray) -> bool:
+    return bool(np.linalg.eigvalsh(mass(problem.model, library, values))[0] > 0)
 
 
 def _loss(e: np.ndarray, size: np.ndarray) -> float:

@@ -18,7 +18,7 @@ from ....models.effects.library import COEFFICIENTS
 from ....models.se3 import AXES
 from ..filter.gram import least_within
 from ..filter.noise import Filter
-from ..filter.problem import Bench, Look
+from ..filter.problem import DiagnosisProblem, Evaluation
 from .hypotheses import known_within
 
 WRENCH = ("axis_thrust", "thrust_lever", "centre_of_buoyancy")
@@ -52,28 +52,28 @@ class Coefficient:
     high: float
 
 
-def with_coefficients(bench: Bench) -> Bench:
+def with_coefficients(problem: DiagnosisProblem) -> DiagnosisProblem:
     """The problem with the effects that only this fit has, and physical bounds."""
-    level, of_pulses = bench.data.command != "F_Bo_B", bench.data.command == "pwm"
+    level, of_pulses = problem.data.command != "F_Bo_B", problem.data.command == "pwm"
     for name, kind in COEFFICIENTS.items():
         if (name in CURVE and not level) or (name in PULSES and not of_pulses):
             continue
-        if name == "voltage_exponent" and not bench.data.has_voltage:
+        if name == "voltage_exponent" and not problem.data.has_voltage:
             continue
-        bench = bench.with_effect(kind.neutral())
-    return bench.within({c.row: (c.low, c.high) for c in coefficients(bench)})
+        problem = problem.with_effect(kind.neutral())
+    return problem.within({c.row: (c.low, c.high) for c in coefficients(problem)})
 
 
-def coefficients(bench: Bench) -> list[Coefficient]:
+def coefficients(problem: DiagnosisProblem) -> list[Coefficient]:
     """All coefficients that are fitted."""
-    library, found = bench.library, []
-    level, of_pulses = bench.data.command != "F_Bo_B", bench.data.command == "pwm"
-    rigid = np.diag(np.asarray(bench.model.rigid_inertia))
+    library, found = problem.library, []
+    level, of_pulses = problem.data.command != "F_Bo_B", problem.data.command == "pwm"
+    rigid = np.diag(np.asarray(problem.model.rigid_inertia))
     for i, (cause, where, p) in enumerate(library.entries):
-        old, start = bench.believes(cause, where), bench.believed[i]
+        old, start = problem.believes(cause, where), problem.believed[i]
         spread, low, high = p.spread, p.low, p.high
         if cause in ("linear_drag", "quadratic_drag"):
-            both = [bench.believes(name, where) for name in ("linear_drag", "quadratic_drag")]
+            both = [problem.believes(name, where) for name in ("linear_drag", "quadratic_drag")]
             spread, low = _DRAG * max(*both, 1e-3), -old
         elif cause == "added_mass":
             spread, low = max(old, 0.1 * float(rigid[AXES.index(where)])), -old
@@ -92,7 +92,7 @@ def coefficients(bench: Bench) -> list[Coefficient]:
 
 
 def identify(
-    bench: Bench,
+    problem: DiagnosisProblem,
     progress: Callable[[float], None] = lambda fraction: None,
     start: Float[np.ndarray, " p"] | None = None,
     also: Sequence[int] = (),
@@ -107,15 +107,15 @@ def identify(
     by piece. That needs no noise levels, which a wrong model makes too large, and an
     estimator's slow errors do less harm where the vehicle rests than where drag multiplies them.
     """
-    chosen = [*coefficients(bench), *_beside(bench, also)]
+    chosen = [*coefficients(problem), *_as_coefficients(problem, also)]
     rows = [c.row for c in chosen]
     spread = np.array([c.spread for c in chosen])
     low, high = np.array([c.low for c in chosen]), np.array([c.high for c in chosen])
-    centre = bench.believed[rows]
+    centre = problem.believed[rows]
     if start is None:
-        theta = bench.believed.copy()
+        theta = problem.believed.copy()
         for c in chosen:
-            if bench.library.entries[c.row].cause in ("thruster_dead_zone", "thrust_offset"):
+            if problem.library.entries[c.row].cause in ("thruster_dead_zone", "thrust_offset"):
                 theta[c.row] += _START
     else:
         theta = start.copy()
@@ -123,7 +123,7 @@ def identify(
 
     def loss(theta: np.ndarray, common: np.ndarray) -> float:
         away = (theta[rows] - centre) / spread
-        C, counts = _by_piece(bench, bench.errors(theta), common)
+        C, counts = _by_piece(problem, problem.errors(theta), common)
         if not np.isfinite(C).all():
             return np.inf
         return float(counts @ np.linalg.slogdet(C)[1] + away @ away) / 2
@@ -131,9 +131,9 @@ def identify(
     damping = 0.0
     for n in range(_ROUNDS):
         progress(n / _ROUNDS)
-        common = bench.covariance(bench.errors(theta), apart=True)
+        common = problem.covariance(problem.errors(theta), apart=True)
         best = loss(theta, common)
-        seen = bench.look(theta, rows, one_step(bench, theta))
+        seen = problem.evaluate(theta, rows, one_step(problem, theta))
         gradient, H = _quadratic(seen, rows)
         gradient = (gradient + (theta[rows] - centre) / spread**2) * spread
         # but for rounding, no eigenvalue is below 1 with the prior
@@ -157,27 +157,29 @@ def identify(
     return theta
 
 
-def _beside(bench: Bench, rows: Sequence[int]) -> list[Coefficient]:
+def _as_coefficients(problem: DiagnosisProblem, rows: Sequence[int]) -> list[Coefficient]:
     """Parameters of causes as coefficients, with the priors and bounds that they have as causes."""
-    low, high = bench.limits(rows)
+    low, high = problem.limits(rows)
     return [
-        Coefficient(i, known_within(bench.library.entries[i].parameter), a, b)
+        Coefficient(i, known_within(problem.library.entries[i].parameter), a, b)
         for i, a, b in zip(rows, low.tolist(), high.tolist(), strict=True)
     ]
 
 
-def one_step(bench: Bench, theta: Float[np.ndarray, " p"]) -> Filter:
+def one_step(problem: DiagnosisProblem, theta: Float[np.ndarray, " p"]) -> Filter:
     """The filter with the gain K = I: its innovations are one-step errors, whitened."""
-    error = bench.errors(theta)
-    C, _ = _by_piece(bench, error, bench.covariance(error, apart=True))
+    error = problem.errors(theta)
+    C, _ = _by_piece(problem, error, problem.covariance(error, apart=True))
     whiten = np.moveaxis(np.linalg.inv(np.linalg.cholesky(C)), 0, -1)
-    whiten = np.repeat(whiten[None], len(bench.data.u), axis=0)
-    log_det = np.broadcast_to(np.linalg.slogdet(C)[1] / 2, bench.data.weight.shape)
+    whiten = np.repeat(whiten[None], len(problem.data.u), axis=0)
+    log_det = np.broadcast_to(np.linalg.slogdet(C)[1] / 2, problem.data.weight.shape)
     return Filter(np.zeros_like(whiten), whiten, log_det)
 
 
 def _by_piece(
-    bench: Bench, error: Float[np.ndarray, "N 12 R"], common: Float[np.ndarray, "12 12"]
+    problem: DiagnosisProblem,
+    error: Float[np.ndarray, "N 12 R"],
+    common: Float[np.ndarray, "12 12"],
 ) -> tuple[Float[np.ndarray, "R 12 12"], Float[np.ndarray, " R"]]:
     """Covariance of each piece's one-step errors, and its number of samples with the prior's.
 
@@ -185,11 +187,11 @@ def _by_piece(
     """
     C = np.einsum("nir,njr->rij", error, error)
     C[:, :6, 6:], C[:, 6:, :6] = 0.0, 0.0
-    counts = bench.data.weight.sum(axis=0) + _COMMON
+    counts = problem.data.weight.sum(axis=0) + _COMMON
     return (C + _COMMON * common) / counts[:, None, None], counts
 
 
-def _quadratic(seen: Look, rows: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+def _quadratic(seen: Evaluation, rows: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Gradient and Gauss–Newton Hessian of ½ |z|² by the parameters."""
     columns = [seen.evidence.column(i) for i in rows]
     total = seen.evidence.total

@@ -10,11 +10,11 @@ from jaxtyping import Float
 from ....models.effects.library import kind
 from ....models.se3 import AXES
 from ..disturbance.found import SLOW, laws_of, won_by
-from ..disturbance.waves import beside_laws
+from ..disturbance.waves import correlated_noise_of
 from ..filter.noise import Filter
-from ..filter.problem import Bench, Look
+from ..filter.problem import DiagnosisProblem, Evaluation
 from ..validation.validation import Contender, scores
-from .correlated_noise import Beside
+from .correlated_noise import CorrelatedNoise
 from .hypotheses import Chance, Fit
 from .model_selection import (
     Choice,
@@ -67,9 +67,9 @@ class Found:
         threshold: what noise alone exceeds with the false-alarm rate (nats).
     """
 
-    base: Look
-    first: Look
-    current: Look
+    base: Evaluation
+    first: Evaluation
+    current: Evaluation
     accepted: list[Choice] = field(default_factory=list)
     fits: dict[Hypothesis, Fit] = field(default_factory=dict)
     left: dict[Hypothesis, Fit] = field(default_factory=dict)
@@ -89,11 +89,11 @@ class Found:
         return _OF_A_DESCRIPTION * sum(described)
 
 
-def refitted(bench: Bench, refit: str) -> list[int]:
+def refitted(problem: DiagnosisProblem, refit: str) -> list[int]:
     """Nuisance parameters: free in the fit of every cause."""
     if refit == "all":
-        return [c.row for c in coefficients(bench)]
-    entries = enumerate(bench.library.entries)
+        return [c.row for c in coefficients(problem)]
+    entries = enumerate(problem.library.entries)
     return [i for i, e in entries if e.cause in REFITS[refit] and e.where != "centre_of_buoyancy"]
 
 
@@ -110,7 +110,7 @@ class Search:
 
     def __init__(
         self,
-        bench: Bench,
+        problem: DiagnosisProblem,
         nuisance: list[int],
         alpha: float,
         most: int,
@@ -120,16 +120,16 @@ class Search:
         shortest: float = 0.0,
     ):
         """`quiet` axes are not identifiable; lags and delays below `shortest` (s) are rejected."""
-        self.bench, self.nuisance, self.alpha, self.most = bench, nuisance, alpha, most
+        self.problem, self.nuisance, self.alpha, self.most = problem, nuisance, alpha, most
         self.rng, self.progress = rng, progress
-        free = {bench.library.entries[i].cause for i in nuisance}
+        free = {problem.library.entries[i].cause for i in nuisance}
         self.names = [
             h
-            for h in bench.library.hypotheses(single=False)
+            for h in problem.library.hypotheses(single=False)
             if h[0] not in free and not _asks_for_commands(h, quiet)
         ]
         self.shortest = shortest
-        self._asked: tuple[Look, tuple[Choice | None, dict[Hypothesis, Fit]]] | None = None
+        self._asked: tuple[Evaluation, tuple[Choice | None, dict[Hypothesis, Fit]]] | None = None
 
     def run(self, found: Found, most: int | None = None) -> "Search":
         """Add causes to `found` until none passes, or `most` are found; all are refitted together.
@@ -147,7 +147,7 @@ class Search:
                 break
             choice, theta = self._refine(choice, fits, found)
             p = p_value(choice.fit, len(fits), found.chance)
-            seen = self.bench.look(theta)
+            seen = self.problem.evaluate(theta)
             doubtful = choice.fit.p_value * len(fits) >= self.alpha
             if doubtful and not self._holds(seen, choice.hypothesis, found):
                 found.dropped.add(choice.hypothesis)
@@ -177,10 +177,10 @@ class Search:
         fit a random disturbance. Where the law is a slow one (its gain summed over axes), which
         causes can imitate, they are tested with it as correlated noise.
         """
-        if self.bench.beside is not None:
-            self._judge_beside(None, found)
+        if self.problem.correlated_noise is not None:
+            self._account_for(None, found)
         choice, fits = self._chosen(found)
-        laws = laws_of(self.bench, found.current)
+        laws = laws_of(self.problem, found.current)
         if choice is None or not laws:
             return choice, fits
         lasting = max(won_by(name, laws) for name in SLOW)
@@ -191,7 +191,7 @@ class Search:
         if explains is not None:
             return explains, {**fits, explains.hypothesis: explains.fit}
         if law == lasting:
-            self._judge_beside(beside_laws(self.bench, found.current, laws), found)
+            self._account_for(correlated_noise_of(self.problem, found.current, laws), found)
         return self._chosen(found, _OF_A_LAW * law, strict=True)
 
     def _explaining(
@@ -205,25 +205,27 @@ class Search:
         names = [choice.hypothesis, *(h for h, _ in choice.rivals)]
         for h in names:
             theta, seen, _ = self._fitted(h, fits, found, None)
-            left = laws_of(self.bench, seen)
+            left = laws_of(self.problem, seen)
             if left and max(won_by(w.name, left) for w in left) < _LEFT * law:
                 exact = self._exact(fits[h], theta, seen, found)
-                named = self.bench.library, found.current.theta, exact
+                named = self.problem.library, found.current.theta, exact
                 if not (admissible(*named) and is_itself(*named)):
                     continue
                 gains = [(other, fits[other].heldout_gain) for other in names if other != h]
                 return Choice(h, exact, (), tuple(gains))
         return None
 
-    def _exact(self, fit: Fit, theta: Float[np.ndarray, " p"], seen: Look, found: Found) -> Fit:
+    def _exact(
+        self, fit: Fit, theta: Float[np.ndarray, " p"], seen: Evaluation, found: Found
+    ) -> Fit:
         """A fit with its exact values, and their gain in nats less one a parameter (AIC).
 
         Each side has its own filter: what a cause explains no longer counts as noise.
         """
         current, rows = found.current, list(fit.parameters)
-        weight = self.bench.data.weight
+        weight = self.problem.data.weight
         won = seen.likelihood(weight) - current.likelihood(weight)
-        labels, index = np.unique(self.bench.data.cluster, return_inverse=True)
+        labels, index = np.unique(self.problem.data.cluster, return_inverse=True)
         heldout = np.bincount(index, won, len(labels)) - len(rows) / len(labels)
         change = theta - current.theta
         return replace(
@@ -234,20 +236,20 @@ class Search:
             heldout=heldout,
         )
 
-    def _judge_beside(self, structure: Beside | None, found: Found) -> None:
-        self.bench = replace(self.bench, beside=structure)
-        found.current = self.bench.look(found.current.theta, again=found.current)
+    def _account_for(self, structure: CorrelatedNoise | None, found: Found) -> None:
+        self.problem = replace(self.problem, correlated_noise=structure)
+        found.current = self.problem.evaluate(found.current.theta, previous=found.current)
 
     def _chosen(
         self, found: Found, least: float = 0.0, strict: bool = False
     ) -> tuple[Choice | None, dict[Hypothesis, Fit]]:
-        bench, current, taken = self.bench, found.current, found.hypotheses
-        beside = self.nuisance + parameters_of(bench.library, taken)
+        problem, current, taken = self.problem, found.current, found.hypotheses
+        free = self.nuisance + parameters_of(problem.library, taken)
         open_names = [h for h in self.names if h not in taken and h not in found.dropped]
-        sets = [bench.library.at(*h) for h in open_names]
-        found.chance = current.evidence.chance(sets, beside, self.rng)
+        sets = [problem.library.at(*h) for h in open_names]
+        found.chance = current.evidence.chance(sets, free, self.rng)
         found.threshold = found.chance.exceeded(self.alpha)
-        fits = {h: current.evidence.fit(s, beside) for h, s in zip(open_names, sets, strict=True)}
+        fits = {h: current.evidence.fit(s, free) for h, s in zip(open_names, sets, strict=True)}
         for h in [h for h in open_names if h[0] in _TIMES]:
             times = current.theta[list(fits[h].parameters)] + fits[h].values
             if np.all(np.abs(times) < self.shortest):
@@ -256,53 +258,57 @@ class Search:
 
         def best(least: float) -> Choice | None:
             needed = max(found.threshold, found.left_undescribed, least)
-            return choose(bench.library, current.theta, fits, needed, self.alpha, gains, strict)
+            return choose(problem.library, current.theta, fits, needed, self.alpha, gains, strict)
 
         def chosen() -> Choice | None:
             found_ = best(least)
             if found_ is None or not current.noise.estimated or self._halves(found_, current):
                 return found_
-            return best(max(least, _OF_ESTIMATES * bench.data.steps))
+            return best(max(least, _OF_ESTIMATES * problem.data.steps))
 
         choice = chosen()
         if choice is not None and self._about_thrust(choice):
-            fits |= self._single_thrusters(current, beside, [*taken, *found.dropped])
+            fits |= self._single_thrusters(current, free, [*taken, *found.dropped])
             choice = chosen()
         return choice, fits
 
-    def _halves(self, choice: Choice, current: Look) -> bool:
+    def _halves(self, choice: Choice, current: Evaluation) -> bool:
         """Whether a cause makes the one-step errors much smaller."""
         theta = self._start(choice.fit, current.theta)
-        won = self.bench.loss_of(current) - self.bench.loss(theta)
-        return bool(won >= _HALVED * self.bench.data.steps)
+        won = self.problem.loss_of(current) - self.problem.loss(theta)
+        return bool(won >= _HALVED * self.problem.data.steps)
 
     def _about_thrust(self, choice: Choice) -> bool:
         """Whether the best causes so far leave it possible that a single thruster is at fault."""
         names = [choice.hypothesis[0], *(h[0] for h, _ in choice.rivals[:2])]
-        level = self.bench.data.command != "F_Bo_B"
+        level = self.problem.data.command != "F_Bo_B"
         return level and any(kind(name).family == "actuation" for name in names)
 
     def _single_thrusters(
-        self, current: Look, beside: list[int], taken: list[Hypothesis]
+        self, current: Evaluation, free: list[int], taken: list[Hypothesis]
     ) -> dict[Hypothesis, Fit]:
         """Fits of causes in one thruster each, with the filter of the other causes."""
-        library = self.bench.library
+        library = self.problem.library
         names = [h for h in library.hypotheses(single=True) if h not in taken]
-        chosen = sorted({*parameters_of(library, names), *beside})
-        seen = self.bench.look(current.theta, chosen, again=current)
-        return {h: seen.evidence.fit(library.at(*h), beside) for h in names}
+        chosen = sorted({*parameters_of(library, names), *free})
+        seen = self.problem.evaluate(current.theta, chosen, previous=current)
+        return {h: seen.evidence.fit(library.at(*h), free) for h in names}
 
-    def _holds(self, seen: Look, named: Hypothesis, found: Found) -> bool:
+    def _holds(self, seen: Evaluation, named: Hypothesis, found: Found) -> bool:
         """Whether a cause improves exact predictions of data left out of its fit.
 
         Where few runs show it, the linearised gain may not hold: responses are nonlinear.
         """
-        bench, names = self.bench, found.hypotheses
-        rows = self.nuisance + parameters_of(bench.library, names)
-        own = parameters_of(bench.library, [named])
+        problem, names = self.problem, found.hypotheses
+        rows = self.nuisance + parameters_of(problem.library, names)
+        own = parameters_of(problem.library, [named])
         before, after = (
-            scores(bench, Contender(bench.without_each(look, used)), found.first.noise.estimated)
-            for look, used in ((found.current, rows), (seen, [*rows, *own]))
+            scores(
+                problem,
+                Contender(problem.without_each(evaluation, used)),
+                found.first.noise.estimated,
+            )
+            for evaluation, used in ((found.current, rows), (seen, [*rows, *own]))
         )
         return bool(after.density.sum() > before.density.sum())
 
@@ -315,28 +321,28 @@ class Search:
 
     def _fitted(
         self, h: Hypothesis, fits: dict[Hypothesis, Fit], found: Found, kalman: Filter | None
-    ) -> tuple[Float[np.ndarray, " p"], Look, Fit]:
+    ) -> tuple[Float[np.ndarray, " p"], Evaluation, Fit]:
         """A cause fitted with exact predictions, jointly with all accepted ones; the fit returned
         has its own parameters alone, as values and not as changes.
         """
-        beside = self.nuisance + parameters_of(self.bench.library, found.hypotheses)
-        chosen = [*self.bench.library.at(*h), *beside]
+        free = self.nuisance + parameters_of(self.problem.library, found.hypotheses)
+        chosen = [*self.problem.library.at(*h), *free]
         start = self._start(fits[h], found.current.theta)
-        theta, seen, joint = self.bench.polish(start, chosen, kalman, origin=found.current)
-        return theta, seen, _of_one(self.bench.library.at(*h), theta, joint)
+        theta, seen, joint = self.problem.polish(start, chosen, kalman, origin=found.current)
+        return theta, seen, _of_one(self.problem.library.at(*h), theta, joint)
 
     def _refine(
         self, choice: Choice, fits: dict[Hypothesis, Fit], found: Found
     ) -> tuple[Choice, Float[np.ndarray, " p"]]:
         """Fit the cause and its close rivals with exact predictions, and take the best."""
-        library, bench = self.bench.library, self.bench
-        beside = self.nuisance + parameters_of(library, found.hypotheses)
+        library, problem = self.problem.library, self.problem
+        free = self.nuisance + parameters_of(library, found.hypotheses)
         top = choice.hypothesis
         theta, seen, _ = self._fitted(top, fits, found, None)
         close = [h for h, g in choice.rivals[:2] if g > _CLOSE * choice.fit.heldout_gain]
         if not close:
             return choice, theta
-        best = bench.polish(theta, [*library.at(*top), *beside], seen.kalman, 2)[1]
+        best = problem.polish(theta, [*library.at(*top), *free], seen.kalman, 2)[1]
         start_loss = best.loss
         for h in close:
             if h[0] in kind(top[0]).simpler:
@@ -360,7 +366,7 @@ class Search:
 
     def _backward(self, found: Found) -> None:
         """Drop causes that later ones have made redundant, and refit the rest."""
-        library, current = self.bench.library, found.current
+        library, current = self.problem.library, found.current
         chosen = parameters_of(library, found.hypotheses)
         kept, theta = [], current.theta.copy()
         for choice in found.accepted:
@@ -378,8 +384,8 @@ class Search:
         if len(kept) < len(found.accepted):
             found.accepted = kept
             rest = self.nuisance + parameters_of(library, found.hypotheses)
-            theta = self.bench.polish(theta, rest)[0] if rest else theta
-            found.current = self.bench.look(theta)
+            theta = self.problem.polish(theta, rest)[0] if rest else theta
+            found.current = self.problem.evaluate(theta)
 
 
 def _of_one(rows: Sequence[int], theta: Float[np.ndarray, " p"], joint: Fit) -> Fit:

@@ -25,7 +25,7 @@ from ...evaluation.metrics import BANDS, order_statistics
 from ..disturbance.laws import Law
 from ..filter.innovations import Arrays, as_arrays, at_first, difference, predict, settle, substeps
 from ..filter.noise import estimate, score_of
-from ..filter.problem import Bench
+from ..filter.problem import DiagnosisProblem
 from ..filter.transition import Transition
 from ..findings import result
 from .blackbox import BlackBox, arguments
@@ -44,12 +44,12 @@ class Contender:
     """A model to judge: θ of each piece (p, R), fitted without it; perhaps a learned correction."""
 
     theta: Float[np.ndarray, "p R"]
-    box: BlackBox | None = None
-    won: Float[np.ndarray, " R"] | float = 0.0
+    black_box: BlackBox | None = None
+    law_gain: Float[np.ndarray, " R"] | float = 0.0
     """Held-out nats by piece that disturbance laws win in addition."""
-    stirring: tuple[Effect, ...] = ()
+    random_effects: tuple[Effect, ...] = ()
     """Effects of these laws; simulations start in their stationary state."""
-    white: Float[np.ndarray, "6"] = field(default_factory=lambda: np.ones(6))
+    white_share: Float[np.ndarray, "6"] = field(default_factory=lambda: np.ones(6))
     """Share of the estimated diffusion that is not due to them (`white_part`)."""
 
 
@@ -99,16 +99,16 @@ class Scores(NamedTuple):
     diffusion: Float[np.ndarray, "6 R"]
 
 
-def scores(bench: Bench, contender: Contender, estimated: bool) -> Scores:
+def scores(problem: DiagnosisProblem, contender: Contender, estimated: bool) -> Scores:
     """One-step log scores of a model on each piece, fitted without it."""
-    data, theta = bench.data, contender.theta
-    p = predict(bench.model, bench.library, theta, data)
+    data, theta = problem.data, contender.theta
+    p = predict(problem.model, problem.library, theta, data)
     error, jacobian = np.asarray(p.error), np.asarray(p.jacobian)
-    if contender.box is not None:
+    if contender.black_box is not None:
         h = data.step[:, None]
-        a = np.asarray(contender.box.acceleration(*arguments(data))).swapaxes(0, 1) * h
-        error = error - np.concatenate([a * h / 2, a], axis=1) * data.told[:, None]
-    mass = bench.mass(theta.mean(axis=1))
+        a = np.asarray(contender.black_box.acceleration(*arguments(data))).swapaxes(0, 1) * h
+        error = error - np.concatenate([a * h / 2, a], axis=1) * data.measured[:, None]
+    mass = problem.mass(theta.mean(axis=1))
     density = np.zeros(len(data.fold))
     record, diffusion = np.zeros((12, len(density))), np.zeros((6, len(density)))
     for label in np.unique(data.fold):
@@ -123,7 +123,7 @@ def scores(bench: Bench, contender: Contender, estimated: bool) -> Scores:
 
 
 def judge(
-    bench: Bench,
+    problem: DiagnosisProblem,
     contender: Contender,
     horizon: float,
     seed: int,
@@ -136,22 +136,24 @@ def judge(
     with the same ones share a compiled program. `estimated` (the records are states of a filter) is
     the same for all folds and contenders.
     """
-    data, theta = bench.data, contender.theta
-    density, record, diffusion = scores(bench, contender, estimated)
+    data, theta = problem.data, contender.theta
+    density, record, diffusion = scores(problem, contender, estimated)
     kept = _spread(data.fold, _PIECES)
-    levels = record[:, kept], diffusion[:, kept] * contender.white[:, None]
-    kinds = {bench.library.entries[i][:2] for i in in_use}
-    kinds |= {bench.library.entries[i][:2] for i in np.flatnonzero(np.any(theta != 0, axis=1))}
-    return _simulated(bench, contender, levels, kept, horizon, seed, density + contender.won, kinds)
+    levels = record[:, kept], diffusion[:, kept] * contender.white_share[:, None]
+    kinds = {problem.library.entries[i][:2] for i in in_use}
+    kinds |= {problem.library.entries[i][:2] for i in np.flatnonzero(np.any(theta != 0, axis=1))}
+    return _simulate(
+        problem, contender, levels, kept, horizon, seed, density + contender.law_gain, kinds
+    )
 
 
-def white_part(laws: Sequence[Law], bench: Bench) -> Float[np.ndarray, "6"]:
+def white_part(laws: Sequence[Law], problem: DiagnosisProblem) -> Float[np.ndarray, "6"]:
     """Share of each axis' estimated diffusion that is not due to these laws.
 
     Impacts occur within single steps and count as diffusion; one that grows with the speed was
     estimated as the mean over all speeds. Slow disturbances are no part of the estimate.
     """
-    share, data = np.ones(6), bench.data
+    share, data = np.ones(6), problem.data
     speed2 = (data.V[:-1, :3] ** 2).sum(axis=1)
     for law in laws:
         p = law.parameters
@@ -175,8 +177,8 @@ def _spread(fold: np.ndarray, most: int) -> np.ndarray:
     return np.array(sorted(chosen))
 
 
-def _simulated(
-    bench: Bench,
+def _simulate(
+    problem: DiagnosisProblem,
     contender: Contender,
     levels: tuple[np.ndarray, np.ndarray],
     kept: np.ndarray,
@@ -185,21 +187,21 @@ def _simulated(
     score: np.ndarray,
     kinds: set[tuple[str, str]],
 ) -> Judged:
-    data = bench.data
+    data = problem.data
     X, V, u, voltage, _, past, _ = as_arrays(data)
     step, past_step = jnp.asarray(data.own_steps(kept)), jnp.asarray(data.past_steps(kept))
     now = X[..., kept], V[..., kept], u[..., kept], voltage[..., kept], step
     arrays = *now, past[..., kept], past_step
     theta = contender.theta[:, kept]
     every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))
-    effects = bench.library.filled(theta[:, None])
+    effects = problem.library.filled(theta[:, None])
     used = tuple(e for e in effects if any((e.name, where) in kinds for where in e.places))
-    box = contender.box
+    box = contender.black_box
     if box is not None:
         box = eqx.tree_at(lambda b: b.weights, box, box.weights[..., kept])
     e = np.asarray(
         _errors(
-            bench.model, used, contender.stirring, arrays, box, jnp.asarray(levels[1]),
+            problem.model, used, contender.random_effects, arrays, box, jnp.asarray(levels[1]),
             jnp.asarray(levels[0]), jax.random.key(seed), every,
             max(1, substeps(data.longest) // _COARSER),
         ),
@@ -245,7 +247,7 @@ def horizons(longest: float, every: int, dt: float) -> list[int]:
 def _errors(
     model: Extended,
     effects: tuple[Effect, ...],
-    stirring: tuple[Effect, ...],
+    random_effects: tuple[Effect, ...],
     arrays: Arrays,
     box: BlackBox | None,
     diffusion: Float[Array, "6 R"],
@@ -257,7 +259,7 @@ def _errors(
     """Recorded less simulated: lane 0 without noise, the others with it and that of the records."""
     X, V, u, voltage, step, past, past_step = arrays
     model = model.with_effects(effects)
-    random = model.with_effects(stirring)
+    random = model.with_effects(random_effects)
     inertia = model.inertia()
     R, S = V.shape[2], 1 + SAMPLES
     more = random.noise_size - 6
@@ -267,10 +269,10 @@ def _errors(
 
     move = jax.vmap(random.step_random_state, -1, -1)  # each column has its own step
 
-    def kicked(V: Array, w: Array) -> Array:
+    def with_noise(V: Array, w: Array) -> Array:
         M = inertia.inverse
         M = M.reshape(M.shape + (1,) * (4 - M.ndim))
-        own = random.scaled_diffusion(V, b) if stirring else b
+        own = random.scaled_diffusion(V, b) if random_effects else b
         return V + jnp.sum(M * (own * w)[None], axis=1)
 
     def read(X: Array, V: Array, w: Array) -> tuple[Array, Array]:
@@ -292,17 +294,17 @@ def _errors(
             wide = jnp.broadcast_to(command[:, None], (len(command), S, R))
             late = jnp.broadcast_to(before[:, None], wide.shape)
             push = times(inertia.matrix, box.acceleration(x, v, wide, late))
-        if stirring:
+        if random_effects:
             w = draw[24:] * noisy  # of which six are left for b dW
             drawn, _ = random.step_random_state(pushes, x, v, w[: 6 + more], FOR_EVER)
             pushes = tuple(jnp.where(starts, a, b) for a, b in zip(drawn, pushes, strict=True))
-            pushes, stirred = move(pushes, x, v, w[more:], jnp.broadcast_to(h, (R,)))
-            push = stirred if push is None else push + stirred
+            pushes, random_wrench = move(pushes, x, v, w[more:], jnp.broadcast_to(h, (R,)))
+            push = random_wrench if push is None else push + random_wrench
         memory, x, Vp, a = advance(
             model, inertia, memory, x, v, command[:, None], dt, coarse, volts[None, None], push
         )
         recent = recent.after(Recent.over(v, Vp, a, dt))
-        v = kicked(Vp, jnp.sqrt(dt) * draw[12:18])
+        v = with_noise(Vp, jnp.sqrt(dt) * draw[12:18])
         seen = model.observe(x, v, recent)
         e = difference(*read(*seen, draw[18:30]), X1[:, None], V1[:, None])
         return (memory, pushes, x, v, recent), e.astype(jnp.float32)
@@ -323,11 +325,15 @@ def _errors(
 # ----------------------------------------------------------------------------------- summary
 
 
-def told(
-    judged: Judged, base: Judged, bench: Bench, horizon: float, rng: np.random.Generator
+def model_gain(
+    judged: Judged,
+    base: Judged,
+    problem: DiagnosisProblem,
+    horizon: float,
+    rng: np.random.Generator,
 ) -> result.ModelGain:
     """Scores with 95 % intervals, by bootstrap over folds."""
-    data = bench.data
+    data = problem.data
     labels = np.unique(data.fold)
     drawn = rng.integers(len(labels), size=(_DRAWS, len(labels)))
     every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))

@@ -8,7 +8,7 @@ ArduPilot: world N is north, east, down; body is forward, right, down; quaternio
 body to world; yaw is clockwise from north. Here: W is east, north, up; B is forward, left, up.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -244,6 +244,48 @@ def manual_control_demand(
             -gain * r / 1000,
         ]
     )
+
+
+def rc_override_fields(
+    demand: Float[np.ndarray, "6"],
+    low: Sequence[float] = (1100,) * 6,
+    trim: Sequence[float] = (NEUTRAL_US,) * 6,
+    high: Sequence[float] = (1900,) * 6,
+) -> dict[str, int]:
+    """RC_CHANNELS_OVERRIDE fields of demands in [−1, 1] about B (as `manual_control_fields`).
+
+    Channels 1 to 6 are pitch (nose up), roll, throttle, yaw (clockwise), forward, lateral (right);
+    `low`, `trim`, `high` are their RCn_MIN, RCn_TRIM, RCn_MAX (µs). Other channels are left as they
+    are.
+
+    Raises:
+        ValueError: a demand is not finite.
+    """
+    if not np.isfinite(demand).all():
+        raise ValueError(f"overrides: demands must be finite, got {demand}")
+    surge, sway, heave, roll, pitch, yaw = np.clip(demand, -1, 1)
+    values = (-pitch, roll, heave, -yaw, surge, -sway)
+    pulses = [
+        middle + value * (top - middle if value > 0 else middle - bottom)
+        for value, bottom, middle, top in zip(values, low, trim, high, strict=True)
+    ]
+    return _channels(pulses)
+
+
+def rc_override_passthrough(pwm: Float[np.ndarray, " n"]) -> dict[str, int]:
+    """RC_CHANNELS_OVERRIDE fields that carry outputs 1 to n, at most 8, each within 1100–1900 µs.
+
+    Raises:
+        ValueError: a pulse width is not finite.
+    """
+    if not np.isfinite(pwm).all():
+        raise ValueError(f"pass-through: pulse widths must be finite, got {pwm}")
+    return _channels(np.clip(pwm, 1100, 1900))
+
+
+def _channels(pulses: Iterable[float]) -> dict[str, int]:
+    known = dict(enumerate((round(float(p)) for p in pulses), 1))
+    return {f"chan{k}_raw": known.get(k, UINT16_MAX) for k in range(1, 9)}
 
 
 def _stack(*fields: Field) -> np.ndarray:

@@ -6,13 +6,14 @@ order of imports matters. `mavutil` is not used.
 """
 
 from collections.abc import Iterable
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 __all__ = ["Message", "Parser", "mavlink"]
 
-Message = mavlink.MAVLink_message
-"""A message; its fields are attributes."""
+Message = Any
+"""A pymavlink message. Its fields are attributes, which its class does not declare."""
 
 _LAST = 255  # sequence numbers count from 0 to this
 _LATE = 32  # places by which a packet can be late

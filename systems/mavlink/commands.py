@@ -1,0 +1,157 @@
+"""Commands that wait for the vehicle's answer: mode, arming, message rates.
+
+They take up to seconds, so they belong before and after a dive, not in its loop.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+
+from ...models.config.errors import UserError
+from .codec import ARMED_FLAG, MODES
+from .dialect import Message, mavlink
+from .link import Link
+
+RESULTS = {number: entry.name for number, entry in mavlink.enums["MAV_RESULT"].items()}
+_ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
+_FORCED_ARM, _FORCED_DISARM = 2989.0, 21196.0  # ArduPilot's magic numbers in parameter 2
+_SPOKEN = 0.3  # s to wait for the text that gives the reason of a refusal
+_STATE = 3.0  # s in which a heartbeat shows what was accepted
+_WARNING = mavlink.MAV_SEVERITY_WARNING
+
+
+class VehicleRefused(UserError):
+    """The vehicle did not do what it was asked; the sentence has its reason."""
+
+
+def command(
+    link: Link, number: int, *parameters: float, timeout: float = 1.0, attempts: int = 3
+) -> int | None:
+    """Send COMMAND_LONG until it is acknowledged: its MAV_RESULT, None without an answer.
+
+    Raises:
+        UserError: there is no vehicle.
+    """
+    vehicle = link.find_vehicle()
+    values = (*parameters, *(0.0,) * (7 - len(parameters)))
+
+    def answers(message: Message) -> bool:
+        return message.command == number and message.result != mavlink.MAV_RESULT_IN_PROGRESS
+
+    for attempt in range(attempts):
+        started = time.monotonic()
+        link.send(mavlink.MAVLink_command_long_message(*vehicle, number, attempt, *values))
+        found = link.wait_for("COMMAND_ACK", timeout, answers, started)
+        if found is not None:
+            return int(found.message.result)
+    return None
+
+
+def mode_of(heartbeat: Message) -> int:
+    """The mode's number (`codec.MODES`)."""
+    return int(heartbeat.custom_mode)
+
+
+def is_armed(heartbeat: Message) -> bool:
+    """Whether the motors are armed."""
+    return bool(heartbeat.base_mode & ARMED_FLAG)
+
+
+def set_mode(link: Link, name: str) -> None:
+    """Change the flight mode and see it in a heartbeat.
+
+    Raises:
+        VehicleRefused: it refused, did not answer, or stayed in another mode.
+        UserError: there is no such mode, or no vehicle.
+    """
+    number = next((n for n, known in MODES.items() if known == name), None)
+    if number is None:
+        raise UserError(f"mode `{name}` is unknown; take one of {', '.join(MODES.values())}")
+    enabled = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
+    _until_seen(
+        link,
+        f"mode {name}",
+        lambda: command(link, mavlink.MAV_CMD_DO_SET_MODE, enabled, float(number)),
+        lambda heartbeat: mode_of(heartbeat) == number,
+    )
+
+
+def arm(link: Link) -> None:
+    """Arm; the vehicle makes its own checks.
+
+    Raises:
+        VehicleRefused: it refused, did not answer, or did not get armed.
+    """
+    number = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
+    _until_seen(link, "arming", lambda: command(link, number, 1.0), is_armed)
+
+
+def disarm(link: Link, force: bool = True) -> None:
+    """Disarm; by `force` also where the autopilot would wait.
+
+    Raises:
+        VehicleRefused: it refused, did not answer, or stayed armed.
+    """
+    number, magic = mavlink.MAV_CMD_COMPONENT_ARM_DISARM, _FORCED_DISARM if force else 0.0
+    _until_seen(
+        link,
+        "disarming",
+        lambda: command(link, number, 0.0, magic),
+        lambda heartbeat: not is_armed(heartbeat),
+    )
+
+
+def request_rates(link: Link, rates: Mapping[str, float]) -> dict[str, str]:
+    """Ask for messages at rates (Hz); what was refused, with the vehicle's answer.
+
+    Whether a rate is kept shows in `link.statistics().rates`: a serial line may be too slow.
+    """
+    refused = {}
+    for name, rate in rates.items():
+        number = getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
+        interval = 1e6 / rate if rate > 0 else -1.0
+        result = command(link, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(number), interval)
+        if result != _ACCEPTED:
+            refused[name] = _answer(result)
+    return refused
+
+
+def _until_seen(
+    link: Link, what: str, act: Callable[[], int | None], shows: Callable[[Message], bool]
+) -> None:
+    """Act, and wait for a heartbeat that shows the effect: an acknowledgement is not the state."""
+    started = time.monotonic()
+    result = act()
+    if result != _ACCEPTED:
+        raise VehicleRefused(f"{what}: {_answer(result)}{_reason(link, started, _SPOKEN)}")
+    vehicle = link.find_vehicle()
+    asked = mavlink.MAVLink_command_long_message(
+        *vehicle,
+        mavlink.MAV_CMD_REQUEST_MESSAGE,
+        0,
+        float(mavlink.MAVLINK_MSG_ID_HEARTBEAT),
+        *(0.0,) * 6,
+    )
+    link.send(asked)  # instead of waiting for the next second's
+    if link.wait_for("HEARTBEAT", _STATE, shows, started) is None:
+        raise VehicleRefused(
+            f"{what}: accepted, and not seen in {_STATE:g} s of heartbeats"
+            f"{_reason(link, started, 0.0)}"
+        )
+
+
+def _answer(result: int | None) -> str:
+    if result is None:
+        return (
+            "the vehicle does not answer; check the link, and that our system id is its SYSID_MYGCS"
+        )
+    return f"the vehicle refuses ({RESULTS.get(result, str(result))})"
+
+
+def _reason(link: Link, since: float, wait: float) -> str:
+    """The warnings that the vehicle has spoken since, as the end of a sentence."""
+    end = time.monotonic() + wait
+    while True:
+        said = [text for _, severity, text in link.texts(since) if severity <= _WARNING]
+        if said or time.monotonic() >= end:
+            return f": {'; '.join(dict.fromkeys(said))}" if said else ""
+        time.sleep(0.02)

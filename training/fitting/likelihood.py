@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from ...models.spinn import Spinn
 from ..config import DriftConfig
 from ..data.windows import Windows
+from ..least_squares import Damping, LocalModel, marquardt, minimise
 from .constants import constants, without_networks
 from .one_step_errors import Steps, correlation, innovations, likely_diffusion, whitened, whitening
 
@@ -28,9 +29,9 @@ Model = TypeVar("Model", bound=Spinn)
 
 _FEW = 4000  # steps of the first passes, enough for approximate constants
 _CHUNK = 4096  # steps whose derivatives fit into a processor's cache
-_TRIES = 8
 _GAIN = 0.1
 """Least gain in log-likelihood of an iteration; one standard error of a parameter is 0.5."""
+_DAMPING = Damping(after_failure=0.0, least=0.0, factor=5.0)
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,12 @@ class _Fit(eqx.Module):
             g = g + self.precision * (values - self.start)
             return H + self.precision * np.eye(len(g)), g
 
-        values, information = _descend(cost, gram, values, self.iterations)
+        def local(values: Float[np.ndarray, " p"]) -> LocalModel:
+            H, g = gram(values)
+            return LocalModel(cost(values), cost, lambda damping: values + marquardt(H, g, damping))
+
+        values = minimise(values, local, self.iterations, _GAIN, _DAMPING)
+        information, _ = gram(values)
         b = likely_diffusion(self.model(values), steps, self.substeps, b)
         errors = self.whitened(values, steps, self.whitening(values, steps, b))
         if not (np.isfinite(values).all() and np.isfinite(b).all()):
@@ -186,32 +192,3 @@ def _gram(
     # the padding of the last chunk has zero weight
     H, g = jax.lax.map(part, (jax.tree.map(chunks, steps), chunks(whiten, "constant")))
     return jnp.sum(H, axis=0), jnp.sum(g, axis=0)
-
-
-def _descend(
-    cost: Callable[[np.ndarray], float],
-    gram: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
-    values: Float[np.ndarray, " p"],
-    iterations: int,
-) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
-    """Minimise the cost from `values` by Levenberg–Marquardt; the Gauss–Newton matrix there.
-
-    Reference: Nocedal and Wright 2006, section 10.3.
-    """
-    now, damping = cost(values), 1e-3
-    H, g = gram(values)
-    for _ in range(iterations):
-        gain = 0.0
-        for _ in range(_TRIES):
-            move = -np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
-            then = cost(values + move)
-            if then < now:  # false for NaN too, if the motion diverges
-                values, gain, now = values + move, now - then, then
-                break
-            damping *= 5
-        if gain > 0:
-            H, g = gram(values)
-        if gain < _GAIN:
-            break
-        damping /= 5
-    return values, H

@@ -314,6 +314,9 @@ def test_extra_columns_can_be_ignored(tmp_path):
         read_csv(write(tmp_path, columns, header))
     meta = "frames: ENU/FLU\nignore: [lights]\n"
     assert read_csv(write(tmp_path, columns, header, meta)).commands == ("F_Bo_B",)
+    quoted = header.replace("lights", '"lights, all"')
+    meta = "frames: ENU/FLU\nignore: ['lights, all']\n"
+    assert read_csv(write(tmp_path, columns, quoted, meta)).commands == ("F_Bo_B",)
 
 
 def test_a_real_tank_run_with_uneven_steps_passes(tmp_path):

@@ -1,6 +1,7 @@
 """A table of numbers from a CSV file, with errors that name the line and the column."""
 
 import codecs
+import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,32 +44,33 @@ def read_table(path: Path) -> Table:
     Raises:
         UserError: naming file, line, column and remedy.
     """
-    text = _text(path)
-    rows = [
+    numbered = [
         (number, line)
-        for number, line in enumerate(text.splitlines(), 1)
+        for number, line in enumerate(_text(path).splitlines(), 1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
-    if not rows:
+    if not numbered:
         raise UserError(f"{path}: the file is empty; the first line must name the columns")
-    header = rows[0][1]
+    (first, header), *rest = numbered
     separator = next((s for s in ("\t", ";") if s in header), ",")
-    names = tuple(name.strip().strip('"') for name in header.split(separator))
-    _check_header(path, rows[0][0], names, separator)
-    if len(rows) == 1:
+    names = tuple(_cells(f"{path}:{first}", header, separator))
+    _check_names(f"{path}:{first}", names, separator)
+    if not rest:
         raise UserError(f"{path}: there is a header but no data line")
-    cells = []
-    for number, line in rows[1:]:
-        row = line.split(separator)
-        if len(row) != len(names):
-            last = number == rows[-1][0]
+    rows = []
+    for number, line in rest:
+        at = f"{path}:{number}"
+        cells = _cells(at, line, separator)
+        if len(cells) != len(names):
+            last = number == rest[-1][0]
             remedy = "the file seems cut off there; remove this line" if last else "mend this line"
-            raise UserError(
-                f"{path}:{number}: {len(row)} fields where {len(names)} belong; {remedy}"
-            )
-        cells.append(row)
-    lines = np.array([number for number, _ in rows[1:]])
-    return Table(path, names, _numbers(path, names, cells, lines, separator), lines)
+            raise UserError(f"{at}: {len(cells)} fields where {len(names)} belong; {remedy}")
+        values = [_number(cell, separator) for cell in cells]
+        if None in values:
+            column = values.index(None)
+            raise UserError(f"{at}: column `{names[column]}`: {cells[column]!r} is no number")
+        rows.append(values)
+    return Table(path, names, np.array(rows, float), np.array([number for number, _ in rest]))
 
 
 def _text(path: Path) -> str:
@@ -87,52 +89,25 @@ def _text(path: Path) -> str:
         ) from error
 
 
-def _check_header(path: Path, line: int, names: tuple[str, ...], separator: str) -> None:
-    if all(_is_number(name, separator) for name in names):
-        raise UserError(
-            f"{path}:{line}: no header; the first line must name the columns: t,x,y,z,…"
-        )
+def _cells(at: str, line: str, separator: str) -> list[str]:
+    """Cells of one line; by itself, so that a quote left open ends with it."""
+    try:
+        return [c.strip().strip('"') for c in next(csv.reader([line], delimiter=separator))]
+    except csv.Error as error:
+        raise UserError(f"{at}: {error}; mend this line") from error
+
+
+def _check_names(at: str, names: tuple[str, ...], separator: str) -> None:
+    if all(name and _number(name, separator) is not None for name in names):
+        raise UserError(f"{at}: no header; the first line must name the columns: t,x,y,z,…")
     twice = {name for name in names if names.count(name) > 1}
     if twice:
-        raise UserError(f"{path}:{line}: column `{sorted(twice)[0]}` appears twice; rename one")
+        raise UserError(f"{at}: column `{sorted(twice)[0]}` appears twice; rename one")
 
 
-def _is_number(cell: str, separator: str) -> bool:
+def _number(cell: str, separator: str) -> float | None:
+    """Value of a cell, NaN of an empty one; None if it is no number."""
     try:
-        float(cell.replace(",", ".") if separator != "," else cell)
+        return float(cell.replace(",", ".") if separator != "," else cell) if cell else np.nan
     except ValueError:
-        return False
-    return True
-
-
-def _numbers(
-    path: Path,
-    names: tuple[str, ...],
-    cells: list[list[str]],
-    lines: np.ndarray,
-    separator: str,
-) -> np.ndarray:
-    def convert(cell: str) -> float:
-        cell = cell.strip().strip('"')
-        if separator != ",":
-            cell = cell.replace(",", ".")
-        return float(cell) if cell else np.nan
-
-    values = np.empty((len(cells), len(names)))
-    for i, row in enumerate(cells):
-        try:
-            values[i] = [convert(cell) for cell in row]
-        except ValueError:
-            column = next(c for c, cell in enumerate(row) if not _parses(convert, cell))
-            raise UserError(
-                f"{path}:{lines[i]}: column `{names[column]}`: {row[column].strip()!r} is no number"
-            ) from None
-    return values
-
-
-def _parses(convert, cell: str) -> bool:
-    try:
-        convert(cell)
-    except ValueError:
-        return False
-    return True
+        return None

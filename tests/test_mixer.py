@@ -8,6 +8,10 @@ import pytest
 
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.sims.vehicle.autopilot.autopilot import Autopilot
+from spinndrift.sims.vehicle.autopilot.navigation import Motion
+from spinndrift.sims.vehicle.autopilot.parameters import Parameters
+from spinndrift.sims.vehicle.autopilot.pilot import Sticks
 from spinndrift.systems.mavlink.codec import (
     manual_control_demand,
     manual_control_fields,
@@ -126,3 +130,34 @@ def test_passed_through_pulses_are_clamped_and_finite():
     ]
     with pytest.raises(ValueError, match="finite"):
         rc_override_passthrough(np.array([np.nan] * 8))
+
+
+def test_the_simulated_autopilot_puts_out_what_was_foreseen(heavy):
+    # `sims.vehicle.autopilot` was written from measurements of ArduSub, apart from the inverse
+    thrusters, _, solve = heavy
+    rng, full = np.random.default_rng(2), reach(thrusters)
+    autopilot, t = Autopilot(Parameters()), 0.0
+
+    def run(seconds: float, sticks: Sticks | None = None, channels: list[int] | None = None):
+        nonlocal t
+        us: list[int] = []
+        for _ in range(round(seconds / 0.02)):
+            if sticks is not None:
+                autopilot.manual_control(255, 1, sticks)
+            if channels is not None:
+                autopilot.override(255, channels)
+            t += 0.02
+            us = autopilot.step(t, Motion())
+        return us[:8]
+
+    neutral = Sticks(**manual_control_fields())
+    run(3.0, neutral)
+    assert autopilot.arm(force=True)
+    run(2.0, neutral)
+    for _ in range(20):
+        found = solve(jnp.asarray(rng.normal(size=6) * full * 0.05), 16.0, autopilot.pilot.gain)
+        demand, gain = np.asarray(found.demand), autopilot.pilot.gain
+        us = run(0.1, Sticks(**manual_control_fields(*demand, gain=gain)))
+        np.testing.assert_allclose(us, found.pwm, atol=3.0)  # whole µs on three axes
+        us = run(0.1, channels=list(rc_override_fields(demand).values()))
+        np.testing.assert_allclose(us, found.pwm, atol=3.0)

@@ -83,9 +83,11 @@ class AxisInverse(eqx.Module):
     factors: Float[Array, "n 6"]
     least_squares: Float[Array, "6 n"]
     scale: Float[Array, "6"]
+    coupling: float = eqx.field(static=True)
+    frame: int = eqx.field(static=True)
 
-    def __init__(self, thrusters: Thrusters, frame: int):
-        """For a vehicle's thrusters and FRAME_CONFIG.
+    def __init__(self, thrusters: Thrusters, frame: int, coupling: float = 1.0):
+        """For a vehicle's thrusters, FRAME_CONFIG and MOT_FV_CPLNG_K.
 
         Raises:
             UserError: the frame is not known, or has another number of thrusters.
@@ -98,7 +100,7 @@ class AxisInverse(eqx.Module):
                 f"vehicle {count}; name the vehicle that is connected (station: vehicle)"
             )
         B = np.asarray(thrusters.allocation, float)
-        self.thrusters = thrusters
+        self.thrusters, self.frame, self.coupling = thrusters, frame, coupling
         self.factors = jnp.asarray(A)
         self.least_squares = jnp.asarray(np.linalg.pinv(A))
         reach = np.abs(B).sum(axis=1)
@@ -106,16 +108,21 @@ class AxisInverse(eqx.Module):
         self.scale = jnp.asarray(np.where(actuated, 1 / np.maximum(reach, 1e-9), 0.0))
 
     def outputs(self, demand: Float[Array, "6"]) -> Float[Array, " n"]:
-        """U of the autopilot's mixer: verticals and horizontals each within [−1, 1].
+        """Outputs u of the autopilot's mixer, in [−1, 1].
 
-        Each of the two groups is divided by its largest output where that exceeds 1; with six
-        thrusters the autopilot clips instead, which is the same up to a full demand on one axis.
+        With eight thrusters, verticals and horizontals are each divided by their largest output
+        where that exceeds 1. With six, each is clipped, and the rear horizontals lose forward
+        thrust while the verticals work (`coupling`).
         """
         u = self.factors @ demand
+        if self.frame == 1:
+            surge, most = demand[0], jnp.maximum(1 - self.coupling * jnp.abs(demand[2]), 0)
+            cut = jnp.clip(surge, -most, most) - surge
+            rear = jnp.sign(self.factors[:, 0]) * jnp.sign(surge) > 0
+            return jnp.clip(u + jnp.where(rear, self.factors[:, 0] * cut, 0), -1, 1)
         for group in self.thrusters.groups:
-            index = np.array(group)
-            largest = jnp.maximum(jnp.max(jnp.abs(u[index])), 1)
-            u = u.at[index].divide(largest)
+            mine = np.isin(np.arange(len(u)), group)
+            u = u / jnp.where(mine, jnp.maximum(jnp.max(jnp.abs(jnp.where(mine, u, 0))), 1), 1)
         return u
 
     def wrench(self, u: Float[Array, " n"], voltage: Array) -> Float[Array, "6"]:
@@ -138,7 +145,7 @@ class AxisInverse(eqx.Module):
 
         def step(d: Array, blend: Array) -> tuple[Array, None]:
             def residual(d: Array) -> Array:
-                u = jnp.clip(self.factors @ d, -1, 1)
+                u = self.outputs(d)
                 linear = self.thrusters.wrench(full * u)
                 return self.scale * ((1 - blend) * self.wrench(u, volts) + blend * linear - F)
 

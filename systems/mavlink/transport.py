@@ -11,7 +11,7 @@ import socket
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from ...models.config.errors import UserError
 
@@ -83,6 +83,7 @@ class Lost(OSError):
     """The other side closed the connection, or the device is gone."""
 
 
+@runtime_checkable
 class Transport(Protocol):
     """A stream of bytes in both directions."""
 

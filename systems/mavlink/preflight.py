@@ -1,0 +1,209 @@
+"""The checks before arming: link, sensors, parameters, frame, failsafes, battery.
+
+Pure functions of what the vehicle has told. Each check gives a finding with its remedy; arming
+needs all of them passed.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from .codec import MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS
+from .dialect import mavlink
+from .link import GROUND_STATION, Statistics
+from .mixer import FRAMES
+
+FAILSAFES: Mapping[str, float] = {
+    "FS_PILOT_INPUT": 2.0,  # disarm when commands stop: the only one that stops the thrusters
+    "FS_PILOT_TIMEOUT": 1.0,
+    "FS_GCS_ENABLE": 2.0,  # disarm when the ground station is silent
+    "FS_LEAK_ENABLE": 1.0,
+    "RC_OVERRIDE_TIME": 3.0,
+}
+"""Parameters that make the autopilot stop the thrusters by itself, with their values for a dive.
+
+Measured on ArduSub 4.5.6: with FS_PILOT_INPUT 0 the last command is held for ever.
+"""
+
+_MOTOR_1 = MOTOR_FUNCTIONS[0]
+_PULSES = {"MIN": 1100.0, "TRIM": 1500.0, "MAX": 1900.0}
+_LOSS, _DAMAGED = 0.05, 0.01  # shares of packets that may be lost, and damaged
+_SENSORS_HEALTHY = mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+_ATTITUDE_GOOD = mavlink.ESTIMATOR_ATTITUDE
+
+
+@dataclass(frozen=True)
+class Requirements:
+    """What a dive needs of the vehicle.
+
+    Attributes:
+        thrusters: their number in the scenario's vehicle.
+        passthrough: whether thrusters are commanded one by one.
+        rates: least rate (Hz) of the messages that the estimator and the guards read.
+        system: our system id.
+        min_voltage: least battery voltage (V); 0 does not check it.
+    """
+
+    thrusters: int
+    passthrough: bool = False
+    rates: Mapping[str, float] = field(default_factory=dict)
+    system: int = GROUND_STATION
+    min_voltage: float = 13.2
+
+
+class Facts(NamedTuple):
+    """What the vehicle has told."""
+
+    statistics: Statistics
+    parameters: Mapping[str, float]
+    vehicle_type: int
+    """MAV_TYPE of its heartbeat."""
+    autopilot: int
+    """MAV_AUTOPILOT of its heartbeat."""
+    armed: bool
+    mode: str
+    voltage: float
+    """Battery (V), NaN if unknown."""
+    health: int | None
+    """onboard_control_sensors_health of SYS_STATUS, None if it did not come."""
+    estimator: int | None
+    """Flags of EKF_STATUS_REPORT, None if it did not come."""
+    leak: bool
+    rivals: int
+    """Other ground stations with our system id."""
+    given_back: bool
+    """Whether no parameters of a former run wait to be restored."""
+
+
+class Finding(NamedTuple):
+    """The result of a check."""
+
+    name: str
+    passed: bool
+    words: str
+
+
+def preflight(needs: Requirements, facts: Facts) -> list[Finding]:
+    """All checks, in the order in which a person would go through them."""
+    return [Finding(*found) for check in _CHECKS for found in check(needs, facts)]
+
+
+Found = Iterator[tuple[str, bool, str]]
+
+
+def _identity(needs: Requirements, facts: Facts) -> Found:
+    del needs
+    ardupilot = facts.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+    submarine = facts.vehicle_type == mavlink.MAV_TYPE_SUBMARINE
+    kind = mavlink.enums["MAV_TYPE"].get(facts.vehicle_type)
+    name = kind.name if kind else facts.vehicle_type
+    yield (
+        "vehicle",
+        ardupilot and submarine,
+        "ArduSub" if ardupilot and submarine else f"is no ArduSub but {name}; check the connection",
+    )
+
+
+def _link(needs: Requirements, facts: Facts) -> Found:
+    del needs
+    s = facts.statistics
+    total = max(s.received + s.lost, 1)
+    lost, damaged = s.lost / total, s.damaged / total
+    yield (
+        "link",
+        lost <= _LOSS and damaged <= _DAMAGED and s.silence < 1.0,
+        f"{100 * lost:.1f} % of packets lost, {100 * damaged:.1f} % damaged, silent for "
+        f"{s.silence:.1f} s",
+    )
+    yield (
+        "ground stations",
+        facts.rivals == 0,
+        f"{facts.rivals} others use our system id"
+        + ("; disconnect them, or give them another id" if facts.rivals else ""),
+    )
+
+
+def _rates(needs: Requirements, facts: Facts) -> Found:
+    for name, least in needs.rates.items():
+        rate = facts.statistics.rates.get(name, 0.0)
+        # a rate counted over two seconds is off by one message
+        yield name, rate >= 0.9 * least - 0.5, f"{rate:.1f} Hz ({least:g} Hz needed)"
+
+
+def _frame(needs: Requirements, facts: Facts) -> Found:
+    number = int(facts.parameters.get("FRAME_CONFIG", -1))
+    count = {1: 6, 2: 8}.get(number)
+    fits = count == needs.thrusters
+    words = f"FRAME_CONFIG {number} ({FRAMES.get(number, 'unknown')})"
+    remedy = f": the scenario's vehicle has {needs.thrusters} thrusters; name the one connected"
+    yield "frame", fits, words + ("" if fits else remedy)
+
+
+def _outputs(needs: Requirements, facts: Facts) -> Found:
+    wrong = []
+    for n in range(1, needs.thrusters + 1):
+        value = facts.parameters.get(f"SERVO{n}_FUNCTION")
+        if value is None or int(value) != _MOTOR_1 + n - 1:
+            left = value is not None and int(value) in PASS_THROUGH_FUNCTIONS
+            note = " (pass-through, left by a run that died)" if left else ""
+            wrong.append(f"SERVO{n}_FUNCTION {value if value is None else int(value)}{note}")
+    yield (
+        "outputs",
+        not wrong and facts.given_back,
+        "motors on outputs 1 to n"
+        if not wrong and facts.given_back
+        else f"{', '.join(wrong) or 'parameters of a former run'}: restore the motors' functions "
+        f"{_MOTOR_1} to {_MOTOR_1 + needs.thrusters - 1} first",
+    )
+    for word, value in (("MIN", 1100.0), ("MAX", 1900.0)):
+        found = facts.parameters.get(f"MOT_PWM_{word}", value)
+        yield f"MOT_PWM_{word}", found == value, f"{found:g} µs ({value:g} is assumed)"
+    if not needs.passthrough:
+        odd = [
+            f"RC{n}_{word} {found:g}"
+            for n in range(1, 7)
+            for word, value in _PULSES.items()
+            if (found := facts.parameters.get(f"RC{n}_{word}", value)) != value
+        ]
+        yield (
+            "RC channels",
+            not odd,
+            ", ".join(odd) + " (1100, 1500, 1900 assumed)" if odd else "ok",
+        )
+
+
+def _failsafes(needs: Requirements, facts: Facts) -> Found:
+    p = facts.parameters
+    mine = int(p.get("SYSID_MYGCS", p.get("MAV_GCS_SYSID", 255)))
+    yield (
+        "ground station id",
+        mine == needs.system,
+        f"the vehicle obeys system {mine}, and we are {needs.system}",
+    )
+    for name, wanted in FAILSAFES.items():
+        found = p.get(name)
+        if name in ("FS_PILOT_TIMEOUT", "RC_OVERRIDE_TIME"):
+            fine = found is not None and 0 < found <= 3.0
+        else:
+            fine = found is not None and found >= wanted
+        state = "is not among its parameters" if found is None else f"is {found:g}"
+        yield name, fine, state + ("" if fine else f": set {wanted:g}")
+
+
+def _state(needs: Requirements, facts: Facts) -> Found:
+    low = needs.min_voltage > 0 and not facts.voltage >= needs.min_voltage
+    yield (
+        "battery",
+        not low,
+        f"{facts.voltage:.1f} V"
+        + (f": below {needs.min_voltage:g} V; charge it, or min_voltage: 0" if low else ""),
+    )
+    yield "leak", not facts.leak, "water in the hull" if facts.leak else "dry"
+    healthy = facts.health is not None and facts.health & _SENSORS_HEALTHY == _SENSORS_HEALTHY
+    yield "inertial sensors", healthy, "healthy" if healthy else "not healthy in SYS_STATUS"
+    level = facts.estimator is not None and bool(facts.estimator & _ATTITUDE_GOOD)
+    yield "attitude", level, "estimated" if level else "no attitude in EKF_STATUS_REPORT; wait"
+    yield "disarmed", not facts.armed, "armed by someone else" if facts.armed else "yes"
+
+
+_CHECKS = (_identity, _link, _rates, _frame, _outputs, _failsafes, _state)

@@ -1,0 +1,294 @@
+"""Guards of a dive: limits on the wrench, watchdogs, and the order to stop.
+
+Pure functions of what is seen at one time; nothing here knows controllers, sockets or threads. A
+guard that trips ends the dive for good: neutral thrusters first, then the configured end. Its
+sentence is the reason in the log.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ...models.config.checks import Vector6, check_numbers, require
+
+Order = Literal["fly", "neutral", "hold_depth", "disarm", "yield"]
+"""What the actuation does: send the wrench; send neutral; neutral in the mode ALT_HOLD; disarm;
+send nothing at all, because a pilot steers."""
+
+_NEUTRAL_FOR = 0.5  # s of neutral before the end: some ten messages, of which one arrives
+_LOST = 2  # health of the filter: 0 good, 1 degraded, 2 lost
+
+
+@dataclass(frozen=True)
+class SafetyConfig:
+    """Limits and watchdogs.
+
+    Attributes:
+        max_wrench: largest magnitude of each component (N, N·m).
+        max_wrench_rate: largest rate of each component (N/s, N·m/s).
+        min_depth: least depth of Bo below the surface (m); negative is above it.
+        max_depth: greatest depth (m).
+        fence: half sides of the box about the start in which Bo stays, along x and y of W (m).
+        silence: longest time without any message of the vehicle (s).
+        stale: longest age of attitude and depth (s).
+        stale_aid: longest age of a velocity or position aid, if the estimate needs one (s).
+        plan_age: longest age of the plan that is followed (s).
+        lost: longest time for which the estimator may be lost (s).
+        min_voltage: least battery voltage under load (V); 0 switches the guard off.
+        dead_man: longest time between presses of the dead-man key (s); 0 needs none.
+        end: what follows neutral thrusters.
+    """
+
+    max_wrench: Vector6 = (80.0, 80.0, 80.0, 8.0, 8.0, 14.0)
+    max_wrench_rate: Vector6 = (400.0, 400.0, 400.0, 40.0, 40.0, 70.0)
+    min_depth: float = -0.5
+    max_depth: float = 30.0
+    fence: tuple[float, float] = (20.0, 20.0)
+    silence: float = 1.0
+    stale: float = 0.5
+    stale_aid: float = 2.0
+    plan_age: float = 2.0
+    lost: float = 1.0
+    min_voltage: float = 13.2
+    dead_man: float = 0.0
+    end: Literal["hold_depth", "disarm"] = "hold_depth"
+
+    def __post_init__(self) -> None:
+        """Check signs."""
+        check_numbers(self)
+        for name in ("max_wrench", "max_wrench_rate", "fence"):
+            require(min(getattr(self, name)) > 0, self, name, "give numbers above zero")
+        for name in ("silence", "stale", "stale_aid", "plan_age", "lost"):
+            require(getattr(self, name) > 0, self, name, "give a time above zero")
+        for name in ("min_voltage", "dead_man"):
+            require(getattr(self, name) >= 0, self, name, "give zero or more")
+        require(self.max_depth > self.min_depth, self, "max_depth", "give more than min_depth")
+
+
+class Sight(NamedTuple):
+    """What is seen at one time. Ages are in s, infinite where nothing came yet."""
+
+    t: float
+    """Time of the dive (s)."""
+    F_Bo_B: Float[np.ndarray, "6"]
+    """The wanted wrench (N, N·m)."""
+    p_WBo: Float[np.ndarray, "3"]
+    """Estimated position (m)."""
+    health: int
+    """Of the estimator: 0 good, 1 degraded, 2 lost."""
+    ages: Mapping[str, float]
+    """Of `vehicle` (any message), `attitude`, `depth`; `aid`, `plan`, `dead_man` where there is
+    one."""
+    armed: bool
+    mode: str
+    voltage: float
+    """Of the battery (V), NaN if unknown."""
+    failsafe: str = ""
+    """The vehicle's own failsafe, in its words; empty if none is on."""
+    rivals: int = 0
+    """Other ground stations with our system id."""
+
+
+class State(NamedTuple):
+    """The guard's state."""
+
+    mode: str
+    """The mode that we set."""
+    p_WBo: Float[np.ndarray, "3"]
+    """Centre of the fence (m)."""
+    F_Bo_B: Float[np.ndarray, "6"] = np.zeros(6)
+    """The wrench that was sent last (N, N·m)."""
+    t: float = 0.0
+    lost_since: float | None = None
+    tripped: str = ""
+    """Name of the guard that ended the dive."""
+    reason: str = ""
+    """Its sentence."""
+    since: float = 0.0
+    """When it tripped (s)."""
+
+
+Guard = Callable[[SafetyConfig, State, Sight], str]
+"""The reason to stop, or nothing."""
+
+
+def _wrench(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del config, state
+    finite = np.isfinite(sight.F_Bo_B).all()
+    return "" if finite else f"the controller wants a wrench that is not finite: {sight.F_Bo_B}"
+
+
+def _silence(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del state
+    return _too_old(config.silence, sight, "vehicle", "the vehicle was not heard")
+
+
+def _attitude(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del state
+    return _too_old(config.stale, sight, "attitude", "no new attitude came")
+
+
+def _depth(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del state
+    return _too_old(config.stale, sight, "depth", "no new depth came")
+
+
+def _aid(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del state
+    return _too_old(config.stale_aid, sight, "aid", "no new velocity or position came")
+
+
+def _plan(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del state
+    return _too_old(config.plan_age, sight, "plan", "the planner made no new plan")
+
+
+def _dead_man(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del state
+    if config.dead_man == 0:
+        return ""
+    return _too_old(config.dead_man, sight, "dead_man", "the dead-man key was not pressed")
+
+
+def _too_old(limit: float, sight: Sight, name: str, words: str) -> str:
+    age = sight.ages.get(name)
+    return "" if age is None or age <= limit else f"{words} for {age:.1f} s (limit {limit:g} s)"
+
+
+def _estimate(config: SafetyConfig, state: State, sight: Sight) -> str:
+    if not np.isfinite(sight.p_WBo).all():
+        return f"the estimated position is not finite: {sight.p_WBo}"
+    since = state.lost_since
+    if sight.health < _LOST or since is None or sight.t - since <= config.lost:
+        return ""
+    return f"the estimator has been lost for {sight.t - since:.1f} s (limit {config.lost:g} s)"
+
+
+def _depth_limits(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del state
+    depth = -float(sight.p_WBo[2])
+    if config.min_depth <= depth <= config.max_depth:
+        return ""
+    return f"depth {depth:.1f} m is outside {config.min_depth:g} to {config.max_depth:g} m"
+
+
+def _fence(config: SafetyConfig, state: State, sight: Sight) -> str:
+    x, y = np.abs(sight.p_WBo - state.p_WBo)[:2]
+    if x <= config.fence[0] and y <= config.fence[1]:
+        return ""
+    half = f"{config.fence[0]:g} × {config.fence[1]:g} m"
+    return f"{x:.1f} m and {y:.1f} m from the start along x and y: outside the fence of ± {half}"
+
+
+def _pilot(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del config
+    if sight.mode == state.mode:
+        return ""
+    return f"the mode was changed to {sight.mode} (we had set {state.mode}): a pilot steers"
+
+
+def _disarmed(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del config, state
+    return "" if sight.armed else "the vehicle was disarmed"
+
+
+def _failsafe(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del config, state
+    return f"the vehicle's failsafe is on: {sight.failsafe}" if sight.failsafe else ""
+
+
+def _rival(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del config, state
+    return "another ground station uses our system id" if sight.rivals else ""
+
+
+def _battery(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del state
+    if np.isnan(sight.voltage) or sight.voltage >= config.min_voltage:
+        return ""
+    return f"battery {sight.voltage:.1f} V is below {config.min_voltage:g} V"
+
+
+GUARDS: dict[str, Guard] = {
+    "pilot": _pilot,
+    "disarmed": _disarmed,
+    "rival": _rival,
+    "failsafe": _failsafe,
+    "silence": _silence,
+    "attitude": _attitude,
+    "depth": _depth,
+    "aid": _aid,
+    "estimate": _estimate,
+    "plan": _plan,
+    "dead_man": _dead_man,
+    "depth_limits": _depth_limits,
+    "fence": _fence,
+    "battery": _battery,
+    "wrench": _wrench,
+}
+"""All guards, by name; the first that trips names the reason."""
+
+_YIELDING = ("pilot", "disarmed")
+
+
+class Ruling(NamedTuple):
+    """What to do now."""
+
+    state: State
+    order: Order
+    F_Bo_B: Float[np.ndarray, "6"]
+    """The limited wrench to send (N, N·m); zero unless the order is to fly."""
+
+
+@dataclass(frozen=True)
+class Supervisor:
+    """All guards with their configuration."""
+
+    config: SafetyConfig = field(default_factory=SafetyConfig)
+    guards: Mapping[str, Guard] = field(default_factory=lambda: dict(GUARDS))
+
+    def step(self, state: State, sight: Sight) -> Ruling:
+        """The order at one time.
+
+        Once a guard has tripped, thrusters are neutral for half a second. Then the dive ends as
+        configured, or by leaving the vehicle to the pilot who took it. A lost depth sensor, a
+        silent vehicle or one whose depth is out of bounds is disarmed: it can't hold its depth.
+        """
+        lost = sight.health >= _LOST
+        since = (sight.t if state.lost_since is None else state.lost_since) if lost else None
+        state = state._replace(lost_since=since)
+        if not state.tripped:
+            for name, guard in self.guards.items():
+                reason = guard(self.config, state, sight)
+                if reason:
+                    state = state._replace(tripped=name, reason=reason, since=sight.t)
+                    break
+        if state.tripped:
+            ended = state._replace(F_Bo_B=np.zeros(6), t=sight.t)
+            return Ruling(ended, self._end(state, sight.t), np.zeros(6))
+        F = limited(self.config, state.F_Bo_B, sight.F_Bo_B, sight.t - state.t)
+        return Ruling(state._replace(F_Bo_B=F, t=sight.t), "fly", F)
+
+    def _end(self, state: State, t: float) -> Order:
+        if state.tripped in _YIELDING:
+            return "yield" if t - state.since >= _NEUTRAL_FOR else "neutral"
+        if t - state.since < _NEUTRAL_FOR:
+            return "neutral"
+        if state.tripped in ("depth", "depth_limits", "silence"):
+            return "disarm"
+        return self.config.end
+
+
+def limited(
+    config: SafetyConfig,
+    before: Float[np.ndarray, "6"],
+    wanted: Float[np.ndarray, "6"],
+    dt: float,
+) -> Float[np.ndarray, "6"]:
+    """The wrench within its limits and its rates (N, N·m), after `dt` (s)."""
+    most = np.asarray(config.max_wrench)
+    step = np.asarray(config.max_wrench_rate) * max(dt, 0.0)
+    return np.clip(np.clip(wanted, -most, most), before - step, before + step)

@@ -1,0 +1,1 @@
+"""Doppler velocity logs that are read directly: byte streams to readings."""

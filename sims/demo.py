@@ -153,7 +153,7 @@ def _page(
     better = all(r < 1 for r in ratio.values())
     page = Page("From a log to a dive", f"`{source.name}`, from the preset `{vehicle.name}`")
     page.verdict(
-        f"On motion it has not seen, {_compared(overall, 'position', 'm')}, "
+        f"On held-out data: {_compared(overall, 'position', 'm')}; "
         f"{_compared(overall, 'linear_velocity', 'm/s')}. {outcome['words']}",
         better and outcome["success"],
     )
@@ -167,18 +167,21 @@ def _page(
     add_evaluation(add_training(add_data(page, recording), learned), learned)
     page.section(
         "The dive",
-        f"The learned model is the vehicle, and MPPI plans with it: {_task(run.scenario)}, on "
-        f"estimates of a Kalman filter.{consistency(values['estimate'])} The run's own "
-        "[report](dive/report.html) and [3-D replay](dive/meshcat.html) show more.",
+        f"The learned model is both the plant and MPPI's model: {_task(run.scenario)}, on the "
+        f"estimates of the Kalman filter.{consistency(values['estimate'])} The run has a "
+        "[report](dive/report.html) and a [3-D replay](dive/meshcat.html).",
     )
     around = scene(run.scenario)
     page.figure(path_figure(run.log, around), "Planned, flown and estimated path.")
     obstacles = run.scenario.station.obstacles
     room = clearance(run.log, vehicle, obstacles)
     for figure, caption in (
-        (progress_figure(run.log, room, around.goal, around.goal_radius), "The way to the goal."),
-        (samples_figure(run.log, around), "Paths that the planner sampled, at six moments."),
-        (tracking_figure(run.log), "Plan minus truth, seen from the vehicle."),
+        (
+            progress_figure(run.log, room, around.goal, around.goal_radius),
+            "Distance to the goal, and clearance.",
+        ),
+        (samples_figure(run.log, around), "Sampled paths at six times."),
+        (tracking_figure(run.log), "Plan minus truth, in B."),
     ):
         if figure is not None:
             page.figure(figure, caption)
@@ -222,14 +225,12 @@ def _words(found: dict[str, Any], out: Path) -> str:
         lines.append(f"  {label:<32}{preset:>8.3f}{learned:>11.3f}")
     inside = found["held_out"]["learned"]
     lines.append(
-        f"  of held-out motion {inside['coverage_0.5']:.0%} lie in the 50 % band and "
-        f"{inside['coverage_0.9']:.0%} in the 90 % band"
+        f"  coverage of held-out motion: 50 % band {inside['coverage_0.5']:.0%}, "
+        f"90 % band {inside['coverage_0.9']:.0%}"
     )
     lines.append(f"dive: {found['dive']['words']}")
     consistent = nees_words(found["estimate"])
     if consistent is not None:
-        lines.append(
-            f"its estimator's NEES (3 on average if its covariance is right): {consistent}"
-        )
-    lines.append(f"{found['seconds']:.0f} s in all; open {out / 'report.html'}")
+        lines.append(f"estimator's NEES (3 on average for a consistent filter): {consistent}")
+    lines.append(f"{found['seconds']:.0f} s in total; open {out / 'report.html'}")
     return "\n".join(lines)

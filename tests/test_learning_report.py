@@ -38,8 +38,8 @@ def test_the_step_taken_is_the_lowest_of_its_stretch_and_ringed():
     """Losses before a refit are of another scale: the lowest of all may not be the best."""
     found = result([0.1, 0.2, 0.5, 0.6], 150, (120,))
     assert taken_words(found, 4) == (
-        "Step 150 is taken, whose loss on 4 validation windows is the lowest since bandwidths were "
-        "fitted anew at step 120."
+        "Step 150 is used; it has the lowest loss on 4 validation windows since bandwidths were "
+        "refitted at step 120."
     )
     assert ring(found) == [(150.0, 0.5)]
     figure = learning_figure(found.metrics, found.refits, found.best_step)
@@ -50,14 +50,14 @@ def test_the_step_taken_is_the_lowest_of_its_stretch_and_ringed():
 @pytest.mark.parametrize(
     ("best", "refits", "windows", "words"),
     [
-        (200, (), 0, "No windows could be spared to choose a step by, so step 200 is taken"),
-        (0, (), 4, "No step was better on 4 validation windows than the start"),
-        (100, (), 1, "Step 100 is taken, whose loss on 1 validation window is the lowest."),
+        (200, (), 0, "too few data for validation windows; the last step, 200, is used."),
+        (0, (), 4, "On 4 validation windows no step was better than the starting model"),
+        (100, (), 1, "Step 100 is used; it has the lowest loss on 1 validation window."),
         (
             100,
             (120,),
             4,
-            "also by the bandwidths that were fitted anew at step 120",
+            "also with the bandwidths refitted at step 120",
         ),
     ],
 )
@@ -84,8 +84,8 @@ def rows(mass, drag):
 @pytest.mark.parametrize(
     ("mass", "drag", "words"),
     [
-        (1.3, 1.2, "overrates thrust shows up as too much"),
-        (0.8, 0.5, "underrates thrust shows up as too little"),
+        (1.3, 1.2, "overestimates thrust appears as too much mass"),
+        (0.8, 0.5, "underestimates thrust appears as too little mass"),
     ],
 )
 def test_what_is_said_of_thrust_is_what_the_table_shows(mass, drag, words):

@@ -142,7 +142,7 @@ def test_following_is_judged_at_the_end():
     plan = log["X_WB"] + np.array([0, 0, 0, 0, 0.4, 0, 0])
     found = metrics(_changed(log, X_WB_plan=plan), over, FollowPath(), VEHICLE)["outcome"]
     assert found["success"] is False
-    assert "0.40 m RMS off" in found["words"]
+    assert "tracking error was 0.40 m RMS" in found["words"]
     early = Outcome("interrupted", 3.0, "Stopped.")
     assert metrics(log, early, FollowPath(), VEHICLE)["outcome"]["success"] is False
 

@@ -39,9 +39,9 @@ def test_report_of_a_crossing():
     assert 'class="verdict good"' in html
     for title in ("Path", "Planning", "Tracking", "Estimate", "Commands", "Disturbances"):
         assert f"<h2>{title}</h2>" in html
-    assert "the chance constraint allows, 5 %. Every plan keeps to it." in html
+    assert "the chance constraint allows, 5 %. Every plan satisfies it." in html
     assert "seed: 3" in html
-    assert "NEES, the squared error by the claimed covariance, is 3 on average" in html
+    assert "NEES, the squared error normalised by the estimated covariance, is 3 on average" in html
     assert "Estimator health: good 75 %, degraded (dvl) 25 %." in html
     assert 'href="meshcat.html"' in html
     assert html.count("<img ") == html.count('src="data:image/') == 9
@@ -51,7 +51,7 @@ def test_report_of_a_crossing():
 
 def test_report_of_a_run_that_ended_at_once():
     log = example_log(0.1, planned=False)
-    outcome = Outcome("interrupted", 0.1, "Stopped by hand after 0.1 s.")
+    outcome = Outcome("interrupted", 0.1, "The run was interrupted after 0.1 s.")
     values = metrics(log, outcome, FollowPath(), VEHICLE)
     html = run_page(log, values, Scene(VEHICLE.size), title="Short").html()
     assert 'class="verdict bad"' in html
@@ -65,7 +65,7 @@ def test_a_chance_constraint_that_could_not_hold_is_told():
     values = metrics(log, outcome, ReachGoal(), VEHICLE, PYLONS, np.array(GOAL))
     assert values["planner"]["plans_beyond_allowed"] == 2
     html = run_page(log, values, SCENE, title="Crossing").html()
-    assert "It could not hold in 2 of 19 plans" in html
+    assert "In 2 of 19 plans no sampled sequence satisfied it" in html
     assert "the risk was up to 20 %" in html
     drawn = figures_time.planner_figure(log)
     assert drawn is not None

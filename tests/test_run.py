@@ -211,7 +211,7 @@ def test_a_ringed_goal_is_said_and_the_vehicle_stays(crossing, tmp_path):
     base = typed_yaml.dump(crossing.scenario)
     run = simulate(overridden(base, text))
     assert run.outcome.reason == "no safe plan"
-    found = re.search(r"every way .* risk of ([\d.]+) % or more, and 5 % is", run.outcome.sentence)
+    found = re.search(r"every passage .* risk of ([\d.]+) % or more; 5 % is", run.outcome.sentence)
     assert found, run.outcome.sentence
     assert float(found[1]) > 90
     assert np.linalg.norm(run.log["X_WB"][-1] - run.log["X_WB"][0]) < 0.02

@@ -90,7 +90,7 @@ def test_an_empty_table_tests_nothing():
         ("errors (RMSE)", lambda r: r["method"] == "pinn" and {"rmse_mean_geodesic": 0.1}),
         ("not enough", lambda r: r["method"] == "pinn" and {"w2": 0.3}),
         ("Moment matching", lambda r: r["method"] == "moments" and {"spread_velocity_ratio": 0.8}),
-        ("distance-aware objective.", lambda r: {"spread_velocity_ratio": 0.8}),
+        ("objective collapses", lambda r: {"spread_velocity_ratio": 0.8}),
         ("unstable", lambda r: {"success": True}),
         ("always succeeds", lambda r: r["method"] == "pinn" and {"success": r["seed"] > 0}),
         ("fails to train", lambda r: {"success": True}),

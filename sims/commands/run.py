@@ -78,9 +78,9 @@ class Run:
         shown.print(values["outcome"]["words"])
         told = [f"path {path['length_m']:.1f} m"]
         for name, block, key in (
-            ("least clearance", path, "min_clearance_m"),
-            ("off the plan", values["tracking"], "position_rms_m"),
-            ("estimate off", values["estimate"], "position_rms_m"),
+            ("minimum clearance", path, "min_clearance_m"),
+            ("tracking error", values["tracking"], "position_rms_m"),
+            ("estimation error", values["estimate"], "position_rms_m"),
         ):
             if block.get(key) is not None:
                 told.append(f"{name} {block[key]:.2f} m")
@@ -89,6 +89,6 @@ class Run:
         beyond = values["planner"].get("plans_beyond_allowed")
         if beyond:
             allowed = values["planner"]["allowed_collision_probability"]
-            told.append(f"collision risk beyond the allowed {100 * allowed:g} % in {beyond} plans")
+            told.append(f"collision risk above the allowed {100 * allowed:g} % in {beyond} plans")
         shown.print(", ".join(told))
         shown.print(f"wrote {out}" + (f"; open {out / 'report.html'}" if self.report else ""))

@@ -90,54 +90,54 @@ def _summary(rows: Sequence[Row]) -> Table:
     if true:
         lines.append(
             (
-                "single causes of realistic size named first",
+                "single causes of realistic size: first cause right",
                 share(sum(r["first_right"] for r in true), len(true)),
             )
         )
         lines.append(
             (
-                "or told to be indistinguishable from the first name",
+                "hidden cause first, or reported as indistinguishable from the first",
                 share(sum(r["declared"] for r in true), len(true)),
             )
         )
         alone = sum(r["first_right"] and len(r["named"]) == 1 for r in true)
-        lines.append(("and no other name beside them", share(alone, len(true))))
+        lines.append(("first cause right and no other cause reported", share(alone, len(true))))
         placed = [r["place_right"] for r in true if r["place_right"] is not None]
-        lines.append(("place right, of those", share(sum(placed), len(placed))))
+        lines.append(("place of the first cause right", share(sum(placed), len(placed))))
     z = np.abs([z for r in rows for z in r["z"].values() if z == z])
     if len(z):
         lines.append(
             (f"parameters within {CLOSE:g} standard errors", share(int(sum(z <= CLOSE)), len(z)))
         )
-        lines.append(("median of their deviation, in standard errors", _middle(list(z))))
+        lines.append(("median deviation of parameters, in standard errors", _middle(list(z))))
         off = [abs(x - 1) for r in rows for x in r["ratio"].values()]
         lines.append(
-            ("median of their deviation, relative", f"{100 * float(np.median(off)):.1f} %")
+            ("median relative deviation of parameters", f"{100 * float(np.median(off)):.1f} %")
         )
     gains = [g for r in singles if (g := gain_share(r)) is not None]
     if gains:
         good = sum(g >= ENOUGH for g in gains)
         lines.append(
-            ("gain of single causes at least 90 % of the true model's", share(good, len(gains)))
+            ("single causes with at least 90 % of the true model's gain", share(good, len(gains)))
         )
-        lines.append(("median of that share", _middle(gains, 3)))
+        lines.append(("median share of the true model's gain", _middle(gains, 3)))
     unknown = _of(rows, "unknown")
     if unknown:
         hits = sum(r["first_right"] for r in unknown)
         lines.append(
             (
-                "effects without a name called unknown, by the right variables",
+                "unmodelled structure reported as `unknown` with a right variable",
                 share(hits, len(unknown)),
             )
         )
     if singles:
         wrong = sum("unknown" in r["named"] for r in singles)
-        lines.append(("named effects called unknown", share(wrong, len(singles))))
+        lines.append(("named effects reported as `unknown`", share(wrong, len(singles))))
     seconds = [r["seconds"] for r in rows]
     if seconds:
         lines.append(
             (
-                "time of a diagnosis, median and longest",
+                "computing time of a diagnosis, median and maximum",
                 f"{np.median(seconds):.0f} s, {max(seconds):.0f} s",
             )
         )
@@ -167,10 +167,10 @@ def _confusion(rows: Sequence[Row]) -> Table:
                 f"{np.median([r['seconds'] for r in own]):.0f}",
             )
         )
-    header = ("hidden", "first name right", "named, in order", "largest z", "gain", "s")
+    header = ("hidden", "first cause right", "reported, in order", "largest z", "gain", "s")
     caption = (
-        "Single causes of realistic size: what was said, the largest deviation of a parameter in "
-        "standard errors, the share of the true model's gain."
+        "Single causes of realistic size: reported causes, largest deviation z of a parameter in "
+        "standard errors, share of the true model's gain, computing time."
     )
     return Table(caption, header, lines)
 
@@ -187,14 +187,14 @@ def _sizes(rows: Sequence[Row]) -> Table:
         right = sum(r["first_right"] for r in own)
         lines.append((f"{size:g}", share(seen, len(own)), share(right, len(own))))
     return Table(
-        "Detection against size, in realistic sizes.",
-        ("size", "something named", "first name right"),
+        "Detection against the size of the effect (1 is realistic).",
+        ("size", "any cause reported", "first cause right"),
         lines,
     )
 
 
 def _varied(rows: Sequence[Row]) -> Table:
-    """Single causes of realistic size by how they were recorded."""
+    """Single causes of realistic size, by kind of recording."""
     chosen = [r for r in _of(rows, "single") if r["size"] == 1]
     kinds = list(dict.fromkeys(r["data"] for r in chosen))
     if kinds in ([], [USUAL]):
@@ -217,18 +217,18 @@ def _varied(rows: Sequence[Row]) -> Table:
             )
         )
     header = (
-        "data", "first name right", "or told as alike", "alone", "nothing named",
+        "data", "first cause right", "or indistinguishable", "no other cause", "no cause",
         f"parameters within {CLOSE:g} SE", "gain ≥ 90 %", "s",
     )  # fmt: skip
-    return Table("Single causes of realistic size by how they were recorded.", header, lines)
+    return Table("Single causes of realistic size, by kind of recording.", header, lines)
 
 
 def _misses(rows: Sequence[Row]) -> Table:
-    """The reported names of cases with unusual data whose first name is wrong."""
+    """Reported causes of cases with other data than usual whose first cause is wrong."""
     wrong = [r for r in _of(rows, "single") if r["data"] != USUAL and not r["first_right"]]
     lines = [(r["data"], r["label"], ", ".join(r["named"]) or "adequate") for r in wrong]
-    caption = "Where the first name is wrong in other data than the usual."
-    return Table(caption, ("data", "hidden", "named, in order"), lines)
+    caption = "Cases with other data than usual whose first cause is wrong."
+    return Table(caption, ("data", "hidden", "reported, in order"), lines)
 
 
 def _rivals(rows: Sequence[Row]) -> Table:
@@ -251,10 +251,10 @@ def _rivals(rows: Sequence[Row]) -> Table:
         lines.append((label, named, *cells))
     names = tuple(chosen[0]["rivals"]) if chosen else ()
     caption = (
-        "Rivals on the same files: the share of the true model's gain (in brackets the terms of "
-        "sparse regressions besides constants, in all six axes; median over cases)."
+        "Rival methods on the same files: share of the true model's gain, median over cases. In "
+        "brackets: number of terms of a sparse regression over all six axes, without constants."
     )
-    return Table(caption, ("hidden", "named by spinndrift", "its gain", *names), lines)
+    return Table(caption, ("hidden", "reported by spinndrift", "its gain", *names), lines)
 
 
 def _mixed(rows: Sequence[Row]) -> Table:
@@ -271,8 +271,8 @@ def _mixed(rows: Sequence[Row]) -> Table:
                     f"{sum(r['spurious'] for r in own) / len(own):.2f}",
                 )
             )
-    header = ("", "first name right", "causes found", "wrong names a case")
-    return Table("Several causes at once.", header, lines)
+    header = ("", "first cause right", "causes found", "wrong causes per case")
+    return Table("Several hidden causes.", header, lines)
 
 
 def _faults(rows: Sequence[Row]) -> Table:
@@ -284,4 +284,4 @@ def _faults(rows: Sequence[Row]) -> Table:
         )
         for r in _of(rows, "fault")
     ]
-    return Table("Data at fault.", ("fault", "told", "named besides"), lines)
+    return Table("Faulty data.", ("fault", "reported", "causes"), lines)

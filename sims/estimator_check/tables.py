@@ -33,9 +33,9 @@ def _nees(results: Sequence[Result]) -> Table:
     averages = [[average_nees(r.scores, i) for i in range(3)] for r in results]
     good = sum(all(a.values.size and a.holds(a.values[-1]) for a in row) for row in averages)
     caption = (
-        f"NEES, average of {count} runs of {seconds:g} s: at the end, least to largest over time, "
-        f"share of times inside. 3 is right; 95 % bounds are {low:.2f} to {high:.2f}, what lies "
-        f"outside is bold. {good} of {len(results)} settings end with all three inside."
+        f"NEES, average of {count} runs of {seconds:g} s: value at the end, range over time, share "
+        f"of times inside the 95 % bounds {low:.2f} to {high:.2f}. A consistent filter has 3; "
+        f"values outside are bold. {good} of {len(results)} settings end with all three inside."
     )
     header = ("setting", *BLOCKS, "not finite")
     rows = []
@@ -50,9 +50,9 @@ def _nis(results: Sequence[Result]) -> Table:
     bounds = [(name, *average_bound(FREEDOM[name], count)) for name in FUSED]
     told = ", ".join(f"{name} {low:.2f} to {high:.2f}" for name, low, high in bounds)
     caption = (
-        "NIS of readings that were fused, average over runs and time, its range over time and the "
-        f"share of times inside its bounds ({told}); readings that were rejected; position error "
-        "at the end as a share of the path."
+        "NIS of fused readings: average over runs and time, range over time, share of times inside "
+        f"the 95 % bounds ({told}). Gated: share of rejected readings. Drift: position error at "
+        "the end relative to the length of the path."
     )
     header = ("setting", *(f"NIS {name}" for name in FUSED), *(f"gated {n}" for n in FUSED))
     rows = []
@@ -73,11 +73,11 @@ def _faults(results: Sequence[Result]) -> Table:
     kept = sum(bool((share >= PROMISED).all()) for share in shares)
     caption = (
         f"Faults from {seconds / 3:g} s on, {count} runs of {seconds:g} s each. Errors at the end: "
-        "95 % of runs lie below the first number, the second is the worst, the third the median of "
-        "what is claimed (root of the covariance's trace). Within 3σ: share of runs whose error "
-        "lies in the ellipsoid of the claimed covariance that holds 99.73 %, as ± 3σ of one axis; "
-        f"at least {_percent(PROMISED)} are promised of position, attitude and velocity each, "
-        f"fewer are bold. {kept} of {len(results)} rows keep it."
+        "95th percentile, maximum, and median of the claimed error (root of the covariance's "
+        "trace). Within 3σ: share of runs whose error lies in the 99.73 % ellipsoid of the claimed "
+        "covariance (the probability of ± 3σ of one axis), for position, attitude and velocity. "
+        f"{_percent(PROMISED)} are required of each; smaller shares are bold. {kept} of "
+        f"{len(results)} rows meet this."
     )
     header = (
         "fault", "position (m)", "attitude (°)", "velocity (m/s)", "within 3σ", "not finite",

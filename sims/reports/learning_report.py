@@ -32,10 +32,10 @@ def add_data(page: Page, recording: Recording) -> Page:
         f"{minutes:.1f} minutes at {1 / recording.dt:g} Hz in {int((recording.lengths > 0).sum())} "
         f"stretches; commands as `{recording.commands[0]}`.",
     )
-    page.figure(recording_figure(recording), "What was measured, one colour a stretch.")
+    page.figure(recording_figure(recording), "Measured motion, one colour per stretch.")
     if recording.notes:
-        page.table([(note,) for note in recording.notes], ("what the source had and lacked",))
-    return page.details("Ranges of everything recorded", summarize(recording))
+        page.table([(note,) for note in recording.notes], ("contents and gaps of the source",))
+    return page.details("Ranges of all variables", summarize(recording))
 
 
 def add_training(page: Page, learned: Learned) -> Page:
@@ -51,8 +51,7 @@ def add_training(page: Page, learned: Learned) -> Page:
     caption = "Loss against steps (running median)."
     if result.refits:
         caption += (
-            " At dotted lines bandwidths were fitted anew: losses before and after one are of "
-            "different scales."
+            " Dotted lines: bandwidths were refitted; losses before and after are not comparable."
         )
     page.figure(learning_figure(result.metrics, result.refits, result.best_step), caption)
     rows = coefficient_rows(learned.preset, learned.model)
@@ -61,7 +60,7 @@ def add_training(page: Page, learned: Learned) -> Page:
         ("axis", "M preset", "M learned", "D preset", "D learned", "D^f preset", "D^f learned",
          "b preset", "b learned"),
         "Diagonals at rest: mass with added mass (kg, kg·m²), viscous and fluid drag, diffusion "
-        "(N√s, N·m√s). The preset's diffusion is estimated from its own errors. "
+        "(N√s, N·m√s). The preset's diffusion is estimated from its prediction errors. "
         + scale_words(rows),
     )  # fmt: skip
     for event in result.events:
@@ -74,15 +73,15 @@ def add_evaluation(page: Page, learned: Learned, window: int | None = None) -> P
     held_out, evaluation = learned.parts.held_out, learned.evaluation
     page.section(
         "Held-out error: preset against learned",
-        f"{len(held_out)} windows of {held_out.length:g} s that share no moment with training.",
+        f"{len(held_out)} windows of {held_out.length:g} s that do not overlap with training data.",
     )
     page.figure(error_figure(evaluation), "Error of the noise-free prediction against its horizon.")
     shown = [key for key in next(iter(evaluation.overall().values())) if key not in _LEFT_OUT]
     page.table(
         [(name, *(row[key] for key in shown)) for name, row in evaluation.overall().items()],
         ("model", *(key.replace("_", " ") for key in shown)),
-        "Averages over all horizons; coverage should be 0.5 and 0.9, the energy score is small "
-        "for a law that is sharp and right.",
+        "Averages over all horizons. Coverage should be 0.5 and 0.9; a smaller energy score is "
+        "better.",
     )
     page.figure(coverage_figure(evaluation), "Calibration of the predicted bands.")
     index = len(held_out) // 2 if window is None else window
@@ -94,9 +93,9 @@ def add_evaluation(page: Page, learned: Learned, window: int | None = None) -> P
             index,
             (learned.substeps, FINE_SUBSTEPS),
         ),
-        "One held-out window, seen from the learned model's noise-free motion: measured motion "
-        "over the learned law's 50 % and 90 % bands; dashed, the preset's prediction (cut off "
-        "where it leaves the panel).",
+        "One held-out window, relative to the learned model's noise-free motion: measured motion "
+        "and the learned law's 50 % and 90 % bands. Dashed: the preset's prediction, cut off "
+        "where it leaves the panel.",
     )
     return page
 
@@ -106,16 +105,16 @@ def taken_words(result: TrainingResult, validation: int) -> str:
     windows = f"{validation} validation window{'s' * (validation != 1)}"
     step, last = result.best_step, max(result.refits, default=0)
     if validation == 0:
-        return f"No windows could be spared to choose a step by, so step {step} is taken, the last."
+        return f"There were too few data for validation windows; the last step, {step}, is used."
     if step == 0:
-        return f"No step was better on {windows} than the start, which is taken."
+        return f"On {windows} no step was better than the starting model, which is used."
     if step <= last:
         return (
-            f"Step {step} is taken: on {windows} none was better, also by the bandwidths that were "
-            f"fitted anew at step {last}."
+            f"Step {step} is used: on {windows} no step was better, also with the bandwidths "
+            f"refitted at step {last}."
         )
-    since = f" since bandwidths were fitted anew at step {last}" if last else ""
-    return f"Step {step} is taken, whose loss on {windows} is the lowest{since}."
+    since = f" since bandwidths were refitted at step {last}" if last else ""
+    return f"Step {step} is used; it has the lowest loss on {windows}{since}."
 
 
 def scale_words(rows: Sequence[tuple[object, ...]]) -> str:
@@ -125,13 +124,13 @@ def scale_words(rows: Sequence[tuple[object, ...]]) -> str:
     drag = [table[:, 2 + k] + _SPEED * table[:, 4 + k] for k in (0, 1)]
     ratio = float(np.median(drag[1] / np.maximum(drag[0], np.finfo(float).tiny)))
     told = (
-        f"In the median of the axes mass is {mass:.2f} times and drag at {_SPEED:g} m/s or rad/s "
+        f"In the median over axes, mass is {mass:.2f} times and drag at {_SPEED:g} m/s or rad/s "
         f"{ratio:.2f} times the preset's."
     )
     if (mass - 1) * (ratio - 1) <= 0:
         return told
-    does, shows = ("overrates", "much") if mass > 1 else ("underrates", "little")
-    return f"{told} A preset that {does} thrust shows up as too {shows} of both."
+    does, shows = ("overestimates", "much") if mass > 1 else ("underestimates", "little")
+    return f"{told} A preset that {does} thrust appears as too {shows} mass and drag."
 
 
 def coefficient_rows(preset: Dynamics, learned: Dynamics) -> list[tuple[object, ...]]:

@@ -26,7 +26,7 @@ PACKAGES = ("spinndrift", "drake", "jax", "equinox", "numpy")
 _NAMES = {
     "time_to_goal_s": "time to the goal (s)",
     "time_near_goal_s": "time near the goal (s)",
-    "min_clearance_m": "least clearance (m)",
+    "min_clearance_m": "minimum clearance (m)",
     "length_m": "length (m)",
     "max_speed_m_s": "highest speed (m/s)",
     "max_turn_rate_rad_s": "highest turn rate (rad/s)",
@@ -36,16 +36,16 @@ _NAMES = {
     "position_nees": "NEES of the position, mean over the run",
     "attitude_nees": "NEES of the attitude, mean over the run",
     "velocity_nees": "NEES of the velocity, mean over the run",
-    "nees_low": "NEES: 2.5 % of single moments lie below",
-    "nees_high": "NEES: 2.5 % of single moments lie above",
+    "nees_low": "NEES: lower 95 % bound of a single value",
+    "nees_high": "NEES: upper 95 % bound of a single value",
     "health_good": "estimator good",
     "health_degraded": "estimator degraded",
     "health_lost": "estimator lost",
     "allowed_collision_probability": "allowed collision probability",
-    "plans_beyond_allowed": "plans beyond what is allowed",
-    "least_risk_to_goal": "collision risk on the widest way to the goal",
-    "planner_median_ms": "one call of the planner, median (ms)",
-    "planner_p95_ms": "one call of the planner, 95 % below (ms)",
+    "plans_beyond_allowed": "plans above the allowed probability",
+    "least_risk_to_goal": "collision risk on the widest passage to the goal",
+    "planner_median_ms": "planner call, median (ms)",
+    "planner_p95_ms": "planner call, 95th percentile (ms)",
 }
 
 
@@ -79,19 +79,19 @@ def run_page(
     page.tiles(_tiles(values))
     _path_section(page, log, scene, clearance, replay, values)
     _errors_section(page, log, values)
-    page.section("Commands", "The wrench that the controller asked for, and what it took.")
+    page.section("Commands", "Commanded wrench and pulse widths of the thrusters.")
     page.figure(
         wrench_figure(log, limits),
-        "Commanded wrench in B. The limit (dashed where it is near) is what the thrusters can give "
-        "along that axis alone.",
+        "Commanded wrench in B. Dashed, where it is near: the largest wrench that the thrusters "
+        "can give along that axis alone.",
     )
     pwm = pwm_figure(log)
     if pwm is not None:
         page.figure(pwm, "Pulse widths. Grey: dead band. Dashed: ends of the range.")
     water = disturbance_figure(log)
     if water is not None:
-        page.section("Disturbances", "What the water did; the vehicle is told none of this.")
-        page.figure(water, "Waves and currents act through the water's velocity at the vehicle.")
+        page.section("Disturbances", "Filter, planner and controller do not know these signals.")
+        page.figure(water, "Velocity of the water at the vehicle, and disturbance wrench in B.")
     page.section("Numbers")
     for group, block in values.items():
         if isinstance(block, dict) and block:
@@ -99,7 +99,7 @@ def run_page(
             rows = [(_NAMES.get(k, _words(k)), v) for k, v in told.items()]
             page.table(rows, caption=group.capitalize(), width="half")
     if scenario_text:
-        page.section("Scenario").details("The whole scenario, defaults written out", scenario_text)
+        page.section("Scenario").details("Scenario with all defaults", scenario_text)
     return page.footer(_versions_line())
 
 
@@ -111,11 +111,11 @@ def _path_section(
     replay: str,
     values: dict[str, Any],
 ) -> None:
-    text = f"The whole run can be looked at from all sides in the [3-D replay]({replay})."
+    text = f"The [3-D replay]({replay}) shows the whole run."
     page.section("Path", text if replay else "")
     page.figure(
         path_figure(log, scene),
-        "Planned, flown and estimated path. Shaded: the hull at several moments. "
+        "Planned, flown and estimated path. Shaded: the hull at several times. "
         + ("Grey: pylons. " if scene.obstacles else "")
         + ("Dashed circle: the goal." if scene.goal is not None else ""),
     )
@@ -124,16 +124,16 @@ def _path_section(
         page.figure(distance)
     samples = samples_figure(log, scene)
     if samples is not None:
-        page.section("Planning", "What the planner looked at before it chose.")
+        page.section("Planning", "Sampled paths and the chosen plan.")
         page.figure(
             samples,
-            "Paths that were sampled at six moments: the darker, the more of them pass. "
-            "Black: the plan chosen. Grey: the path that was flown in the end.",
+            "Sampled paths at six times; darker where more of them pass. Black: the chosen plan. "
+            "Grey: the path flown.",
         )
         planner = planner_figure(log)
         if planner is not None:
             page.figure(
-                planner, f"The planner's own figures, call by call.{_risk(values['planner'])}"
+                planner, f"Cost, risk and clearance of every plan.{_risk(values['planner'])}"
             )
 
 
@@ -142,30 +142,30 @@ def _risk(planner: dict[str, Any]) -> str:
     allowed = planner.get("allowed_collision_probability")
     beyond = planner.get("plans_beyond_allowed")
     if allowed is None:
-        return " No collision risk is allowed for: the chance constraint is left out."
+        return " The planner has no chance constraint."
     text = f" Dashed: the collision risk that the chance constraint allows, {100 * allowed:g} %."
     if not beyond:
-        return f"{text} Every plan keeps to it."
+        return f"{text} Every plan satisfies it."
     return (
-        f"{text} It could not hold in {beyond} of {planner['plans']} plans: nothing that was tried "
-        f"kept to it, and the risk was up to {100 * planner['max_collision_probability']:.2g} %."
+        f"{text} In {beyond} of {planner['plans']} plans no sampled sequence satisfied it; the "
+        f"risk was up to {100 * planner['max_collision_probability']:.2g} %."
     )
 
 
 def _errors_section(page: Page, log: RunLog, values: dict[str, Any]) -> None:
     tracking = tracking_figure(log)
     if tracking is not None:
-        page.section("Tracking", "How far the vehicle was from its plan.")
-        page.figure(tracking, "Plan minus truth, seen from the vehicle.")
+        page.section("Tracking", "Difference between the plan and the true state.")
+        page.figure(tracking, "Plan minus truth, in B.")
     estimate = estimate_figure(log)
     if estimate is not None:
         within = values["estimate"].get("position_within_3_sigma")
-        text = "How far the estimate was from the truth, and how far it thought it could be."
+        text = "Estimation error and its estimated standard deviation."
         if within is not None:
             text += f" {100 * within:.0f} % of the position errors lie within 3σ."
         text += consistency(values["estimate"])
         page.section("Estimate", text)
-        page.figure(estimate, "Truth minus estimate in B, and three standard deviations.")
+        page.figure(estimate, "Truth minus estimate in B, and three estimated standard deviations.")
 
 
 def consistency(estimate: dict[str, Any]) -> str:
@@ -173,9 +173,9 @@ def consistency(estimate: dict[str, Any]) -> str:
     told, text = nees_words(estimate), ""
     if told is not None:
         text = (
-            " NEES, the squared error by the claimed covariance, is 3 on average if that is "
-            f"right. Over this run: {told}, between which a single moment lies with 95 %. Errors "
-            "of one run correlate in time, so its mean is worth few such moments."
+            " NEES, the squared error normalised by the estimated covariance, is 3 on average for "
+            f"a consistent filter. Mean over this run: {told} (95 % of single values). Errors of "
+            "one run are correlated in time, so its mean varies nearly as much as single values."
         )
     if "health" in estimate:
         text += f" Estimator health: {estimate['health']}."
@@ -197,9 +197,9 @@ def _tiles(values: dict[str, Any]) -> list[tuple[str, str, str]]:
         add("Time", values["outcome"]["time_s"], "s", 1)
         add("Distance left", path.get("final_distance_m"), "m", 2)
     add("Path", path["length_m"], "m", 1, f"up to {path['max_speed_m_s']:.2f} m/s")
-    add("Least clearance", path.get("min_clearance_m"), "m", 2, "hull to pylon")
-    add("Off the plan", tracking.get("position_rms_m"), "m", 2, "RMS")
-    add("Estimate off", values["estimate"].get("position_rms_m"), "m", 2, "RMS")
+    add("Minimum clearance", path.get("min_clearance_m"), "m", 2, "hull to pylon")
+    add("Tracking error", tracking.get("position_rms_m"), "m", 2, "RMS")
+    add("Estimation error", values["estimate"].get("position_rms_m"), "m", 2, "RMS")
     return tiles
 
 

@@ -252,12 +252,12 @@ def _fly(
             k += stride
             t = round(k * dt, 9)
             if outcome is None and k >= steps:
-                outcome = Outcome("duration", t, f"The time was over after {t:.1f} s.")
+                outcome = Outcome("duration", t, f"The time limit of {t:.1f} s was reached.")
             elif outcome is None and k // 5 > (k - stride) // 5:
                 done = max(done, k / steps, monitor.progress)
                 tell(done, f"{t:.0f} s, {timing.speed(200):.1f} × real time")
             if outcome is None and stopped.is_set():
-                outcome = Outcome("interrupted", t, f"Stopped by hand after {t:.1f} s.")
+                outcome = Outcome("interrupted", t, f"The run was interrupted after {t:.1f} s.")
         # complete the row of the last sample with the updates at its time
         simulator.AdvanceTo(k * dt + scenario.station.period)
     except FloatingPointError as error:  # its message names the signal that was not finite

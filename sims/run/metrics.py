@@ -56,18 +56,20 @@ def verdict(
         words = outcome.sentence
         if outcome.reason == "duration":
             left = values["path"]["final_distance_m"]
-            words = f"The time was over with {left:.2f} m to go."
+            words = f"The time limit was reached {left:.2f} m from the goal."
         return outcome.reason == "goal", words
     if outcome.reason != "duration":
         return False, outcome.sentence
     rms = values["tracking"]["position_rms_m"]
     if rms is None or math.isnan(rms):
-        return False, "The run was too short to judge how well the path was followed."
+        return False, "The run was too short to measure the tracking error."
     if rms <= success.position_rms:
-        return True, f"The vehicle followed its reference to {rms:.2f} m RMS over the whole run."
+        return (
+            True,
+            f"The vehicle followed its reference within {rms:.2f} m RMS.",
+        )
     return False, (
-        f"The vehicle was {rms:.2f} m RMS off its reference; {success.position_rms:g} m are "
-        "allowed."
+        f"The tracking error was {rms:.2f} m RMS; {success.position_rms:g} m are allowed."
     )
 
 

@@ -64,12 +64,12 @@ def holding(scenario: Scenario) -> ControllerKind:
 
 def no_safe_plan(scenario: Scenario, passage: Passage) -> str:
     """The sentences on the outcome `no safe plan`."""
-    held = " The vehicle held its place." if isinstance(scenario.controller, MppiImpedance) else ""
+    held = " The vehicle kept its pose." if isinstance(scenario.controller, MppiImpedance) else ""
     risk = f"has a collision risk of {_percent(passage.risk)} or more"
     if passage.allowed is None:
-        return f"No safe plan: no way to the goal is wide enough for the hull; each {risk}.{held}"
+        return f"No safe plan: no passage to the goal is wide enough; each {risk}.{held}"
     allowed = _percent(passage.allowed)
-    return f"No safe plan: every way to the goal {risk}, and {allowed} is allowed.{held}"
+    return f"No safe plan: every passage to the goal {risk}; {allowed} is allowed.{held}"
 
 
 def _check(field: str, pose: PoseConfig, scenario: Scenario) -> None:

@@ -91,13 +91,13 @@ def fdm_is_best(rows: Sequence[Row]) -> Verdict:
         known = {m: v for m, v in debiased.items() if v is not None}
         if known:
             first = min(known, key=lambda m: known[m].value)
-            told[-1] += f"; without sampling bias {first} is closest ({known[first]})"
+            told[-1] += f"; by debiased W₂ {first} is closest ({known[first]})"
     return _verdict(text, good, told, seen)
 
 
 def errors_are_competitive(rows: Sequence[Row]) -> Verdict:
     """Each FDM variant's error of the mean path is at most a tenth above the best baseline's."""
-    text = "Its errors (RMSE) are competitive with the baselines' or smaller."
+    text = "FDM's errors (RMSE) are smaller than the baselines' or competitive with them."
     told, good, seen = [], [], False
     for quantity in ("rmse_mean_geodesic", "rmse_mean_velocity"):
         for regime, table in _by_regime(rows, quantity):
@@ -117,7 +117,7 @@ def errors_are_competitive(rows: Sequence[Row]) -> Verdict:
 
 def deterministic_and_moments_are_worse(rows: Sequence[Row]) -> Verdict:
     """W₂ of the PINN and of moment matching lies above geodesic FDM's by the standard error."""
-    text = "Geometry alone is not enough: geometric PINN and moment matching are farther off (W₂)."
+    text = "Geometry alone is not enough: W₂ of geometric PINN and moment matching is larger."
     told, good, seen = [], [], False
     for regime, table in _by_regime(rows, "w2"):
         others = [m for m in GROUP_BASELINES if m in table]
@@ -140,7 +140,7 @@ def moments_collapse(rows: Sequence[Row]) -> Verdict:
 
 def distance_aware_collapses(rows: Sequence[Row]) -> Verdict:
     """The same for the distance-aware objective."""
-    text = "So does the distance-aware objective."
+    text = "The distance-aware objective collapses towards a deterministic model, too."
     return _collapse(rows, ("euclidean-distance-aware",), text)
 
 
@@ -175,7 +175,7 @@ def unconstrained_fails(rows: Sequence[Row]) -> Verdict:
 
 def gain_is_largest_in_sparse_data(rows: Sequence[Row]) -> Verdict:
     """The best baseline's W₂ over the best FDM's is larger on sparse data than on rich."""
-    text = "The gain in W₂ is largest on sparse data."
+    text = "The improvement in W₂ is largest on sparse data."
     gains = {}
     for regime, table in _by_regime(rows, "w2"):
         mine = [table[m].value for m in FDM if m in table]
@@ -292,7 +292,7 @@ def _collapse(rows: Sequence[Row], methods: Sequence[str], text: str) -> Verdict
 
 def _verdict(text: str, good: Sequence[bool], told: Sequence[str], seen: bool) -> Verdict:
     if not seen:
-        return Verdict(text, "not tested", "the runs that this speaks of are lacking")
+        return Verdict(text, "not tested", "the runs that it needs are missing")
     state: State = "reproduced" if all(good) else "not reproduced"
     return Verdict(text, state, "; ".join(told))
 

@@ -44,15 +44,15 @@ _COLUMNS = (
     ("seconds_training", "training, s"),
 )
 _EXPLAINED = (
-    "Runs that succeeded are averaged (± one standard deviation over seeds). A run succeeds if "
-    "training goes to its end, its loss does not end higher than it began, and all numbers and all "
-    "judged motions stay finite. Every law is compared with the true one by samples, at evenly "
-    "spaced times of the whole horizon; the floor is the same number between two independent "
-    "sample sets of the true law. W₂ is exact; its ground distance counts a metre, a radian and "
-    "their rates as the study's settings say. In so many dimensions W₂ of some hundred samples is "
-    "mostly sampling error, which a narrow law has less of: the debiased W₂ takes it off. The "
-    "samples' error compares single motions, which favours a law without noise; the mean path's "
-    "does not."
+    "Values are means over successful runs (± one standard deviation over seeds). A run succeeds "
+    "if training finishes, the final loss is not above the initial one, and all numbers and all "
+    "sampled motions are finite. Every learned law is compared with the true law by samples, at "
+    "evenly spaced times of the whole horizon. The floor is the same metric between two "
+    "independent sample sets of the true law. W₂ is exact; the study's settings weight metres, "
+    "radians and their rates in its ground distance. In many dimensions W₂ of a few hundred "
+    "samples is mostly sampling error, and smaller for a narrow law; the debiased W₂ subtracts "
+    "this error. The error of samples compares single motions, which favours a law without noise; "
+    "the error of the mean path does not."
 )
 
 
@@ -149,11 +149,11 @@ def _page(
     page = Page("Ablation study", _told(rows))
     page.verdict(f"{good} of {len(tested)} tested claims of the paper reproduced.")
     page.table([(v.claim, v.state, v.evidence) for v in found], ("claim", "verdict", "numbers"))
-    page.table([(v.claim, _MET[v.state], v.evidence) for v in aims], ("aim", "", "numbers"))
+    page.table([(v.claim, _MET[v.state], v.evidence) for v in aims], ("target", "", "numbers"))
     page.section("Errors and distances", _EXPLAINED)
     page.figure(
         figures["results"],
-        "Every method in every regime, beside each how many runs succeeded.",
+        "Every method in every regime, with its number of successful runs.",
     )
     for regime in REGIMES:
         lines = _lines(summary, regime)
@@ -166,7 +166,7 @@ def _page(
             with xr.open_dataset(path, engine="h5netcdf") as dataset:
                 metrics[regime] = dataset[["w2"]].load()
     if metrics:
-        page.figure(horizon_figure(metrics), "How far from the true law, over the horizon.")
+        page.figure(horizon_figure(metrics), "W₂ to the true law over the horizon.")
     shown = [name for name in figures if name.startswith("distributions")]
     if shown:
         page.section("Distributions", "Samples of the true and of each learned law from above.")
@@ -179,7 +179,7 @@ def _page(
     page.figure(figures["training"], "Loss against steps; its unit differs by method.")
     failures = [(r["regime"], r["method"], r["seed"], r["failure"]) for r in rows if r["failure"]]
     if failures:
-        page.table(failures, ("regime", "method", "seed", "why training was given up"))
+        page.table(failures, ("regime", "method", "seed", "why training failed"))
     study = _settings(out)
     if study is not None:
         page.details("All settings (study.yaml)", yaml.dump(study))
@@ -248,7 +248,7 @@ def ablation_text(
     lines = [
         _TITLE,
         "",
-        *_wrapped(f"{_told(rows)}, as written by"),
+        *_wrapped(f"{_told(rows)}. Written by"),
         "",
         "```",
         _command(rows, study, docs),
@@ -259,7 +259,7 @@ def ablation_text(
         lines += [*_wrapped(_setting_words(study, rows)), ""]
     lines += ["## The paper's claims", "", "| claim | verdict | numbers |", "|---|---|---|"]
     lines += [_claim(v, v.state) for v in verdicts(rows)]
-    lines += ["", "## This project's aims", "", "| aim | | numbers |", "|---|---|---|"]
+    lines += ["", "## This project's targets", "", "| target | | numbers |", "|---|---|---|"]
     lines += [_claim(v, _MET[v.state]) for v in targets(rows)]
     lines += ["", "## Numbers", "", *_wrapped(_EXPLAINED), ""]
     summary = summarise(rows)
@@ -292,12 +292,11 @@ def _setting_words(study: StudyConfig, rows: Sequence[Row]) -> str:
     return (
         f"The truth is the preset `{study.truth.vehicle}` with the diffusion b = ({b}) N√s and "
         f"N·m√s; networks are pre-trained to the preset `{study.belief}`"
-        f"{'' if fitted else ', and no data have touched that start'}. "
+        f"{'' if fitted else ', and their coefficients are not fitted to data before training'}. "
         f"{words[:1].upper()}{words[1:]}. "
-        f"Laws are compared by {e.samples} samples a scenario at {e.times} times; the distance's "
-        f"weights are {e.metric.position:g} a metre, {e.metric.rotation:g} a radian, "
-        f"{e.metric.linear_velocity:g} a metre a second and {e.metric.angular_velocity:g} a radian "
-        "a second."
+        f"Laws are compared by {e.samples} samples per scenario at {e.times} times. The weights of "
+        f"the ground distance are {e.metric.position:g} per m, {e.metric.rotation:g} per rad, "
+        f"{e.metric.linear_velocity:g} per m/s and {e.metric.angular_velocity:g} per rad/s."
     )
 
 

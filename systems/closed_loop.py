@@ -13,30 +13,17 @@ from .compiled.network import Port, flatten, holders
 from .compiled.signal_log import SignalLog, add_log
 from .controllers.kinds import INPUTS, TOLD, Controller, Goal
 from .station.config import StationConfig
-from .station.simulated import CHEATS, check_stand_in, make_station
+from .station.ports import CHEATS, default_log_periods
+from .station.simulated import check_stand_in, make_station
 
-LOG_PERIODS: Mapping[str, float] = {
-    "X_WB": 0.05,
-    "V_WB_B": 0.05,
-    "covariance": 0.2,
-    "imu": 0.05,
-    "dvl": 0.2,
-    "depth": 0.1,
-    "compass": 0.1,
-    "pwm": 0.05,
-    "status": 0.2,
-    "health": 0.05,
-    "X_WB_cheat": 0.05,
-    "V_WB_B_cheat": 0.05,
-    "F_disturbance_cheat": 0.05,
-    "flow_cheat": 0.05,
+CONTROLLER_PERIODS: Mapping[str, float] = {
     "F_Bo_B": 0.05,
     "F_bias_Bo_W": 0.2,
     "plan": 0.2,
     "samples": 0.2,
     "figures": 0.2,
 }
-"""How often each output port of station and controller is logged (s); others are not."""
+"""How often each output port of a controller is logged (s); others are not."""
 
 
 class Signal(NamedTuple):
@@ -51,7 +38,7 @@ def build_diagram(
     controller: Controller,
     *,
     hardware: bool = False,
-    log_periods: Mapping[str, float] = LOG_PERIODS,
+    log_periods: Mapping[str, float] | None = None,
     extend: Callable[[DiagramBuilder, System, System], Any] | None = None,
     goal: Goal = None,
     stand_in: System | None = None,
@@ -60,7 +47,8 @@ def build_diagram(
 
     A row of the logs is one instant for all ports (`systems.compiled.signal_log`): the results of
     the updates at t, together with the truth at t. The truth is the output of systems that hold the
-    state behind one of the station's ports `CHEATS`.
+    state behind one of the station's ports `CHEATS`. `log_periods` are those of the logged
+    ports (s); if left out, the table's (`station.ports`) and `CONTROLLER_PERIODS`.
 
     `extend(builder, station, controller)` may add more, a visualiser say, before the diagram is
     built. The diagram has no input ports; its randomness comes from sources inside (`seeded`).
@@ -78,20 +66,22 @@ def build_diagram(
     if stand_in is None:
         plant = builder.AddNamedSystem("station", make_station(station, hardware))
     else:
-        check_stand_in(stand_in)
+        check_stand_in(stand_in, station)
         plant = builder.AddNamedSystem("station", stand_in)
     control = controller.add_to(builder, station, goal)
-    for name in INPUTS | TOLD:
+    for name in (*INPUTS, *TOLD):
         if name in INPUTS or (plant.HasOutputPort(name) and control.HasInputPort(name)):
             builder.Connect(plant.GetOutputPort(name), control.GetInputPort(name))
     builder.Connect(control.GetOutputPort("F_Bo_B"), plant.GetInputPort("F_Bo_B"))
     truth = _truth(plant, control)
+    if log_periods is None:
+        log_periods = default_log_periods(station) | CONTROLLER_PERIODS
     for system in (plant, control):
         for i in range(system.num_output_ports()):
             port = system.get_output_port(i)
-            if port.get_name() in log_periods:
-                name, early = port.get_name(), (system, i) in truth
-                add_log(builder, port, name, log_periods[name], early)
+            name = port.get_name()
+            if name in log_periods:
+                add_log(builder, port, name, log_periods[name], (system, i) in truth)
     if extend is not None:
         extend(builder, plant, control)
     diagram = builder.Build()
@@ -143,7 +133,7 @@ def _truth(station: System, controller: System) -> set[Port]:
         for i, port in enumerate(flat[system].shown)
     }
     true = set()
-    for name in CHEATS:
-        if station.HasOutputPort(name):
-            true |= behind[station, int(station.GetOutputPort(name).get_index())]
+    for cheat in CHEATS:
+        if station.HasOutputPort(cheat.name):
+            true |= behind[station, int(station.GetOutputPort(cheat.name).get_index())]
     return {port for port, found in behind.items() if found & true}

@@ -6,15 +6,16 @@ import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from traceback import extract_tb
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 from pydrake.systems.framework import InputPort, OutputPort, System
 
 from ..models.config.errors import UserError
+from ..models.sensors import Sensor
 
 Offered = Mapping[str, Callable[[], Any]]
 """Values passed to a constructor that has an argument of that name, each as a function that makes
@@ -33,13 +34,16 @@ class OwnSystem:
     system: str
     parameters: dict[str, Any] = field(default_factory=dict)
 
+    base: ClassVar[type] = System
+    """What the class must be derived from."""
+
     @property
     def code(self) -> str:
         """The file (or module) whose code runs, and the class in it."""
         where, _, name = self.system.rpartition(":")
         return f"{Path(where).resolve() if where.endswith('.py') else where}:{name}"
 
-    def make(self, offered: Offered) -> System:
+    def make(self, offered: Offered) -> Any:
         """Run the code and build the system; `parameters` take precedence over `offered`.
 
         Raises:
@@ -55,8 +59,9 @@ class OwnSystem:
             )
         with _blamed(f"{kind}.system: {where}"):
             found = getattr(_module(kind, where), name, None)
-        if not (inspect.isclass(found) and issubclass(found, System)):
-            raise UserError(f"{kind}.system: {where} has no Drake system called `{name}`")
+        if not (inspect.isclass(found) and issubclass(found, self.base)):
+            what = "Drake system" if self.base is System else self.base.__name__
+            raise UserError(f"{kind}.system: {where} has no {what} called `{name}`")
         signature = inspect.signature(found)
         arguments, nothing = dict(self.parameters), []
         for word in offered.keys() & signature.parameters.keys() - arguments.keys():
@@ -87,11 +92,26 @@ class OwnFilter(OwnSystem):
 
     It has the outputs `X_WB` and `V_WB_B`, and any of the station's `covariance`, `status` and
     `health`; where it lacks one, the station outputs NaN there, and good health. It is connected to
-    those of `imu`, `dvl`, `depth`, `compass` (`systems.plant.sensor_suite`), `pwm` and
-    `initial_noise` that are among its inputs. Its constructor receives, if it has arguments of
-    these names, the station's `vehicle`, its sensors' configurations `imu`, `dvl`, `depth`,
-    `compass`, the start `X0_WB` and `V0_WB_B`, and the whole configuration `station`.
+    the station's sensors by their names (`imu`, `dvl`, …), `pwm` and `initial_noise` as far as they
+    are among its inputs. Its constructor receives, if it has arguments of these names, the
+    station's `vehicle`, its sensors' configurations by their names, the start `X0_WB` and
+    `V0_WB_B`, and the whole configuration `station`.
     """
+
+
+@dataclass(frozen=True)
+class OwnSensor(OwnSystem):
+    """A user-defined sensor: `system` names a class derived from `models.sensors.Sensor`.
+
+    The station's filter fuses it if it `observes` something.
+    """
+
+    base: ClassVar[type] = Sensor
+
+    def make(self, offered: Offered) -> Any:
+        """As for a system; a list of the parameters becomes a tuple, as sensors have them."""
+        given = {k: tuple(v) if isinstance(v, list) else v for k, v in self.parameters.items()}
+        return OwnSystem.make(replace(self, parameters=given), offered)
 
 
 def port_sizes(system: System) -> tuple[dict[str, int], dict[str, int]]:

@@ -18,13 +18,15 @@ from spinndrift.models import se3
 from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu, wrap
 from spinndrift.sims.estimator_check.scores import within_three_sigma
 from spinndrift.systems.estimation import error_state
-from spinndrift.systems.estimation.delayed import HEALTH, DelayedFilter, EkfConfig, Readings
+from spinndrift.systems.estimation.delayed import DelayedFilter, EkfConfig, Readings, health_names
 
 SEEDS = 10
 EVERY = 20  # samples from one estimate that is kept to the next
 BEGIN, LATER, END = 800, 1400, 2000  # samples of 10 ms: first and last of a fault, end of the run
 GOOD, DEGRADED = 0, 1
-FILTER = DelayedFilter(Imu(), Dvl(dropout_share=0.0), DepthSensor(), Compass(), EkfConfig())
+AIDS = {"dvl": Dvl(dropout_share=0.0), "depth": DepthSensor(), "compass": Compass()}
+FILTER = DelayedFilter(Imu(), tuple(AIDS.values()), EkfConfig())
+HEALTH = health_names(tuple(AIDS))
 
 
 class Dives(NamedTuple):
@@ -55,7 +57,7 @@ def twist(t: Array, phase: Array) -> Array:
 
 def dive(key: Array) -> Dives:
     """A motion with phases of its own and the readings along it."""
-    h, sensors = FILTER.period, (FILTER.imu, FILTER.dvl, FILTER.depth, FILTER.compass)
+    h, sensors = FILTER.period, (FILTER.imu, *FILTER.aids)
     every = [round(FILTER.imu.rate / sensor.rate) for sensor in sensors]
     motion, start, noises = jax.random.split(key, 3)
     phase = 2 * np.pi * jax.random.uniform(motion, (6,))
@@ -84,7 +86,7 @@ def dive(key: Array) -> Dives:
             jnp.concatenate([x, jnp.stack([jnp.ones_like(t), stamp])])
             for x, stamp in zip(others, stamps, strict=True)
         ]
-        readings = Readings(imu, jnp.concatenate([dvl[:4], dvl[6:]]), *marked)
+        readings = Readings(imu, (jnp.concatenate([dvl[:4], dvl[6:]]), *marked))
         return (X, now, states), Dives(readings, X, now)
 
     begin = (X0, twist(jnp.zeros(()), phase), states)
@@ -155,24 +157,24 @@ def imu_spike_in_range(readings: Readings) -> None:
 
 
 def compass_frozen(readings: Readings) -> None:
-    frozen(readings.compass[..., :1], LATER)
+    frozen(readings.aids[2][..., :1], LATER)
 
 
 def compass_turned(readings: Readings) -> None:
-    yaw = readings.compass[:, BEGIN:, 0]
+    yaw = readings.aids[2][:, BEGIN:, 0]
     yaw[:] = wrap(jnp.asarray(yaw + np.deg2rad(40)))
 
 
 def dvl_frozen(readings: Readings) -> None:
-    frozen(readings.dvl[..., :3], LATER)
+    frozen(readings.aids[0][..., :3], LATER)
 
 
 def dvl_late(readings: Readings) -> None:
-    readings.dvl[:, BEGIN:, 4] += 0.15
+    readings.aids[0][:, BEGIN:, 4] += 0.15
 
 
 def depth_jump(readings: Readings) -> None:
-    readings.depth[:, BEGIN:, 0] += 0.5
+    readings.aids[1][:, BEGIN:, 0] += 0.5
 
 
 PASSING = {

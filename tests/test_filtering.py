@@ -19,7 +19,8 @@ from spinndrift.systems.estimation.delayed import DelayedFilter, EkfConfig, Filt
 
 SEEDS, STEPS = 40, 600
 RNG = np.random.default_rng(0)
-SENSORS = (Imu(), Dvl(), DepthSensor(), Compass())
+AIDS = (Dvl(), DepthSensor(), Compass())
+ERRORS = es.INERTIAL + len(AIDS)
 
 
 def navigation(scale: float = 1.0) -> es.Navigation:
@@ -58,10 +59,10 @@ def test_an_increment_follows_newtons_law():
 
 @pytest.mark.parametrize("time", [0.01, 0.1])
 def test_the_transition_is_the_derivative_of_a_step(time):
-    imu, compass = Imu(), Compass()
+    imu = Imu()
     x, force, rate = navigation(), jnp.array([0.5, -0.3, 9.9]), jnp.array([0.3, -0.5, 0.4])
     T = jnp.asarray(time)
-    decay = jnp.exp(-T / compass.wander_time)
+    decay = jnp.exp(-T / Compass().wander_time)
 
     def step(state: es.Navigation) -> es.Navigation:
         sample = es.sample_increment(
@@ -71,19 +72,19 @@ def test_the_transition_is_the_derivative_of_a_step(time):
         return after._replace(sensors=after.sensors * jnp.stack([1.0, 1.0, decay]))
 
     after = step(x)
-    F, _ = es.transition(x, after, force, rate, T, imu, compass)
-    exact = jax.jacfwd(lambda d: es.error(after, step(es.retract(x, d))))(jnp.zeros(es.ERRORS))
+    F, _ = es.transition(x, after, force, rate, T, imu, AIDS)
+    exact = jax.jacfwd(lambda d: es.error(after, step(es.retract(x, d))))(jnp.zeros(ERRORS))
     angle = float(jnp.linalg.norm(rate)) * time
     np.testing.assert_allclose(F, exact, atol=max(1e-12, 10 * angle**4))
 
 
 def test_the_transitions_noise_is_that_of_many_small_steps():
-    imu, compass = Imu(), Compass()
+    imu = Imu()
     x = navigation()
     force, rate = se3.rotate_inverse(x.X_WB, jnp.array([0, 0, imu.gravity])), jnp.zeros(3)
     x = x._replace(v_B=jnp.zeros(3))
     P, n, T = jnp.zeros((18, 18)), 64, 0.1
-    transition = jax.jit(partial(es.transition, imu=imu, compass=compass))
+    transition = jax.jit(partial(es.transition, imu=imu, aids=AIDS))
     F, Q = transition(x, x, force, rate, jnp.asarray(T / n))
     for _ in range(n):
         P = F @ P @ F.T + Q
@@ -96,12 +97,10 @@ def test_the_transitions_noise_is_that_of_many_small_steps():
 
 @jax.jit
 def _innovations(x: es.Navigation) -> list[measurement.Innovation]:
-    _, dvl, depth, compass = SENSORS
     rate = jnp.array([0.2, -0.1, 0.3])
     return [
-        measurement.dvl_innovation(dvl, x, rate, jnp.zeros(3)),
-        measurement.depth_innovation(depth, x, jnp.zeros(1)),
-        measurement.compass_innovation(compass, x, jnp.zeros(1)),
+        measurement.innovation(each, i, x, rate, jnp.zeros(each.value_size))
+        for i, each in enumerate(AIDS)
     ]
 
 
@@ -112,7 +111,7 @@ def _residuals(x: es.Navigation, delta: Array) -> Array:
 
 def test_measurement_jacobians_agree_with_finite_differences():
     x, h = navigation(), 1e-6
-    steps = h * jnp.eye(es.ERRORS)
+    steps = h * jnp.eye(ERRORS)
     columns = [(_residuals(x, -step) - _residuals(x, step)) / (2 * h) for step in steps]
     H = jnp.concatenate([found.H for found in _innovations(x)])
     np.testing.assert_allclose(H, jnp.stack(columns, axis=1), atol=1e-8)
@@ -131,8 +130,8 @@ def test_small_inverse(size):
 
 
 def random_covariance() -> Array:
-    A = RNG.standard_normal((es.ERRORS, es.ERRORS)) * 0.05
-    return jnp.asarray(A @ A.T + 1e-4 * np.eye(es.ERRORS))
+    A = RNG.standard_normal((ERRORS, ERRORS)) * 0.05
+    return jnp.asarray(A @ A.T + 1e-4 * np.eye(ERRORS))
 
 
 @pytest.mark.parametrize("used", [(True, True, True), (True, False, False), (False, True, True)])
@@ -199,7 +198,7 @@ def simulate(core: DelayedFilter, key: Array, steps: int, blind_after: Array, gr
     The DVL is lost after `blind_after` (s); a share `gross` of its readings is off by 1 m/s.
     """
     h, slots = core.period, core.slots
-    sensors = (core.imu, core.dvl, core.depth, core.compass)
+    sensors = (core.imu, *core.aids)
     keys = jax.random.split(key, 5)
     phase = jax.random.uniform(keys[0], (6,)) * 6.28
     X0 = se3.from_position_rpy(jnp.array([0.0, 0, -3]), jnp.array([0.0, 0, 1]))
@@ -231,7 +230,7 @@ def simulate(core: DelayedFilter, key: Array, steps: int, blind_after: Array, gr
             jnp.where(n % m == 0, s.measure(old, X_new, V_new, A, t, w), old)
             for s, old, m, w in zip(sensors, states, every, noises, strict=True)
         ]
-        dvl = core.dvl.reading(states[1], t)
+        dvl = core.aids[0].reading(states[1], t)
         valid = jnp.where(dvl[6] < blind_after, dvl[3:4], 0)
 
         ping = jax.random.fold_in(keys[4], jnp.round(dvl[6] / h).astype(int))
@@ -243,9 +242,7 @@ def simulate(core: DelayedFilter, key: Array, steps: int, blind_after: Array, gr
 
         readings = Readings(
             core.imu.reading(states[0], t),
-            jnp.concatenate([dvl[:3] + off, valid, dvl[6:]]),
-            stamped(2),
-            stamped(3),
+            (jnp.concatenate([dvl[:3] + off, valid, dvl[6:]]), stamped(2), stamped(3)),
         )
         state = core.step(state, readings, k)
         true = jax.tree.map(lambda leaf: leaf[0], past)
@@ -274,9 +271,8 @@ def many(seed: int, blind_after: float = np.inf, gross: float = 0.0) -> Run:
     return jax.tree.map(np.asarray, _many(honest, *values))
 
 
-def core(**changes) -> DelayedFilter:
-    sensors = {"imu": Imu(), "dvl": Dvl(), "depth": DepthSensor(), "compass": Compass()}
-    return DelayedFilter(**(sensors | {"config": EkfConfig()} | changes))
+def core(dvl: Dvl = AIDS[0], config: EkfConfig | None = None) -> DelayedFilter:
+    return DelayedFilter(Imu(), (dvl, *AIDS[1:]), config or EkfConfig())
 
 
 @pytest.fixture(scope="module")
@@ -294,7 +290,7 @@ def nees(run: Run, at: int) -> np.ndarray:
 def test_errors_are_as_large_as_the_covariance_says(honest, at):
     """The sum of all seeds' NEES is chi-square; the bounds hold with probability 99.8 %."""
     total = nees(honest, at).sum()
-    low, high = chi2.ppf([0.001, 0.999], es.ERRORS * SEEDS)
+    low, high = chi2.ppf([0.001, 0.999], ERRORS * SEEDS)
     assert low < total < high
 
 
@@ -343,7 +339,7 @@ def test_outliers_are_shut_out():
     speed = np.sqrt((run.error[:, -1, 6:9] ** 2).sum(axis=-1))
     assert np.median(speed) < 0.02
     # Few small outliers pass, so the errors are a little larger than P says, not many times.
-    assert np.median(nees(run, -1)) < 2 * es.ERRORS
+    assert np.median(nees(run, -1)) < 2 * ERRORS
 
 
 def test_without_the_dvl_the_uncertainty_grows(honest):
@@ -353,7 +349,7 @@ def test_without_the_dvl_the_uncertainty_grows(honest):
     assert np.all(after > 4 * before)
     assert np.all(after > 2 * seen)
     assert np.all(blind.status[:, -1, 7] > 3)  # and the status says since when
-    low, high = chi2.ppf([0.001, 0.999], es.ERRORS * SEEDS)
+    low, high = chi2.ppf([0.001, 0.999], ERRORS * SEEDS)
     assert low < nees(blind, 599).sum() < high
 
 
@@ -367,7 +363,7 @@ def still_readings(k: int, late: int, lost: bool = False) -> Readings:
     v = jnp.array([0.02 * np.sin(shown), 0.01 * np.cos(shown), 0.01 * np.sin(2 * shown)])
     dvl = jnp.concatenate([v, jnp.array([valid, max(shown, 0) * 0.01])])
     never = jnp.array([0.0, 0, 0])
-    return Readings(jnp.array([0.01, 0.02, 9.80665, 0.001, 0, 0]), dvl, never, never)
+    return Readings(jnp.array([0.01, 0.02, 9.80665, 0.001, 0, 0]), (dvl, never, never))
 
 
 def rested(core: DelayedFilter) -> FilterState:

@@ -14,26 +14,20 @@ from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 from spinndrift.models import se3
 from spinndrift.models.config import typed_yaml
 from spinndrift.models.config.errors import UserError
-from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu, Sensor, SensorFault
-from spinndrift.models.sensors.faults import VALUES, FaultySensor
+from spinndrift.models.sensors import SHIPPED, DepthSensor, Dvl, SensorFault
+from spinndrift.models.sensors.faults import FaultySensor
 from spinndrift.systems.closed_loop import Signal, logged, seeded
 from spinndrift.systems.compiled.simulator import CompiledSimulator
-from spinndrift.systems.plant.sensor_suite import NAMES, SensorSuite
+from spinndrift.systems.plant.sensor_suite import SensorSuite
 from spinndrift.systems.station.config import Sensing, StationConfig
 from spinndrift.systems.station.simulated import add_noise
 
-SENSORS: dict[str, Sensor] = {
-    "imu": Imu(),
-    "dvl": Dvl(),
-    "depth": DepthSensor(),
-    "compass": Compass(),
-}
 RATE = 10.0  # of the depth gauge and the compass
 
 
 def see(faults: Sequence[SensorFault], readings: np.ndarray, seed: int = 0) -> np.ndarray:
     """Readings [values, valid, stamp] (time, size) as they are shown."""
-    faulty = FaultySensor(SENSORS[faults[0].sensor], tuple(faults))
+    faulty = FaultySensor(SHIPPED[faults[0].sensor], tuple(faults))
     memory = jnp.zeros(faulty.memory_size)
     noise = np.random.default_rng(seed).standard_normal((len(readings), faulty.noise_size))
     rows = []
@@ -46,8 +40,8 @@ def see(faults: Sequence[SensorFault], readings: np.ndarray, seed: int = 0) -> n
 
 def readings(sensor: str, count: int, seed: int = 1) -> np.ndarray:
     """Valid readings of random values at a sensor's rate."""
-    values = np.random.default_rng(seed).uniform(-1, 1, (count, VALUES[sensor]))
-    time = np.arange(count) / SENSORS[sensor].rate
+    values = np.random.default_rng(seed).uniform(-1, 1, (count, SHIPPED[sensor].value_size))
+    time = np.arange(count) / SHIPPED[sensor].rate
     return np.column_stack([values, np.ones(count), time])
 
 
@@ -178,7 +172,7 @@ def test_faults_act_one_after_the_other():
 
 def _many(fault: SensorFault, n: int) -> np.ndarray:
     """What a fault adds to n readings of zero at one time, as a batch."""
-    faulty = FaultySensor(SENSORS[fault.sensor], (fault,))
+    faulty = FaultySensor(SHIPPED[fault.sensor], (fault,))
     w = np.random.default_rng(3).standard_normal((faulty.noise_size, n))
     reading = jnp.zeros((3, n)).at[1].set(1.0)
     _, shown = faulty.show(jnp.zeros((faulty.memory_size, n)), reading, reading[2], jnp.asarray(w))
@@ -201,21 +195,23 @@ ALL = (
     SensorFault("depth", "noise", 0.2, size=3.0, share=0.8),
     SensorFault("compass", "frozen_stamp", 0.5),
 )
-PERIODS = dict.fromkeys((f"log_{name}" for name in NAMES), 0.01)
+PERIODS = dict.fromkeys((f"log_{name}" for name in SHIPPED), 0.01)
 
 
 def suite(faults: tuple[SensorFault, ...] = ()) -> Diagram:
     """A suite that looks at one motion; its depth gauge keeps no time with the IMU."""
     X = np.asarray(se3.from_position_rpy(jnp.array([1.0, 2, -3]), jnp.array([0.1, -0.2, 0.7])))
     builder = DiagramBuilder()
-    sensors = builder.AddNamedSystem("sensors", SensorSuite(depth=DepthSensor(7.0), faults=faults))
+    sensors = builder.AddNamedSystem(
+        "sensors", SensorSuite({**SHIPPED, "depth": DepthSensor(7.0)}, faults)
+    )
     for name, value in (("X_WB", X), ("V_WB_B", np.full(6, 0.1)), ("A_WB_B", np.zeros(6))):
         source = builder.AddSystem(ConstantVectorSource(value))
         builder.Connect(source.get_output_port(), sensors.GetInputPort(name))
     add_noise(builder, sensors, "noise", 0.01)
     if sensors.HasInputPort("fault_noise"):
         add_noise(builder, sensors, "fault_noise", 0.01)
-    for name in NAMES:
+    for name in SHIPPED:
         log = LogVectorOutput(sensors.GetOutputPort(name), builder, 0.01)
         log.set_name(f"log_{name}")
     return builder.Build()
@@ -234,7 +230,7 @@ def test_a_suite_with_faults_is_the_suite_without_but_for_them():
     healthy = record(Simulator(bare), bare)
     drake = record(Simulator(faulty), faulty)
     loop = record(CompiledSimulator(faulty, PERIODS), faulty)
-    for name in NAMES:
+    for name in SHIPPED:
         np.testing.assert_allclose(loop[name].value, drake[name].value, rtol=1e-12, atol=1e-12)
         before = drake[name].time <= 0.2
         np.testing.assert_array_equal(drake[name].value[before], healthy[name].value[before])
@@ -273,9 +269,9 @@ def test_a_scenario_names_faults():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{sensor: sonar, fault: nan}", "sensor: .*one of imu, dvl"),
+        ("{sensor: sonar, fault: nan}", "sensor is 'sonar': take one of imu, dvl"),
         ("{sensor: imu, fault: broken}", "fault: .*one of nan, infinite"),
-        ("{sensor: imu, fault: dropout}", "fault is 'dropout': the IMU's readings have neither"),
+        ("{sensor: imu, fault: dropout}", "fault is 'dropout': the readings of imu have neither"),
         ("{sensor: dvl, fault: nan, components: [3]}", r"components is \(3,\): .*some of 0 to 2"),
         ("{sensor: dvl, fault: nan, components: [0, 0]}", "components .*each once"),
         ("{sensor: depth, fault: nan, components: [-1]}", "components .*0 is the only one"),

@@ -7,11 +7,11 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from spinndrift.models import se3
 from spinndrift.models.rigid_body import FossenDynamics, spatial_inertia
-from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu
+from spinndrift.models.sensors import SHIPPED, Compass, DepthSensor, Dvl, Imu
 from spinndrift.systems.plant.learned_plant import LearnedPlant
 from spinndrift.systems.plant.sensor_suite import SensorSuite
 
-PORTS = ("imu", "dvl", "depth", "compass")
+PORTS = tuple(SHIPPED)
 X = np.asarray(se3.from_position_rpy(jnp.array([1.0, 2, -3]), jnp.array([0.1, -0.2, 0.7])))
 V = np.array([0.5, -0.2, 0.1, 0.2, -0.1, 0.3])
 A = np.array([0.1, 0.2, -0.3, 0.4, -0.5, 0.6])
@@ -65,7 +65,8 @@ def test_without_noise_the_readings_are_the_expected_ones():
     imu = Imu(position=(0.1, 0.2, -0.1), rpy=(0.1, 0.2, 0.3), integrating=False)
     dvl = Dvl(dropout_share=0.0, outlier_share=0.0)
     depth, compass = DepthSensor(), Compass()
-    shown = still(SensorSuite(imu, dvl, depth, compass), 1.05)
+    on_board = {"imu": imu, "dvl": dvl, "depth": depth, "compass": compass}
+    shown = still(SensorSuite(on_board), 1.05)
     x, v, a = jnp.asarray(X), jnp.asarray(V), jnp.asarray(A)
     np.testing.assert_allclose(shown["imu"], imu.expected(x, v, a), rtol=1e-12)
     np.testing.assert_allclose(shown["dvl"][:4], [*dvl.expected(v), 1], rtol=1e-12)
@@ -107,7 +108,8 @@ def test_the_dvl_is_late_by_its_latency_and_says_so(history):
 
 
 def test_biases_are_drawn_at_the_start():
-    sensors = SensorSuite(Imu(accelerometer_bias=1.0), depth=DepthSensor(offset_std=0.5))
+    imu, depth = Imu(accelerometer_bias=1.0), DepthSensor(offset_std=0.5)
+    sensors = SensorSuite({**SHIPPED, "imu": imu, "depth": depth})
     simulator = Simulator(sensors)
     context = simulator.get_mutable_context()
     sensors.GetInputPort("X_WB").FixValue(context, X)

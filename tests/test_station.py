@@ -26,7 +26,8 @@ from spinndrift.systems.planning.mppi_config import MppiConfig
 from spinndrift.systems.planning.obstacles import BoxHull, Cylinders, Pylon
 from spinndrift.systems.planning.paths import HoldPose, PoseConfig
 from spinndrift.systems.station.config import Sensing, StationConfig
-from spinndrift.systems.station.simulated import make_station, station_ports
+from spinndrift.systems.station.ports import station_ports
+from spinndrift.systems.station.simulated import make_station
 
 START = PoseConfig((0.0, 0.0, -1.5))
 HARBOUR = StationConfig(disturbance_set="harbour", seed=3)

@@ -6,30 +6,31 @@ import numpy as np
 
 from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu
 from spinndrift.systems.estimation.trust import (
-    SIZES,
     Shown,
     Trust,
     counted,
     imu_off,
     judged,
+    sizes,
     suspected,
     with_doubt,
 )
 
 PATIENCE = 10
 GATES = (16.3, 10.8, 10.8)
-DVL = Dvl()
+AIDS = (Dvl(), DepthSensor(), Compass())
+SIZES = sizes(AIDS)
 NONE, ALL = jnp.zeros(3, bool), jnp.ones(3, bool)
 
 
 @jax.jit
 def show(shown: Shown, values, valid, stamps):
-    return shown.with_readings(DVL, values, valid, stamps)
+    return shown.with_readings(AIDS, values, valid, stamps)
 
 
 def usable(values: list, stamps: list, valid=ALL) -> np.ndarray:
     """Which of the readings after each other could be used, (readings, sensors)."""
-    shown, found = Shown.start(jnp.dtype("float64")), []
+    shown, found = Shown.start(AIDS, jnp.dtype("float64")), []
     for value, stamp in zip(values, stamps, strict=True):
         given = jnp.asarray(value, float), valid, jnp.full(3, float(stamp))
         shown, good = show(shown, *given)
@@ -76,12 +77,12 @@ def test_zeros_of_lost_lock_sentinels_and_what_is_not_finite_are_not_used():
 
 def judge(rejected: float, jump: float, well: bool, **more) -> tuple:
     """The verdict on a compass of which a reading came."""
-    start = Trust.start(jnp.dtype("float64"))
+    start = Trust.start(AIDS, jnp.dtype("float64"))
     trust = start._replace(
         rejected=start.rejected.at[2].set(rejected), jump=start.jump.at[2].set(jump), **more
     )
     used = jnp.array([False, False, True])
-    off = imu_off(Imu(), DVL, DepthSensor(), Compass())
+    off = imu_off(Imu(), AIDS)
     trust, (left_out, follow) = judged(trust, used, off, PATIENCE, jnp.full(3, well))
     return trust, bool(left_out[2]), bool(follow[2])
 
@@ -108,7 +109,7 @@ def test_a_sensor_comes_back_when_its_readings_pass_again():
 
 def test_noise_is_raised_by_the_mean_nis_and_not_by_chance():
     rng = np.random.default_rng(1)
-    usual = larger = several = Trust.start(jnp.dtype("float64"))
+    usual = larger = several = Trust.start(AIDS, jnp.dtype("float64"))
     factors, biases = [], []
     only_dvl = np.array([5.0, 1, 1])
     for _ in range(400):
@@ -129,7 +130,7 @@ def test_noise_is_raised_by_the_mean_nis_and_not_by_chance():
 @jax.jit
 def _count(trust, nis, w):
     zero = jnp.zeros(())
-    return counted(trust, ALL, ALL, nis, nis, GATES, (w, jnp.ones(5)), zero)
+    return counted(AIDS, trust, ALL, ALL, nis, nis, GATES, (w, jnp.ones(5)), zero)
 
 
 def count(trust: Trust, nis: np.ndarray, w: np.ndarray) -> Trust:
@@ -138,14 +139,14 @@ def count(trust: Trust, nis: np.ndarray, w: np.ndarray) -> Trust:
 
 
 def test_innovations_with_a_mean_make_a_suspect():
-    trust, time = Trust.start(jnp.dtype("float64")), jnp.asarray(10.0)
+    trust, time = Trust.start(AIDS, jnp.dtype("float64")), jnp.asarray(10.0)
     rng = np.random.default_rng(2)
     for _ in range(60):
         w = rng.standard_normal(5)
         w[4] += 1.5
         trust = count(trust, rng.chisquare(SIZES), w)
     pulled = jnp.ones((3, 18))
-    trust = suspected(trust, NONE, NONE, ALL, ALL, pulled, time, jnp.asarray(0.1))
+    trust = suspected(AIDS, trust, NONE, NONE, ALL, ALL, pulled, time, jnp.asarray(0.1))
     np.testing.assert_array_equal(trust.suspect(time + 50), [False, False, True])
     assert not trust.suspect(time + 70).any()
     np.testing.assert_allclose(trust.pulled[:2], 0.95)  # only recent pulls of others are kept
@@ -163,16 +164,16 @@ def test_outliers_do_not_look_like_a_bias():
         trust = jax.vmap(_count)(trust, *given)
         return trust, jnp.abs(trust.mean).max(axis=1)
 
-    start = jax.tree.map(lambda x: jnp.stack([x] * side), Trust.start(jnp.dtype("float64")))
+    start = jax.tree.map(lambda x: jnp.stack([x] * side), Trust.start(AIDS, jnp.dtype("float64")))
     _, largest = jax.jit(lambda: jax.lax.scan(over, start, (jnp.asarray(nis), jnp.asarray(w))))()
     assert largest.max() < 0.8
 
 
 def test_a_sensor_that_was_stuck_is_suspect_for_a_short_time_alone():
     """Until its values stood still it was right, and what repeats is not used."""
-    trust, time = Trust.start(jnp.dtype("float64")), jnp.asarray(10.0)
+    trust, time = Trust.start(AIDS, jnp.dtype("float64")), jnp.asarray(10.0)
     stuck = jnp.array([True, False, False])
-    trust = suspected(trust, NONE, stuck, ALL, ALL, jnp.ones((3, 18)), time, jnp.asarray(0.1))
+    trust = suspected(AIDS, trust, NONE, stuck, ALL, ALL, jnp.ones((3, 18)), time, jnp.asarray(0.1))
     np.testing.assert_array_equal(trust.suspect(time + 2), [True, False, False])
     assert not trust.suspect(time + 4).any()
 

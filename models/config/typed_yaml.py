@@ -4,7 +4,7 @@ A configuration is a dataclass: its annotations are the schema, its defaults the
 Supported are nested dataclasses, bool, int, float, str, Path, Literal, Optional, list, tuple, dict,
 NumPy arrays (`Float[np.ndarray, "3"]` also checks the shape), unions, and Any for YAML's own types:
 numbers, text, lists and mappings. In a union of dataclasses the file names the class by a tag, as
-in Drake's typed YAML:
+in Drake's typed YAML (an abstract member stands for what only Python can give):
 
     disturbances:
       - !OrnsteinUhlenbeckWrench {time_constant: 3.0}
@@ -17,6 +17,7 @@ loader adds file, line and field to its message.
 
 import dataclasses
 import difflib
+import inspect
 import math
 import sys
 from collections.abc import Mapping
@@ -306,8 +307,8 @@ def _is_union(cls: Any) -> bool:
 
 
 def _union(cls: Any, converter: Converter) -> Any:
-    members = [member for member in get_args(cls) if member is not NoneType]
-    optional = len(members) < len(get_args(cls))
+    members = [m for m in get_args(cls) if m is not NoneType and not inspect.isabstract(m)]
+    optional = NoneType in get_args(cls)
     kinds: list[Any] = [member for member in members if dataclasses.is_dataclass(member)]
     classes = {kind.__name__: kind for kind in kinds}
     others = [member for member in members if not dataclasses.is_dataclass(member)]
@@ -338,7 +339,7 @@ def _untagged(cls: Any, converter: Converter) -> Any:
 
     def unstructure(value: Any) -> Any:
         plain = converter.unstructure(value, type(value))
-        if len(classes) > 1 and type(value) in classes:
+        if len(classes) > 1 and dataclasses.is_dataclass(value):
             return Tagged(type(value).__name__, plain)
         return plain
 

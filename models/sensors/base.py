@@ -1,14 +1,32 @@
-"""Interface of sensors, and their mounting on the vehicle."""
+"""Interface of sensors, their mounting on the vehicle, and their measurement models."""
 
 import abc
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import se3
 from ..config.checks import Vector3, check_numbers, require
 from ..randomness import Scalar
+
+
+class Innovation(NamedTuple):
+    """Residual of a reading and the slopes of the measurement; None for what it does not measure.
+
+    The slopes are those in [δp, δθ] of the pose, in the velocity v_B, in the rate ω_B and in the
+    sensor's slow error.
+    """
+
+    residual: Float[Array, "m"]
+    pose: Float[Array, "m 6"] | None = None
+    velocity: Float[Array, "m 3"] | None = None
+    rate: Float[Array, "m 3"] | None = None
+    slow: Float[Array, "m"] | None = None
 
 
 @dataclass(frozen=True)
@@ -18,8 +36,12 @@ class Sensor(abc.ABC):
     `measure` is called every 1/`rate` seconds and returns a new state `(state_size, *batch)`: the
     slow errors and the last readings. `reading` is the output at a time t. A Drake system holds the
     state, updates it periodically and evaluates its output from it. Randomness enters through `w`
-    alone, independent unit Gaussians. Each kind also has a noise-free `expected`, the measurement
-    function of an estimator.
+    alone, independent unit Gaussians.
+
+    A reading is the measured values alone, and the station adds [valid, time] to it; that of a
+    sensor that is `late` has them itself, as [values, valid, …, time]. A sensor that `observes`
+    something is fused by the station's filter: it has `predicted`, its noise `noise_std` and one
+    slow error of standard deviation and time constant `slow_error`.
 
     Attributes:
         rate: measurements per second (Hz).
@@ -30,6 +52,15 @@ class Sensor(abc.ABC):
     rate: float = 10.0
     position: Vector3 = (0.0, 0.0, 0.0)
     rpy: Vector3 = (0.0, 0.0, 0.0)
+
+    observes: ClassVar[Literal["velocity", "position", "attitude"] | None] = None
+    """What a filter corrects with it; None if it is not fused."""
+    late: ClassVar[bool] = False
+    """Whether a reading appears later than it was measured."""
+    angle: ClassVar[bool] = False
+    """Whether its values are angles in [−π, π)."""
+    stuck_after: ClassVar[int] = 4
+    """Repeats of one value, bit for bit, after which it is stuck."""
 
     def __post_init__(self) -> None:
         """Check numbers; kinds extend this with their own limits and raise `UserError`."""
@@ -85,6 +116,83 @@ class Sensor(abc.ABC):
         """Return the sensor's output at time t; it is the end of the state."""
         del t
         return state[self.state_size - self.reading_size :]
+
+    @property
+    def value_size(self) -> int:
+        """Number of values in a reading."""
+        return self.reading_size
+
+    @property
+    def port_size(self) -> int:
+        """Length of the output on a station: the reading, with [valid, time] unless it has them."""
+        return self.reading_size if self.late else self.reading_size + 2
+
+    def marked(self, shown: Float[Array, "r *batch"]) -> Float[Array, "m *batch"]:
+        """[values, valid, time] of an output."""
+        n = self.value_size
+        return shown if n + 2 == shown.shape[0] else jnp.concatenate([shown[: n + 1], shown[-1:]])
+
+    @property
+    def noise_std(self) -> tuple[float, ...]:
+        """Standard deviation of each value's white noise."""
+        return (getattr(self, "noise", 0.0),) * self.value_size
+
+    @property
+    def slow_error(self) -> tuple[float, float]:
+        """Standard deviation and time constant (s) of the slow error, infinite for a constant."""
+        return 0.0, math.inf
+
+    @property
+    def latencies(self) -> tuple[float, float]:
+        """Shortest and longest time from a measurement to its appearance (s)."""
+        return 0.0, 0.0
+
+    @property
+    def largest(self) -> float:
+        """Norm of the values above which a reading is invalid."""
+        return math.inf
+
+    def predicted(
+        self, X_WB: Float[Array, "7"], V_WB_B: Float[Array, "6"], slow: Float[Array, "1"]
+    ) -> Float[Array, "m"]:
+        """Noise-free values at a pose, a twist and a slow error, for `innovation`."""
+        raise NotImplementedError(f"{type(self).__name__} has no measurement model")
+
+    def innovation(
+        self,
+        X_WB: Float[Array, "7"],
+        V_WB_B: Float[Array, "6"],
+        slow: Float[Array, "1"],
+        values: Float[Array, "m"],
+    ) -> Innovation:
+        """The residual of `predicted` and its derivatives; a kind may state them itself."""
+
+        def moved(delta: Float[Array, "13"]) -> Float[Array, "m"]:
+            X = se3.retract(X_WB, delta[:6])
+            return self.predicted(X, V_WB_B + delta[6:12], slow + delta[12:])
+
+        J = jax.jacfwd(moved)(jnp.zeros(13, X_WB.dtype))
+        residual = values - self.predicted(X_WB, V_WB_B, slow)
+        return Innovation(residual, J[:, :6], J[:, 6:9], J[:, 9:12], J[:, 12])
+
+    def add_to(self, station: Any, name: str) -> None:
+        """Add it to a station's builder (`systems.station.simulated.StationBuilder`)."""
+        station.measure(name, self)
+
+
+def along_pose(h: Callable[[Array], Array], X_WB: Float[Array, "7"]) -> tuple[Array, Array]:
+    """Value of h at a pose and its Jacobian in the pose's error, by forward differentiation."""
+    value, slope = jax.linearize(h, X_WB)
+    return value, jax.vmap(slope, in_axes=1, out_axes=1)(_tangents(X_WB))
+
+
+def _tangents(X_WB: Float[Array, "7"]) -> Float[Array, "7 6"]:
+    """The derivative of X exp(ξ) at ξ = 0: q̇ = q (0, δθ) / 2, ṗ = R δp."""
+    w, x, y, z = jnp.unstack(X_WB[:4] / 2)
+    turns = jnp.stack([-x, -y, -z, w, -z, y, z, w, -x, -y, x, w]).reshape(4, 3)
+    zero = jnp.zeros((3, 3), X_WB.dtype)
+    moves = jnp.concatenate([se3.rotation_matrix(X_WB), zero], axis=1)
+    return jnp.concatenate([jnp.concatenate([jnp.zeros_like(turns), turns], axis=1), moves])
 
 
 def velocity_at(

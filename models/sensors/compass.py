@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -9,7 +10,7 @@ from jaxtyping import Array, Float
 from .. import se3
 from ..config.checks import require
 from ..randomness import Scalar, column, gauss_markov
-from .base import Sensor
+from .base import Innovation, Sensor, along_pose
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,9 @@ class Compass(Sensor):
     noise: float = 0.01
     wander: float = 0.03
     wander_time: float = 60.0
+
+    observes: ClassVar[Literal["attitude"]] = "attitude"
+    angle: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         """Check signs."""
@@ -58,6 +62,35 @@ class Compass(Sensor):
     def reading_size(self) -> int:
         """Yaw."""
         return 1
+
+    @property
+    def slow_error(self) -> tuple[float, float]:
+        """The wander."""
+        return self.wander, self.wander_time
+
+    def innovation(
+        self,
+        X_WB: Float[Array, "7"],
+        V_WB_B: Float[Array, "6"],
+        slow: Float[Array, "1"],
+        values: Float[Array, "1"],
+    ) -> Innovation:
+        """Component of the bow perpendicular to the compass heading, corrected for the wander.
+
+        The component of the bow perpendicular to the true heading is zero at every attitude, and is
+        differentiable where yaw is not. A yaw error Δ makes it cos θ sin Δ, so the residual is
+        cos θ times that of yaw; beyond 90° it is clipped. The noise, cos θ times that of the
+        compass, is taken as the compass' own: a compass is no more accurate than that while the bow
+        is up.
+        """
+        yaw = self.expected(X_WB)
+        off = jnp.clip(wrap(values - yaw - slow), -math.pi / 2, math.pi / 2)
+        shown = yaw + off
+        across = jnp.concatenate([-jnp.sin(shown), jnp.cos(shown), jnp.zeros_like(shown)])
+        bow = jnp.eye(3, dtype=yaw.dtype)[0]
+        h, H = along_pose(lambda X: (across @ se3.rotate(X, bow))[None], X_WB)
+        level = jnp.linalg.norm(se3.rotate(X_WB, bow)[:2]) * jnp.cos(off[0])
+        return Innovation(-h, H, slow=level[None])
 
     def expected(self, X_WB: Float[Array, "7 *batch"]) -> Float[Array, "1 *batch"]:
         """Noise-free reading: the yaw of B."""

@@ -1,6 +1,8 @@
 """Depth from water pressure."""
 
+import math
 from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,7 +10,7 @@ from jaxtyping import Array, Float
 from .. import se3
 from ..config.checks import Vector3, require
 from ..randomness import Scalar, column
-from .base import Sensor
+from .base import Innovation, Sensor, along_pose
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,9 @@ class DepthSensor(Sensor):
     water_density: float = 1025.0
     assumed_density: float = 1025.0
 
+    observes: ClassVar[Literal["position"]] = "position"
+    stuck_after: ClassVar[int] = 8  # its resolution may be as coarse as its noise
+
     def __post_init__(self) -> None:
         """Check signs."""
         super().__post_init__()
@@ -62,6 +67,22 @@ class DepthSensor(Sensor):
     def reading_size(self) -> int:
         """Depth."""
         return 1
+
+    @property
+    def slow_error(self) -> tuple[float, float]:
+        """The offset."""
+        return self.offset_std, math.inf
+
+    def innovation(
+        self,
+        X_WB: Float[Array, "7"],
+        V_WB_B: Float[Array, "6"],
+        slow: Float[Array, "1"],
+        values: Float[Array, "1"],
+    ) -> Innovation:
+        """Depth of the gauge and its offset."""
+        expected, H = along_pose(self.expected, X_WB)
+        return Innovation(values - expected - slow, H, slow=jnp.ones_like(slow))
 
     def expected(self, X_WB: Float[Array, "7 *batch"]) -> Float[Array, "1 *batch"]:
         """Noise-free reading: −z of the sensor times the ratio of the densities."""

@@ -1,6 +1,8 @@
 """Doppler velocity log: velocity over the bed, with latency and drop-outs."""
 
+import math
 from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -8,7 +10,7 @@ from jaxtyping import Array, Float
 from .. import se3
 from ..config.checks import Vector3, require
 from ..randomness import Scalar, bernoulli, column, uniform
-from .base import Sensor, velocity_at
+from .base import Innovation, Sensor, velocity_at
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,9 @@ class Dvl(Sensor):
     highest_speed: float = 3.75
     water_depth: float = 10.0
 
+    observes: ClassVar[Literal["velocity"]] = "velocity"
+    late: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         """Check signs, shares and that a reading appears before the next measurement."""
         super().__post_init__()
@@ -110,6 +115,38 @@ class Dvl(Sensor):
     def reading_size(self) -> int:
         """Velocity, valid, altitude, figure of merit, time of validity."""
         return 7
+
+    @property
+    def value_size(self) -> int:
+        """Velocity."""
+        return 3
+
+    @property
+    def slow_error(self) -> tuple[float, float]:
+        """The scale error."""
+        return self.scale_std, math.inf
+
+    @property
+    def latencies(self) -> tuple[float, float]:
+        """Those configured."""
+        return self.earliest_latency, self.latest_latency
+
+    @property
+    def largest(self) -> float:
+        """A tenth above the highest speed."""
+        return 1.1 * self.highest_speed
+
+    def innovation(
+        self,
+        X_WB: Float[Array, "7"],
+        V_WB_B: Float[Array, "6"],
+        slow: Float[Array, "1"],
+        values: Float[Array, "3"],
+    ) -> Innovation:
+        """(1 + scale) R_SB (v + ω × r)."""
+        E = self.expected(jnp.eye(6, dtype=V_WB_B.dtype))  # the measurement is linear in the twist
+        EV, scale = E @ V_WB_B, 1 + slow[0]
+        return Innovation(values - scale * EV, None, scale * E[:, :3], scale * E[:, 3:], EV)
 
     def expected(self, V_WB_B: Float[Array, "6 *batch"]) -> Float[Array, "3 *batch"]:
         """Noise-free velocity in the transducer's axes: R_SB (v + ω × r)."""

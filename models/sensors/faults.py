@@ -17,12 +17,8 @@ from jaxtyping import Array, Bool, Float
 from ..config.checks import check_numbers, require
 from ..randomness import bernoulli, column
 from .base import Sensor
-from .compass import Compass, wrap
-from .depth import DepthSensor
-from .dvl import Dvl
-from .imu import Imu
+from .compass import wrap
 
-SensorName = Literal["imu", "dvl", "depth", "compass"]
 FaultName = Literal[
     "nan",
     "infinite",
@@ -37,9 +33,6 @@ FaultName = Literal[
     "frozen_stamp",
     "stamp_offset",
 ]
-VALUES: Mapping[str, int] = {"imu": 6, "dvl": 3, "depth": 1, "compass": 1}
-"""Values in a reading: specific force and angular rate, velocity, depth, yaw."""
-
 _LONGEST = 10.0  # longest latency (s); it bounds the number of stored readings
 _SLACK = 1e-6  # rounding of a reading's number: times are whole periods
 
@@ -61,7 +54,7 @@ class SensorFault:
         share: probability that a reading in this time is affected (1), independently of others.
     """
 
-    sensor: SensorName
+    sensor: str
     fault: FaultName
     start: float = 0.0
     duration: float | None = None
@@ -70,11 +63,10 @@ class SensorFault:
     share: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check names, numbers and that the fault makes sense for the sensor."""
+        """Check the kind's name and the numbers."""
         check_numbers(self)
-        for field, names in (("sensor", get_args(SensorName)), ("fault", get_args(FaultName))):
-            known = ", ".join(names)
-            require(getattr(self, field) in names, self, field, f"take one of {known}")
+        known = get_args(FaultName)
+        require(self.fault in known, self, "fault", f"take one of {', '.join(known)}")
         require(self.start >= 0, self, "start", "give a time of zero or more")
         require(
             self.duration is None or self.duration >= 0,
@@ -83,34 +75,41 @@ class SensorFault:
             "give zero or more, or leave it out for a fault that stays",
         )
         require(0 <= self.share <= 1, self, "share", "give a probability from 0 to 1")
-        self._check_fault()
-
-    def _check_fault(self) -> None:
-        kind, n = _KINDS[self.fault], VALUES[self.sensor]
-        require(
-            self.sensor != "imu" or not kind.marks,
-            self,
-            "fault",
-            "the IMU's readings have neither valid mark nor stamp; take frozen or latency, or "
-            "another sensor",
-        )
+        kind = _KINDS[self.fault]
         require(
             not self.components or not kind.marks,
             self,
             "components",
             f"{self.fault} concerns the whole reading; leave them out",
         )
-        known = set(self.components) <= set(range(n))
-        several = len(set(self.components)) < len(self.components)
-        which = "0 is the only one" if n == 1 else f"take some of 0 to {n - 1}, each once"
-        remedy = f"of the values of {self.sensor} {which}"
-        require(known and not several, self, "components", remedy)
         if kind.size is None:
             require(self.size is None, self, "size", f"{self.fault} has none; leave it out")
             return
         require(self.size is not None, self, "size", f"{self.fault} needs one: give {kind.size}")
         low, high = kind.limits
         require(low <= (self.size or 0.0) <= high, self, "size", f"give {kind.size}")
+
+    def check(self, sensors: Mapping[str, Sensor]) -> None:
+        """Check that the fault makes sense for the sensor that it names.
+
+        Raises:
+            UserError: there is no such sensor, or it has no such component, mark or stamp.
+        """
+        known = ", ".join(sensors)
+        require(self.sensor in sensors, self, "sensor", f"take one of {known}")
+        sensor, n = sensors[self.sensor], sensors[self.sensor].value_size
+        require(
+            sensor.port_size > n or not _KINDS[self.fault].marks,
+            self,
+            "fault",
+            f"the readings of {self.sensor} have neither valid mark nor stamp; take frozen or "
+            "latency, or another sensor",
+        )
+        within = set(self.components) <= set(range(n))
+        several = len(set(self.components)) < len(self.components)
+        which = "0 is the only one" if n == 1 else f"take some of 0 to {n - 1}, each once"
+        remedy = f"of the values of {self.sensor} {which}"
+        require(within and not several, self, "components", remedy)
 
     def readings(self, rate: float) -> tuple[float, float]:
         """Number of the first affected reading, and of the first one after the fault."""
@@ -124,11 +123,9 @@ class SensorFault:
         """Number of stored readings."""
         return _KINDS[self.fault].kept(self.size or 0.0, rate)
 
-    @property
-    def noise_size(self) -> int:
+    def noise_size(self, sensor: Sensor) -> int:
         """Number of unit Gaussians that one reading takes."""
-        noise = VALUES[self.sensor] if self.fault == "noise" else 0
-        return noise + (0 < self.share < 1)
+        return (sensor.value_size if self.fault == "noise" else 0) + (0 < self.share < 1)
 
     def show(
         self,
@@ -143,28 +140,28 @@ class SensorFault:
         The memory, if there is any, is a flag that it is filled and the newest `kept` readings, all
         zero before the first.
         """
-        n, batch = VALUES[self.sensor], reading.shape[1:]
+        n, batch = sensor.value_size, reading.shape[1:]
         first, end = self.readings(sensor.rate)
         number = jnp.round(t * sensor.rate)
         hit = (number >= first) & (number < end)
         if self.share < 1:
             hit = hit & (bernoulli(w[-1], self.share) if self.share > 0 else False)
 
-        memory, ring = self._remember(memory, reading, hit)
+        memory, ring = self._remember(memory, reading, hit, n)
         chosen = np.isin(np.arange(n), self.components or np.arange(n))
         look = _Look(self, sensor, reading, ring, t - self.start, w, bool(chosen.all()))
         values, valid, stamp = _KINDS[self.fault].act(look)
-        if isinstance(sensor, Compass):
+        if sensor.angle:
             values = _in_range(values)
         values = jnp.where(chosen.reshape((-1,) + (1,) * len(batch)), values, reading[:n])
         faulty = jnp.concatenate([values, valid[None], stamp[None]])
         return memory, jnp.where(hit, faulty, reading)
 
-    def _remember(self, memory: Array, reading: Array, hit: Array) -> tuple[Array, Array]:
+    def _remember(self, memory: Array, reading: Array, hit: Array, n: int) -> tuple[Array, Array]:
         """The memory with this reading added, and its readings, the newest first."""
         if not len(memory):
             return memory, reading[:0]
-        n, batch = VALUES[self.sensor], reading.shape[1:]
+        batch = reading.shape[1:]
         old = memory[1:].reshape(-1, n + 2, *batch)
         new = jnp.where(memory[0] > 0, jnp.concatenate([reading[None], old[:-1]]), reading[None])
         # Latency delays all readings; a frozen sensor repeats the last good one.
@@ -193,13 +190,12 @@ class FaultySensor:
     @property
     def _memory_sizes(self) -> list[int]:
         kept = [fault.kept(self.sensor.rate) for fault in self.faults]
-        sizes = [VALUES[fault.sensor] + 2 for fault in self.faults]
-        return [1 + k * size if k else 0 for k, size in zip(kept, sizes, strict=True)]
+        return [1 + k * (self.sensor.value_size + 2) if k else 0 for k in kept]
 
     @property
     def noise_size(self) -> int:
         """Number of unit Gaussians that one reading takes."""
-        return sum(fault.noise_size for fault in self.faults)
+        return sum(fault.noise_size(self.sensor) for fault in self.faults)
 
     def show(
         self,
@@ -211,7 +207,8 @@ class FaultySensor:
         """As `SensorFault.show`, for all faults."""
         kept, shown = [], reading
         places = pairwise(np.cumsum([0, *self._memory_sizes]))
-        noises = pairwise(np.cumsum([0, *(fault.noise_size for fault in self.faults)]))
+        drawn = (fault.noise_size(self.sensor) for fault in self.faults)
+        noises = pairwise(np.cumsum([0, *drawn]))
         for fault, (a, b), (c, d) in zip(self.faults, places, noises, strict=True):
             own, shown = fault.show(self.sensor, memory[a:b], shown, t, w[c:d])
             kept.append(own)
@@ -266,7 +263,7 @@ def _constant(look: _Look) -> _Parts:
 
 def _noisy(values: Array, look: _Look) -> Array:
     """Additional white noise: together with the sensor's own its std is `size` times that."""
-    std = column(_noise_std(look.sensor), values) * math.sqrt(look.size**2 - 1)
+    std = column(look.sensor.noise_std, values) * math.sqrt(look.size**2 - 1)
     return values + std * look.w[: len(values)]
 
 
@@ -289,7 +286,7 @@ def _late(look: _Look) -> _Parts:
     values, mark = older[:-2], older[-2]
     if part:
         change = look.ring[whole + 1][:-2] - values
-        change = wrap(change) if isinstance(look.sensor, Compass) else change
+        change = wrap(change) if look.sensor.angle else change
         values, mark = values + part * change, mark * look.ring[whole + 1][-2]
     return values, mark if look.whole else mark * valid, stamp
 
@@ -314,15 +311,6 @@ def _periods(time: float, rate: float) -> tuple[int, float]:
 def _kept_late(size: float, rate: float) -> int:
     whole, part = _periods(size, rate)
     return whole + (2 if part else 1)
-
-
-def _noise_std(sensor: Sensor) -> tuple[float, ...]:
-    """Standard deviation of each value's white noise."""
-    if isinstance(sensor, Imu):
-        accelerometer, gyroscope = sensor.noise_std()
-        return (accelerometer,) * 3 + (gyroscope,) * 3
-    assert isinstance(sensor, Dvl | DepthSensor | Compass)
-    return (sensor.noise,) * (3 if isinstance(sensor, Dvl) else 1)
 
 
 def _in_range(yaw: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

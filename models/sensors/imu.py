@@ -66,6 +66,11 @@ class Imu(Sensor):
             require(getattr(self, f"{kind}_range") > 0, self, f"{kind}_range", "give above zero")
 
     @property
+    def port_size(self) -> int:
+        """Its output has no mark and no time: it is never late."""
+        return 6
+
+    @property
     def state_size(self) -> int:
         """Six biases, the last attitude and velocity, whether there are any, and the reading."""
         return 20
@@ -120,10 +125,11 @@ class Imu(Sensor):
         v_W = se3.rotate(X_WB, velocity_at(X_BS[4:], V_WB_B))
         return jnp.concatenate([se3.compose(X_WB, X_BS)[:4], v_W])
 
-    def noise_std(self) -> tuple[float, float]:
-        """Standard deviation of one measurement's white noise: (m/s², rad/s)."""
+    @property
+    def noise_std(self) -> tuple[float, ...]:
+        """Standard deviation of one measurement's white noise (m/s², rad/s)."""
         scale = math.sqrt(self.rate / 2)
-        return self.accelerometer_density * scale, self.gyroscope_density * scale
+        return (self.accelerometer_density * scale,) * 3 + (self.gyroscope_density * scale,) * 3
 
     def initial(self, w: Float[Array, "6 *batch"]) -> Float[Array, "20 *batch"]:
         """Draw the initial biases."""
@@ -147,7 +153,7 @@ class Imu(Sensor):
             # before the first measurement the stored quaternion is zero, which is no attitude
             before = jnp.where(started > 0, before, self._carried(X_WB, V_WB_B))
             true = jnp.where(started > 0, self.mean(before, X_WB, V_WB_B), true)
-        z = true + bias + _six(*self.noise_std(), state) * w[:6]
+        z = true + bias + column(self.noise_std, state) * w[:6]
         limit = _six(self.accelerometer_range, self.gyroscope_range, state)
         step = 1 / math.sqrt(self.rate)
         walk = _six(self.accelerometer_walk * step, self.gyroscope_walk * step, state)

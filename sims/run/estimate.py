@@ -97,11 +97,12 @@ def nees_words(estimate: Mapping[str, Any]) -> str | None:
 
 def health_shares(log: RunLog) -> dict[str, dict[str, float]]:
     """Share of the run's time in each state of `HEALTH`, by the sensors that are not trusted."""
+    trusted = ("imu", *log.fused)
     state = np.nan_to_num(log["health"], nan=2.0)
     found: dict[str, dict[str, float]] = {name: {} for name in HEALTH}
     rows, counts = np.unique(np.clip(state, 0, 2), axis=0, return_counts=True)
     for row, count in zip(rows, counts, strict=True):
-        doubted = ", ".join(n for n, mark in zip(TRUSTED, row[1:], strict=True) if mark < 0.5)
+        doubted = ", ".join(n for n, mark in zip(trusted, row[1:], strict=True) if mark < 0.5)
         own = found[HEALTH[int(row[0])]]
         own[doubted] = own.get(doubted, 0.0) + float(count / len(state))
     return found

@@ -84,7 +84,7 @@ def scene(scenario: Scenario) -> Scene:
         scenario.station.obstacles,
         None if goal is None else (float(goal[0]), float(goal[1]), float(goal[2])),
         success.radius if isinstance(success, ReachGoal) else 0.5,
-        scenario.station.sensing.dvl.water_depth,
+        scenario.station.sensing.water_depth,
     )
 
 

@@ -2,19 +2,20 @@
 
 Besides the variables of every recording (`docs/recording.md`) a run's log holds, over its time:
 
-- `X_WB_estimate`, `V_WB_B_estimate`: the filter's estimates; `error_std` (18): their standard
+- `X_WB_estimate`, `V_WB_B_estimate`: the filter's estimates; `error_std` (15 + n): their standard
   deviations in the order of `systems.estimation.error_state`; `error_covariance` (27): covariances
   of δp, δθ and δv, each 3 × 3 by rows, both as the filter estimates them;
-- `nis`, `rejected` (3): normalised innovation squared of the last reading of `FUSED`, and the
-  number of consecutive rejections;
-- `health` (5), if the filter has such a port: 0 good, 1 degraded, 2 lost, then 1 where it trusts
-  imu, dvl, depth and compass;
+- `nis`, `rejected` (n): normalised innovation squared of the last reading of each fused sensor, and
+  the number of consecutive rejections;
+- `health` (2 + n), if the filter has such a port: 0 good, 1 degraded, 2 lost, then 1 where it
+  trusts the imu and each fused sensor;
 - `X_WB_plan`, `V_WB_B_plan`: the plan at that time; `plan_valid`: 1 where there was one;
 - `F_disturbance_Bo_B` (N, N·m), `flow_W` (velocity m/s, acceleration m/s²): disturbances and flow;
 
 and for every plan (dim `plan`): `plan_time` (s), `plan_X_WB`, and with a sampling planner also
 `sample_p_WB`, `sample_weight` and `planner_figures`. Attributes: `allowed_risk` of the planner's
-chance constraint, and `least_risk`, that of the widest path to the goal.
+chance constraint, `least_risk`, that of the widest path to the goal, and `fused`, the names of the
+n fused sensors if they are not `FUSED`.
 """
 
 import os
@@ -29,7 +30,7 @@ from ...models.recordings.build import Trajectory
 from ...models.recordings.store import Recording
 
 FUSED = ("dvl", "depth", "compass")
-"""Sensors whose readings the filter fuses, in the order of `nis` and `rejected`."""
+"""Sensors whose readings the filter fuses by default, in the order of `nis` and `rejected`."""
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,12 @@ class RunLog:
         source: str = "",
         notes: tuple[str, ...] = (),
         least_risk: float | None = None,
+        fused: tuple[str, ...] = FUSED,
     ) -> "RunLog":
         """Build from arrays with time first; `variables` holds at least X_WB, V_WB_B, F_Bo_B.
 
-        `least_risk` is the probability of a collision on the widest path to the goal.
+        `least_risk` is the probability of a collision on the widest path to the goal; `fused` are
+        the names of the sensors that the filter fuses.
         """
         rest = dict(variables)
         X, V = rest.pop("X_WB"), rest.pop("V_WB_B")
@@ -109,6 +112,8 @@ class RunLog:
                 dataset.attrs["allowed_risk"] = float(plans.allowed)
         if least_risk is not None:
             dataset.attrs["least_risk"] = float(least_risk)
+        if fused != FUSED:
+            dataset.attrs["fused"] = ",".join(fused)
         return cls(Recording(dataset))
 
     def __contains__(self, name: str) -> bool:
@@ -132,6 +137,11 @@ class RunLog:
     def least_risk(self) -> float | None:
         """Probability of a collision on the widest path to the goal, if there is a goal."""
         return self._attribute("least_risk")
+
+    @property
+    def fused(self) -> tuple[str, ...]:
+        """Names of the sensors that the filter fuses."""
+        return tuple(str(self.recording.dataset.attrs.get("fused", ",".join(FUSED))).split(","))
 
     def _attribute(self, name: str) -> float | None:
         value = self.recording.dataset.attrs.get(name)

@@ -1,5 +1,6 @@
 """From a simulated diagram's signals to one log on a uniform grid."""
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -12,12 +13,12 @@ from pydrake.systems.primitives import LogVectorOutput
 
 from ...systems.closed_loop import Signal
 from ...systems.compiled.signal_log import add_log
-from ...systems.estimation.delayed import STATUS
-from ...systems.estimation.error_state import ERRORS, POSITION, ROTATION, VELOCITY
+from ...systems.estimation.delayed import status_names
+from ...systems.estimation.error_state import POSITION, ROTATION, VELOCITY
 from ...systems.planning.passage import Passage
 from ...systems.planning.plan import PlanLayout
 from ..scenarios.scenario import Scenario
-from .log import FUSED, Plans, RunLog
+from .log import Plans, RunLog
 
 _PLAN_STEP = 0.2  # s between the stored states of a plan
 _NOTES = (
@@ -165,9 +166,11 @@ def collect(
     finite = np.all(np.isfinite(signals["X_WB_cheat"].value[:n]), axis=1)
     n = n if finite.all() else max(1, int(np.argmin(finite)))
     grid = dt * np.arange(n)
-    P = signals["covariance"].value[:n].reshape(-1, ERRORS, ERRORS)
+    P = signals["covariance"].value[:n]
+    P = P.reshape(n, math.isqrt(P.shape[1]), -1)
     blocks = [P[:, part, part].reshape(-1, 9) for part in (POSITION, ROTATION, VELOCITY)]
-    status = signals["status"].value[:n]
+    status, fused = signals["status"].value[:n], scenario.station.sensing.fused
+    names = status_names(fused)
     variables = {
         "X_WB": signals["X_WB_cheat"].value[:n],
         "V_WB_B": signals["V_WB_B_cheat"].value[:n],
@@ -177,8 +180,8 @@ def collect(
         "V_WB_B_estimate": signals["V_WB_B"].value[:n],
         "error_std": np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0)),
         "error_covariance": np.concatenate(blocks, axis=1),
-        "nis": status[:, [STATUS.index(f"nis_{name}") for name in FUSED]],
-        "rejected": status[:, [STATUS.index(f"rejected_{name}") for name in FUSED]],
+        "nis": status[:, [names.index(f"nis_{name}") for name in fused]],
+        "rejected": status[:, [names.index(f"rejected_{name}") for name in fused]],
         "F_disturbance_Bo_B": signals["F_disturbance_cheat"].value[:n],
         "flow_W": signals["flow_cheat"].value[:n],
     }
@@ -193,6 +196,7 @@ def collect(
         source=f"simulation of scenario {scenario.name}, seed {scenario.seed}",
         notes=_NOTES,
         least_risk=None if passage is None else passage.risk,
+        fused=fused,
     )
 
 

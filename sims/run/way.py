@@ -48,7 +48,7 @@ def find_passage(scenario: Scenario) -> Passage | None:
         scenario.success.radius,
         station.obstacles,
         station.load_vehicle().size,
-        -station.sensing.dvl.water_depth,
+        -station.sensing.water_depth,
         4 * std,
     )
     return Passage(float(widest), std, allowed)

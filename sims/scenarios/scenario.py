@@ -96,7 +96,8 @@ class Scenario:
     @property
     def code(self) -> tuple[str, ...]:
         """The user code that runs with it: files or modules, with the class in them."""
-        parts = (self.controller, self.station.sensing.filter)
+        sensing = self.station.sensing
+        parts = (self.controller, sensing.filter, *sensing.more.values())
         return tuple(part.code for part in parts if isinstance(part, OwnSystem))
 
     def with_changes(

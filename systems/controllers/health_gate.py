@@ -7,7 +7,6 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from ..compiled.jit import value_or_none
 from ..compiled.pure import Inputs, Output, Pure
-from ..estimation.delayed import HEALTH
 
 LOST = 2.0
 """State of a filter's health from which on its estimate is unusable."""
@@ -35,12 +34,12 @@ class HealthGate(LeafSystem):
 
     """
 
-    def __init__(self):
-        """No settings."""
+    def __init__(self, size: int = 5):
+        """`size` is the length of the filter's health."""
         super().__init__()
         sizes = {"X_WB": 7, "V_WB_B": 6}
         ports = {name: self.DeclareVectorInputPort(name, size) for name, size in sizes.items()}
-        self._health = self.DeclareVectorInputPort("health", len(HEALTH))
+        self._health = self.DeclareVectorInputPort("health", size)
         for name, port in ports.items():
 
             def pass_on(context: Context, output: BasicVector, port=port) -> None:

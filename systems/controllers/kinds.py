@@ -1,8 +1,8 @@
 """Controllers by kind: each is a dataclass for YAML that adds itself to a diagram.
 
 A controller is any system with the input ports `X_WB` (7) and `V_WB_B` (6), the estimated state,
-and the output port `F_Bo_B` (6), the commanded wrench. An input port `health` (5) receives the
-health of the estimate (`systems.estimation.delayed.HEALTH`); the controllers here command a zero
+and the output port `F_Bo_B` (6), the commanded wrench. An input port `health` receives the health
+of the estimate (`systems.estimation.delayed.health_names`); the controllers here command a zero
 wrench while it is lost (`systems.controllers.health_gate`).
 """
 
@@ -22,7 +22,6 @@ from ...models.effects.extended import Extended, core
 from ...models.files.checkpoint import load_model
 from ...models.spinn import Spinn
 from ...models.vehicles.vehicle import load_vehicle
-from ..estimation.delayed import HEALTH
 from ..estimation.disturbance_observer import DisturbanceObserver, MomentumObserver
 from ..own import OwnSystem, check_ports, port_sizes
 from ..planning.mppi import Mppi
@@ -34,6 +33,7 @@ from ..planning.plan import PlanLayout
 from ..planning.reference import Reference
 from ..plant.wrench_limits import ThrusterLimits
 from ..station.config import StationConfig
+from ..station.ports import station_ports
 from ..station.simulated import add_noise
 from .health_gate import HealthGate
 from .impedance import Impedance, ImpedanceGains, ImpedanceLaw
@@ -41,7 +41,7 @@ from .impedance import Impedance, ImpedanceGains, ImpedanceLaw
 INPUTS = {"X_WB": 7, "V_WB_B": 6}
 """Input ports of every controller and their sizes."""
 
-TOLD = {"health": len(HEALTH)}
+TOLD = ("health",)
 """Optional input ports of a controller, connected if the station has them."""
 
 OUTPUTS = {"F_Bo_B": 6}
@@ -69,7 +69,9 @@ class Controller(abc.ABC):
             UserError: it lacks a port, or a port has another size.
         """
         system = self.build(station, goal)
-        check_ports("controller", system, (INPUTS, OUTPUTS), (TOLD, {}))
+        sizes = station_ports(station)[1]
+        told = {name: sizes[name] for name in TOLD}
+        check_ports("controller", system, (INPUTS, OUTPUTS), (told, {}))
         return builder.AddNamedSystem("controller", system)
 
 
@@ -155,8 +157,8 @@ class Tracking:
             systems.append(observer)
         if source.HasInputPort("X_WB"):
             systems.append(source)
-        gate = builder.AddNamedSystem("gate", HealthGate())
-        for name in INPUTS | TOLD:
+        gate = builder.AddNamedSystem("gate", HealthGate(station_ports(station)[1]["health"]))
+        for name in (*INPUTS, *TOLD):
             builder.ExportInput(gate.GetInputPort(name), name)
         for name in INPUTS:
             for system in systems:

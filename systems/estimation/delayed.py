@@ -9,7 +9,9 @@ the preintegrated increment of the buffered samples (the predictor of Khosravian
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import NamedTuple
 
 import equinox as eqx
@@ -21,37 +23,40 @@ from scipy.stats import chi2
 
 from ...models import se3
 from ...models.config.checks import Vector3, check_numbers, require
-from ...models.sensors import Compass, DepthSensor, Dvl, Imu
+from ...models.sensors import Imu, Sensor
 from . import error_state, inertial, measurement
 from .error_state import Navigation
 from .inertial import Motion, Samples
-from .trust import SIZES, Shown, Trust, counted, imu_off, judged, suspected, with_doubt
+from .trust import Shown, Trust, counted, imu_off, judged, sizes, suspected, with_doubt
 
-SLOT = 22
-"""Columns of a slot: has sample, force 3, mean rate 3 | has dvl, v 3 | has depth, depth | has
-compass, yaw | rate at the end 3 | `inertial.LEFT_OPEN`."""
-_DVL, _DEPTH, _COMPASS, _RATE, _OPEN = 7, 11, 13, 15, 18
-_FLAGS = np.array([_DVL, _DEPTH, _COMPASS])
+_SAMPLE = 7
+"""Columns of a slot: has sample, force 3, mean rate 3 | has reading, values, for each sensor | rate
+at the end 3 | `inertial.LEFT_OPEN`."""
 _SINCE = 9  # components of `FilterState.since` that are sums
 _LONGEST = 0.1  # s: longest interval between predictions of the covariance
+_OBSERVED = {
+    "velocity": error_state.VELOCITY,
+    "position": error_state.POSITION,
+    "attitude": error_state.ROTATION,
+}
 
-STATUS = (
-    "time",
-    "nis_dvl",
-    "nis_depth",
-    "nis_compass",
-    "rejected_dvl",
-    "rejected_depth",
-    "rejected_compass",
-    "age_dvl",
-    "age_depth",
-    "age_compass",
-)
-"""Components of the status vector: time of the horizon (s), last NIS of each sensor, rejections in
-a row, and time since a reading was last accepted (s)."""
 
-HEALTH = ("state", "imu", "dvl", "depth", "compass")
-"""Components of the health vector: 0 good, 1 degraded, 2 lost; then 1 where a sensor is trusted."""
+def status_names(fused: Sequence[str]) -> tuple[str, ...]:
+    """Components of the status vector, given the names of the sensors that the filter fuses.
+
+    Time of the horizon (s), last NIS of each sensor, rejections in a row, and time since a reading
+    was last accepted (s).
+    """
+    kinds = ("nis", "rejected", "age")
+    return ("time", *(f"{kind}_{name}" for kind in kinds for name in fused))
+
+
+def health_names(fused: Sequence[str]) -> tuple[str, ...]:
+    """Components of the health vector, given the names of the sensors that the filter fuses.
+
+    0 good, 1 degraded, 2 lost; then 1 where a sensor is trusted.
+    """
+    return ("state", "imu", *fused)
 
 
 @dataclass(frozen=True)
@@ -107,8 +112,8 @@ class FilterState(NamedTuple):
     """The filter's state."""
 
     nominal: Navigation
-    P: Float[Array, "18 18"]
-    ring: Float[Array, "slots 22"]
+    P: Float[Array, "e e"]
+    ring: Float[Array, "slots row"]
     since: Float[Array, "12"]
     """Since the time of P: elapsed time, sums of force · dt and rate · dt, variances due to missing
     forces and rates; and v_B at the time of P."""
@@ -123,43 +128,39 @@ class Readings(NamedTuple):
 
     imu: Float[Array, "6"]
     """Specific force (m/s²) and angular rate (rad/s) in the sensor's axes."""
-    dvl: Float[Array, "5"]
-    """Velocity (m/s) in the sensor's axes, valid, time of validity (s)."""
-    depth: Float[Array, "3"]
-    """Depth (m), valid, time (s)."""
-    compass: Float[Array, "3"]
-    """Yaw (rad), valid, time (s)."""
+    aids: tuple[Float[Array, "_"], ...]
+    """[values, valid, time of validity (s)] of each other sensor."""
 
-    def by_kind(self) -> tuple[Float[Array, "5"], Bool[Array, "3"], Float[Array, "3"]]:
-        """Values, validity flags and times (s) of DVL, depth gauge and compass."""
-        readings = (self.dvl, self.depth, self.compass)
-        values = jnp.concatenate([each[:-2] for each in readings])
-        marks = jnp.stack([each[-2] > 0 for each in readings])
-        return values, marks, jnp.stack([each[-1] for each in readings])
+    def joined(self) -> tuple[Float[Array, "m"], Bool[Array, "n"], Float[Array, "n"]]:
+        """Values, validity flags and times (s) of the sensors besides the IMU."""
+        values = jnp.concatenate([each[:-2] for each in self.aids])
+        marks = jnp.stack([each[-2] > 0 for each in self.aids])
+        return values, marks, jnp.stack([each[-1] for each in self.aids])
 
 
 class DelayedFilter(eqx.Module):
-    """The filter's constants, with pure `init`, `step` and `present`."""
+    """The filter's constants, with pure `init`, `step` and `present`.
+
+    `aids` are the sensors that are fused, besides the IMU: all that `observes` something.
+    """
 
     imu: Imu = eqx.field(static=True)
-    dvl: Dvl = eqx.field(static=True)
-    depth: DepthSensor = eqx.field(static=True)
-    compass: Compass = eqx.field(static=True)
+    aids: tuple[Sensor, ...] = eqx.field(static=True)
     config: EkfConfig = eqx.field(static=True)
 
     def __check_init__(self) -> None:
-        """Check that the DVL's readings arrive within the horizon and that no noise is zero."""
-        for sensor in (self.dvl, self.depth, self.compass):
+        """Check that readings arrive within the horizon and that no noise is zero."""
+        for sensor in self.aids:
+            remedy = "give more than zero: a filter divides by it"
+            require(min(sensor.noise_std) > 0, sensor, "noise", remedy)
+            longest = sensor.latencies[1] + 2 * self.period
             require(
-                sensor.noise > 0, sensor, "noise", "give more than zero: a filter divides by it"
+                not sensor.late or self.slots * self.period >= longest - 1e-9,
+                self.config,
+                "horizon",
+                f"give at least the {type(sensor).__name__}'s latest latency and two samples, "
+                f"{longest:.3g} s",
             )
-        longest = self.dvl.latest_latency + 2 * self.period
-        require(
-            self.slots * self.period >= longest - 1e-9,
-            self.config,
-            "horizon",
-            f"give at least the DVL's latest latency and two samples, {longest:.3g} s",
-        )
 
     @property
     def period(self) -> float:
@@ -171,10 +172,30 @@ class DelayedFilter(eqx.Module):
         """Number of buffered samples."""
         return math.ceil(self.config.horizon * self.imu.rate - 1e-9)
 
+    @property
+    def flags(self) -> np.ndarray:
+        """Column of each sensor's flag in a slot; its values follow."""
+        return np.array([*accumulate((n + 1 for n in sizes(self.aids)), initial=_SAMPLE)][:-1])
+
+    @property
+    def rate_column(self) -> int:
+        """Column of the rate in a slot, after the sensors' values."""
+        return _SAMPLE + sum(sizes(self.aids)) + len(self.aids)
+
+    @property
+    def slot(self) -> int:
+        """Number of columns of a slot."""
+        return self.rate_column + 3 + inertial.LEFT_OPEN
+
+    @property
+    def errors(self) -> int:
+        """Number of components of the error state."""
+        return error_state.INERTIAL + len(self.aids)
+
     def samples_at_once(self, most: int) -> int:
         """Largest divisor of `most` so that `take_in` of so many samples misses no reading."""
-        dvl = 1 / self.dvl.rate - (self.dvl.latest_latency - self.dvl.earliest_latency)
-        shortest = min(dvl, 1 / self.depth.rate, 1 / self.compass.rate)
+        gaps = [(1 / each.rate, each.latencies) for each in self.aids]
+        shortest = min(period - (latest - earliest) for period, (earliest, latest) in gaps)
         fit = [
             n for n in range(1, most + 1) if most % n == 0 and n * self.period <= shortest + 1e-9
         ]
@@ -189,10 +210,10 @@ class DelayedFilter(eqx.Module):
             gyroscope_density=f * imu.gyroscope_density,
         )
 
-    def deviations(self) -> Float[Array, "18"]:
+    def deviations(self) -> Float[Array, "e"]:
         """Standard deviations of the initial error."""
         c = self.config
-        slow = (self.dvl.scale_std, self.depth.offset_std, self.compass.wander)
+        slow = (each.slow_error[0] for each in self.aids)
         biases = (self.imu.gyroscope_bias,) * 3 + (self.imu.accelerometer_bias,) * 3
         stds = (*c.position_std, *c.attitude_std, *c.velocity_std, *biases, *slow)
         return jnp.asarray(stds, jnp.result_type(float))
@@ -201,14 +222,14 @@ class DelayedFilter(eqx.Module):
         """The state at time 0 for an estimated pose and twist, biases unknown."""
         zero = jnp.zeros_like(V_WB_B[:3])
         return FilterState(
-            Navigation(X_WB, V_WB_B[:3], zero, zero, zero),
+            Navigation(X_WB, V_WB_B[:3], zero, zero, jnp.zeros(len(self.aids), V_WB_B.dtype)),
             jnp.diag(self.deviations() ** 2),
-            jnp.zeros((self.slots, SLOT), V_WB_B.dtype),
+            jnp.zeros((self.slots, self.slot), V_WB_B.dtype),
             jnp.concatenate([jnp.zeros(_SINCE, V_WB_B.dtype), V_WB_B[:3]]),
             Samples.start(V_WB_B[3:]),
             Motion.start(V_WB_B.dtype),
-            Shown.start(V_WB_B.dtype),
-            Trust.start(V_WB_B.dtype),
+            Shown.start(self.aids, V_WB_B.dtype),
+            Trust.start(self.aids, V_WB_B.dtype),
         )
 
     def step(self, state: FilterState, readings: Readings, k: Float[Array, ""]) -> FilterState:
@@ -228,7 +249,7 @@ class DelayedFilter(eqx.Module):
         samples: Float[Array, "n 6"],
         readings: Readings,
         last: Float[Array, ""],
-    ) -> tuple[FilterState, Float[Array, "n 22"]]:
+    ) -> tuple[FilterState, Float[Array, "n row"]]:
         """Put samples that end with number `last` into the ring; return the slots that leave it.
 
         `samples` are the IMU's, oldest first; the IMU's entry in `readings` is not used. The caller
@@ -241,11 +262,12 @@ class DelayedFilter(eqx.Module):
             return inertial.take(self.imu, memory, *given)
 
         memory, rows = jax.lax.scan(over, state.samples, (samples, number[self.slots :]))
-        rest = jnp.zeros((n, _OPEN - _DVL), dtype)
-        new = jnp.concatenate([rows[:, :_DVL], rest, rows[:, _DVL:]], axis=1)
+        open_ = self.rate_column + 3
+        rest = jnp.zeros((n, open_ - _SAMPLE), dtype)
+        new = jnp.concatenate([rows[:, :_SAMPLE], rest, rows[:, _SAMPLE:]], axis=1)
         ring = jnp.concatenate([state.ring, new])
-        following = jnp.concatenate([ring[1:, 4:_DVL], ring[-1:, 4:_DVL]])
-        shown, usable = state.shown.with_readings(self.dvl, *readings.by_kind())
+        following = jnp.concatenate([ring[1:, 4:_SAMPLE], ring[-1:, 4:_SAMPLE]])
+        shown, usable = state.shown.with_readings(self.aids, *readings.joined())
 
         def place(old: Array, reading: Array, i: int) -> Array:
             """The columns with [1, value] in the slot of a usable reading's time."""
@@ -254,12 +276,13 @@ class DelayedFilter(eqx.Module):
             return jnp.where(here[:, None], row[None], old)
 
         columns = [
-            ring[:, :_DVL],
-            place(ring[:, _DVL:_DEPTH], readings.dvl, 0),
-            place(ring[:, _DEPTH:_COMPASS], readings.depth, 1),
-            place(ring[:, _COMPASS:_RATE], readings.compass, 2),
-            (ring[:, 4:_DVL] + following) / 2,
-            ring[:, _OPEN:],
+            ring[:, :_SAMPLE],
+            *(
+                place(ring[:, flag : flag + reading.size - 1], reading, i)
+                for i, (flag, reading) in enumerate(zip(self.flags, readings.aids, strict=True))
+            ),
+            (ring[:, 4:_SAMPLE] + following) / 2,
+            ring[:, open_:],
         ]
         ring = jnp.concatenate(columns, axis=1)
         return state._replace(ring=ring[n:], samples=memory, shown=shown), ring[:n]
@@ -270,7 +293,7 @@ class DelayedFilter(eqx.Module):
         return se3.rotate_inverse(x.X_WB, up) + se3.cross(omega, x.v_B)
 
     def move(
-        self, state: FilterState, slots: Float[Array, "n 22"], first: Float[Array, ""]
+        self, state: FilterState, slots: Float[Array, "n row"], first: Float[Array, ""]
     ) -> tuple[FilterState, Float[Array, ""]]:
         """Predict the nominal state from slot `first` through the next one that needs `fuse`.
 
@@ -279,27 +302,28 @@ class DelayedFilter(eqx.Module):
         n, h, dtype = slots.shape[0], self.period, slots.dtype
         order = jnp.arange(n, dtype=dtype)
         ahead = order >= first
-        due = ahead & jnp.any(slots[:, _FLAGS] > 0, axis=1)
+        due = ahead & jnp.any(slots[:, self.flags] > 0, axis=1)
         late = state.since[0] + h * jnp.sum(jnp.where(ahead, slots[:, 0], 0)) > _LONGEST - h / 2
         due = due.at[-1].set(due[-1] | (late & ~jnp.any(due)))
         at = jnp.min(jnp.where(due, order, n))
         times = jnp.where(ahead & (order <= at), h * slots[:, 0], 0)
+        open_ = self.rate_column + 3
 
         def over(
             given: tuple[Navigation, Motion, Array], slot: tuple[Array, Array]
         ) -> tuple[tuple[Navigation, Motion, Array], None]:
             x, motion, since = given
             dt, values = slot
-            force, omega = values[1:4] - x.accel_bias, values[4:_DVL] - x.gyro_bias
+            force, omega = values[1:4] - x.accel_bias, values[4:_SAMPLE] - x.gyro_bias
             still = self._still(x, omega)
-            force = jnp.where(values[_OPEN] > 0, still, force)
-            known = jnp.all(values[_OPEN:] <= 0)
+            force = jnp.where(values[open_] > 0, still, force)
+            known = jnp.all(values[open_:] <= 0)
             motion = motion.after(force - still, omega, jnp.where(known, dt, 0))
             sample = error_state.sample_increment(force, omega, dt)
-            decay = jnp.exp(-dt / self.compass.wander_time)
+            decay = jnp.stack(error_state.decays(self.aids, dt))
             x = error_state.apply(x, sample, self.imu.gravity)
-            x = x._replace(sensors=jnp.concatenate([x.sensors[:2], decay * x.sensors[2:]]))
-            left_open = jnp.where(dt > 0, motion.variances(values[_OPEN:]), 0)
+            x = x._replace(sensors=decay * x.sensors)
+            left_open = jnp.where(dt > 0, motion.variances(values[open_:]), 0)
             gone = jnp.concatenate([dt[None], force * dt, omega * dt, left_open])
             return (x, motion, jnp.concatenate([since[:_SINCE] + gone, since[_SINCE:]])), None
 
@@ -308,42 +332,46 @@ class DelayedFilter(eqx.Module):
         return state._replace(nominal=x, motion=motion, since=since), at
 
     def fuse(
-        self, state: FilterState, slot: Float[Array, "22"], k: Float[Array, ""]
+        self, state: FilterState, slot: Float[Array, "row"], k: Float[Array, ""]
     ) -> FilterState:
         """Predict P and fuse the readings of the slot that left with sample number k."""
         x, trust = state.nominal, state.trust
         F, P = self._covariance(state, x, state.since[:_SINCE])
-        plain = (
-            measurement.dvl_innovation(self.dvl, x, slot[_RATE:_OPEN], slot[_DVL + 1 : _DEPTH]),
-            measurement.depth_innovation(self.depth, x, slot[_DEPTH + 1 : _COMPASS]),
-            measurement.compass_innovation(self.compass, x, slot[_COMPASS + 1 : _RATE]),
-        )
+        rate = slot[self.rate_column : self.rate_column + 3]
+        places = zip(self.aids, self.flags, strict=True)
+        values = [slot[flag + 1 : flag + 1 + each.value_size] for each, flag in places]
+        plain = [
+            measurement.innovation(each, i, x, rate, values[i]) for i, each in enumerate(self.aids)
+        ]
         factors = jnp.unstack(trust.noise_factor)
         found = [each._replace(R=f * each.R) for each, f in zip(plain, factors, strict=True)]
-        used = jnp.stack([slot[flag] > 0 for flag in (_DVL, _DEPTH, _COMPASS)])
+        used = jnp.stack([slot[flag] > 0 for flag in self.flags])
         time = (k - self.slots) * self.period
 
-        off = imu_off(self.imu, self.dvl, self.depth, self.compass)
+        off = imu_off(self.imu, self.aids)
         well = self._vouched_for(state, time)
         trust, (left_out, follow) = judged(trust, used, off, self.config.patience, well)
-        own = (error_state.VELOCITY, error_state.POSITION, error_state.ROTATION)
-        for i, (each, part) in enumerate(zip(plain, own, strict=True)):
+        for i, (each, sensor) in enumerate(zip(plain, self.aids, strict=True)):
             # a followed sensor's quantity is as uncertain as its residual is large
+            part = _OBSERVED[str(sensor.observes)]
             H, unknown = each.H[:, part], jnp.where(follow[i], each.residual**2, 0)
             P = P.at[part, part].add(H.T @ (unknown[:, None] * H))
-        gates = tuple(float(chi2.ppf(self.config.gate, size)) for size in SIZES)
+        gates = tuple(float(chi2.ppf(self.config.gate, size)) for size in sizes(self.aids))
         together = measurement.together(plain)
         S = together.H @ (P @ together.H.T) + together.R
-        plain_nis = measurement.normalized_squares(S, together.residual, SIZES)
+        plain_nis = measurement.normalized_squares(S, together.residual, sizes(self.aids))
         done = measurement.update(x, P, found, used & ~left_out, gates)
 
         innovations = (together.residual, jnp.sqrt(jnp.diag(S)))
-        trust = counted(trust, used, done.accepted, done.nis, plain_nis, gates, innovations, time)
+        trust = counted(
+            self.aids, trust, used, done.accepted, done.nis, plain_nis, gates, innovations, time
+        )
         pulled = self._pulled(trust.pulled @ F.T, done, together, used)
         trust = suspected(
+            self.aids,
             trust,
             left_out | follow,
-            state.shown.stuck,
+            state.shown.stuck(self.aids),
             used,
             done.accepted,
             pulled,
@@ -357,19 +385,19 @@ class DelayedFilter(eqx.Module):
             trust=trust,
         )
 
-    @staticmethod
     def _pulled(
-        pulled: Float[Array, "3 18"],
+        self,
+        pulled: Float[Array, "n e"],
         done: measurement.Update,
         found: measurement.Innovation,
-        used: Bool[Array, "3"],
-    ) -> Float[Array, "3 18"]:
+        used: Bool[Array, "n"],
+    ) -> Float[Array, "n e"]:
         """The pulls after an update: a sensor's own correction adds, those of others reduce."""
-        own = np.repeat(np.eye(len(SIZES), dtype=bool), SIZES, axis=1)
+        own = np.repeat(np.eye(len(self.aids), dtype=bool), sizes(self.aids), axis=1)
         read = jnp.where(used[:, None], found.residual[None], 0)
         return pulled - jnp.where(own, read, pulled @ found.H.T) @ done.gain.T
 
-    def _vouched_for(self, state: FilterState, time: Float[Array, ""]) -> Bool[Array, "3"]:
+    def _vouched_for(self, state: FilterState, time: Float[Array, ""]) -> Bool[Array, "n"]:
         """For each sensor, whether the IMU and another sensor are well."""
         c, trust = self.config, state.trust
         well = (time - trust.accepted_at <= c.silence) & (trust.distrusted < 1)
@@ -377,19 +405,19 @@ class DelayedFilter(eqx.Module):
         others = jnp.sum(well) - well.astype(int)
         return (others > 0) & (state.samples.calm > c.silence)
 
-    def covariance(self, state: FilterState) -> Float[Array, "18 18"]:
+    def covariance(self, state: FilterState) -> Float[Array, "e e"]:
         """P at the horizon."""
         return self._covariance(state, state.nominal, state.since[:_SINCE])[1]
 
     def _covariance(
         self, state: FilterState, after: Navigation, gone: Float[Array, "9"]
-    ) -> tuple[Float[Array, "18 18"], Float[Array, "18 18"]]:
+    ) -> tuple[Float[Array, "e e"], Float[Array, "e e"]]:
         """F and P after an interval with the sums `gone` (as in `FilterState.since`)."""
         time = gone[0]
         some = jnp.maximum(time, self.period)
         before = state.nominal._replace(v_B=state.since[_SINCE:])
         F, Q = error_state.transition(
-            before, after, gone[1:4] / some, gone[4:7] / some, time, self._noisy_imu, self.compass
+            before, after, gone[1:4] / some, gone[4:7] / some, time, self._noisy_imu, self.aids
         )
         moves = slice(0, error_state.VELOCITY.stop)
         Q = Q.at[moves, moves].multiply(state.trust.imu_factor)
@@ -400,7 +428,7 @@ class DelayedFilter(eqx.Module):
             P = P + time / self.period * self._between_samples(state)
         return F, (P + P.T) / 2
 
-    def _between_samples(self, state: FilterState) -> Float[Array, "18 18"]:
+    def _between_samples(self, state: FilterState) -> Float[Array, "e e"]:
         """Covariance of the interpolation over a period T of an IMU that does not integrate.
 
         Between two known values a Brownian rate of density σ² has an integral of variance
@@ -414,21 +442,26 @@ class DelayedFilter(eqx.Module):
         open_ = open_.at[error_state.ROTATION, error_state.ROTATION].set(turn * T**2 / 24)
         return open_.at[error_state.VELOCITY, error_state.VELOCITY].set(force * T**2 / 6)
 
-    def status(self, state: FilterState, k: Float[Array, ""]) -> Float[Array, "10"]:
-        """The status vector after `step` number k; see `STATUS`."""
+    def status(self, state: FilterState, k: Float[Array, ""]) -> Float[Array, "_"]:
+        """The status vector after `step` number k; see `status_names`."""
         time = jnp.maximum(k - self.slots, 0) * self.period
         age, trust = time - state.trust.accepted_at, state.trust
         return jnp.concatenate([time[None], trust.nis, trust.rejected, age])
 
     def health(
-        self, state: FilterState, P: Float[Array, "18 18"], k: Float[Array, ""]
-    ) -> Float[Array, "5"]:
+        self, state: FilterState, P: Float[Array, "e e"], k: Float[Array, ""]
+    ) -> Float[Array, "_"]:
         """The health vector after `step` number k, for the covariance P that is shown."""
         c, variance, trust = self.config, jnp.diag(P), state.trust
         age = jnp.maximum(k - self.slots, 0) * self.period - trust.accepted_at
         fit = (age <= c.silence) & (trust.rejected < c.patience) & (trust.distrusted < 1)
         time = jnp.maximum(k - self.slots, 0) * self.period
-        fit = fit & ~state.shown.stuck & ~trust.suspect(time, c.silence) & (trust.noise_factor <= 1)
+        fit = (
+            fit
+            & ~state.shown.stuck(self.aids)
+            & ~trust.suspect(time, c.silence)
+            & (trust.noise_factor <= 1)
+        )
         imu = (state.samples.calm > 1) & (trust.imu_factor < 2)
         fit = jnp.concatenate([imu[None], fit])
         lost = jnp.any(variance[error_state.VELOCITY] > c.lost_velocity**2)
@@ -438,7 +471,7 @@ class DelayedFilter(eqx.Module):
 
     def present(
         self, state: FilterState, ahead: float | Float[Array, ""]
-    ) -> tuple[Float[Array, "7"], Float[Array, "6"], Float[Array, "18 18"]]:
+    ) -> tuple[Float[Array, "7"], Float[Array, "6"], Float[Array, "e e"]]:
         """Pose, twist and error covariance `ahead` seconds after the newest sample.
 
         The buffered samples are applied to the state at the horizon; beyond the newest one its rate
@@ -447,7 +480,8 @@ class DelayedFilter(eqx.Module):
         """
         x, ring = state.nominal, state.ring
         time = ring[:, 0] * self.period
-        missing, left_open = ring[:, _OPEN] > 0, jax.vmap(state.motion.variances)(ring[:, _OPEN:])
+        open_ = ring[:, self.rate_column + 3 :]
+        missing, left_open = open_[:, 0] > 0, jax.vmap(state.motion.variances)(open_)
         still = self._still(x, jnp.zeros_like(x.v_B))[:, None]
         force = jnp.where(missing[None], still, ring[:, 1:4].T - x.accel_bias[:, None])
         omega = ring[:, 4:7].T - x.gyro_bias[:, None]
@@ -468,10 +502,10 @@ class DelayedFilter(eqx.Module):
 
     def _foreseen(
         self, state: FilterState, now: Navigation, ahead: float | Float[Array, ""]
-    ) -> Float[Array, "18 18"]:
+    ) -> Float[Array, "e e"]:
         """Covariance due to the error of the predicted mean force and rate over `ahead`."""
         a = ahead * jnp.eye(3, dtype=state.P.dtype)
-        J = jnp.zeros((error_state.ERRORS, 6), state.P.dtype)
+        J = jnp.zeros((self.errors, 6), state.P.dtype)
         J = J.at[error_state.POSITION, :3].set(ahead / 2 * a)
         J = J.at[error_state.ROTATION, 3:].set(a).at[error_state.VELOCITY, :3].set(a)
         J = J.at[error_state.VELOCITY, 3:].set(ahead * error_state.skew(now.v_B))

@@ -1,5 +1,7 @@
 """The state estimator as a system; the filter itself is in `systems.estimation`."""
 
+from collections.abc import Mapping
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,12 +12,12 @@ from pydrake.common import RandomDistribution
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from ...models import se3
-from ...models.sensors import Compass, DepthSensor, Dvl, Imu
+from ...models.config.errors import UserError
+from ...models.sensors import SHIPPED, Imu, Sensor
 from ..compiled.jit import VectorFunction, value_or_zeros
 from ..compiled.pure import Event, Inputs, Pure, State, shown
 from ..plant.learned_plant import check_state
-from .delayed import HEALTH, SLOT, STATUS, DelayedFilter, EkfConfig, FilterState, Readings
-from .error_state import ERRORS
+from .delayed import DelayedFilter, EkfConfig, FilterState, Readings, health_names, status_names
 
 _WAITING = 6  # state group of the buffered samples, after the filter's own and the outputs'
 
@@ -24,13 +26,14 @@ class Ekf(LeafSystem):
     """Error-state Kalman filter on SE(3), driven by the IMU, at a delayed horizon.
 
     At every IMU period it reads the sample of one period ago. At `config.output_rate` (more often
-    if a sensor reads faster) it predicts over the new samples, fuses DVL, depth and compass
-    `config.horizon` in the past in the order of their times of validity
+    if a sensor reads faster) it predicts over the new samples, fuses the other sensors that
+    `observes` something `config.horizon` in the past in the order of their times of validity
     (`systems.estimation.delayed`), and predicts the present state with the buffered samples. The
-    order and frame of the error are those of `systems.estimation.error_state`: `covariance` is the
-    18 × 18 matrix by rows, whose first six rows and columns belong to [δp, δθ] in body axes.
-    Horizontal position is dead reckoning: its variance grows. `status` has the components
-    `STATUS`, `health` those of `HEALTH`.
+    order and frame of the error are those of `systems.estimation.error_state`: `covariance` is its
+    square matrix by rows, whose first six rows and columns belong to [δp, δθ] in body axes. What no
+    sensor observes is dead reckoning: its variance grows, as that of horizontal position does with
+    the shipped sensors. `status` has the components `status_names`, `health` those of
+    `health_names`.
 
     The estimate starts at the given pose and twist. With `initial_noise` connected (a simulation)
     it starts with an error drawn from `config`'s standard deviations: δp, δθ, δv.
@@ -55,25 +58,28 @@ class Ekf(LeafSystem):
 
     def __init__(
         self,
-        imu: Imu | None = None,
-        dvl: Dvl | None = None,
-        depth: DepthSensor | None = None,
-        compass: Compass | None = None,
+        on_board: Mapping[str, Sensor] = SHIPPED,
         config: EkfConfig | None = None,
         X0_WB: ArrayLike | None = None,
         V0_WB_B: ArrayLike | None = None,
     ):
-        """Expect the given sensors (their defaults if left out) and start at `X0_WB`, `V0_WB_B`.
+        """Expect the given sensors by their ports' names and start at `X0_WB`, `V0_WB_B`.
 
         Raises:
             ValueError: the start is not a state, or the output rate does not divide the IMU's rate.
-            UserError: the horizon is shorter than the DVL's latency.
+            UserError: the horizon is shorter than a sensor's latency, there is no IMU, or nothing
+                to fuse with it.
         """
         super().__init__()
         config = config or EkfConfig()
-        core = DelayedFilter(
-            imu or Imu(), dvl or Dvl(), depth or DepthSensor(), compass or Compass(), config
-        )
+        imu = on_board.get("imu")
+        aids = {name: each for name, each in on_board.items() if each.observes is not None}
+        if not (isinstance(imu, Imu) and aids):
+            raise UserError(
+                "sensing: the filter needs an IMU called `imu` and a sensor to fuse with it, such "
+                "as dvl, depth or compass; add one, or give a filter of your own (!OwnFilter)"
+            )
+        core = DelayedFilter(imu, tuple(aids.values()), config)
         ratio = core.imu.rate / config.output_rate
         if abs(ratio - round(ratio)) > 1e-6 or ratio < 1 - 1e-6:
             raise ValueError(
@@ -83,15 +89,15 @@ class Ekf(LeafSystem):
         X0 = np.array([1.0, 0, 0, 0, 0, 0, 0]) if X0_WB is None else X0_WB
         X0, V0 = check_state(X0, np.zeros(6) if V0_WB_B is None else V0_WB_B)
 
-        sizes = {"imu": 6, "dvl": 7, "depth": 3, "compass": 3}
+        sizes = {"imu": imu.port_size} | {name: each.port_size for name, each in aids.items()}
         self._readings = [self.DeclareVectorInputPort(*item) for item in sizes.items()]
         gaussian = RandomDistribution.kGaussian
         self._initial_noise = self.DeclareVectorInputPort("initial_noise", 9, gaussian)
 
         start, unravel = ravel_pytree(core.init(jnp.asarray(X0), jnp.asarray(V0)))
         n = start.size
-        outputs = {"X_WB": 7, "V_WB_B": 6, "covariance": ERRORS**2, "status": len(STATUS)}
-        outputs["health"] = len(HEALTH)
+        outputs = {"X_WB": 7, "V_WB_B": 6, "covariance": core.errors**2}
+        outputs |= {"status": len(status_names([*aids])), "health": len(health_names([*aids]))}
         self._ratio, self._period = round(ratio), core.period
         self._samples = core.samples_at_once(self._ratio)
         self._filter = self.DeclareDiscreteState(BasicVector(np.asarray(start).tolist()))
@@ -116,15 +122,16 @@ class Ekf(LeafSystem):
             return X, V, P.reshape(-1), core.status(state, k), core.health(state, P, k)
 
         def take_in(flat: Array, *given: Array) -> tuple[Array, Array, Array]:
-            *samples, dvl, depth, compass, last = given
-            imu = jnp.concatenate(samples).reshape(-1, 6)
-            readings = Readings(imu[-1], jnp.concatenate([dvl[:4], dvl[6:]]), depth, compass)
-            state, slots = core.take_in(unravel(flat), imu, readings, last[0])
+            waiting, newest, *shown, last = given
+            samples = jnp.concatenate([waiting, newest]).reshape(-1, 6)
+            marked = tuple(each.marked(x) for each, x in zip(core.aids, shown, strict=True))
+            readings = Readings(samples[-1], marked)
+            state, slots = core.take_in(unravel(flat), samples, readings, last[0])
             state, at = core.move(state, slots, jnp.zeros_like(last[0]))
             return ravel_pytree(state)[0], at, slots
 
         def move(flat: Array, slots: Array, first: Array) -> tuple[Array, Array]:
-            state, at = core.move(unravel(flat), slots.reshape(-1, SLOT), first[0])
+            state, at = core.move(unravel(flat), slots.reshape(-1, core.slot), first[0])
             return ravel_pytree(state)[0], at
 
         def fuse(flat: Array, slot: Array, k: Array) -> Array:
@@ -136,10 +143,10 @@ class Ekf(LeafSystem):
         # Several calls: XLA runs small programs inline and larger ones on its thread pool.
         m = self._samples
         self._take_in = VectorFunction(
-            take_in, [n, 6 * (m - 1), *sizes.values(), 1], [n, 1, SLOT * m]
+            take_in, [n, 6 * (m - 1), *sizes.values(), 1], [n, 1, core.slot * m]
         )
-        self._move = VectorFunction(move, [n, SLOT * m, 1], [n, 1])
-        self._fuse = VectorFunction(fuse, [n, SLOT, 1], [n])
+        self._move = VectorFunction(move, [n, core.slot * m, 1], [n, 1])
+        self._fuse = VectorFunction(fuse, [n, core.slot, 1], [n])
         self._show = VectorFunction(lambda x, t: show(unravel(x), t[0]), [n, 1], results)
 
     def filter_state(self, context: Context) -> FilterState:
@@ -151,7 +158,8 @@ class Ekf(LeafSystem):
     def pure(self) -> Pure:
         """The update as a pure function."""
         take_in, move, fuse, show, unravel = self._functions
-        n, sizes = self._samples, [port.size() for port in self._readings]
+        n, width = self._samples, self.filter.slot
+        sizes = {port.get_name(): port.size() for port in self._readings}
 
         def step(state: State, given: list[Array], last: Array) -> Array:
             """The filter's state after the buffered samples and the present one."""
@@ -159,17 +167,14 @@ class Ekf(LeafSystem):
 
             def fuse_and_move(carry: tuple[Array, Array]) -> tuple[Array, Array]:
                 flat, at = carry
-                slot = jax.lax.dynamic_slice(slots.reshape(-1), (SLOT * at.astype(int),), (SLOT,))
+                slot = jax.lax.dynamic_slice(slots.reshape(-1), (width * at.astype(int),), (width,))
                 flat = fuse(flat, slot, (last - n + 1 + at)[None])
                 return move(flat, slots, (at + 1)[None])  # no slot left at at = n
 
             return jax.lax.while_loop(lambda carry: carry[1] < n, fuse_and_move, (flat, at))[0]
 
         def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
-            names = ("imu", "dvl", "depth", "compass")
-            given = [
-                inputs.get(name, jnp.zeros(size)) for name, size in zip(names, sizes, strict=True)
-            ]
+            given = [inputs.get(name, jnp.zeros(size)) for name, size in sizes.items()]
             tick = jnp.round(t / self._period)
             phase = jnp.mod(tick, n)
             slot = (jnp.maximum(phase, 1) - 1).astype(int)
@@ -208,10 +213,10 @@ class Ekf(LeafSystem):
         state, at, slots = self._take_in(
             held.value(0), held.value(_WAITING), imu, *readings, np.array([last])
         )
-        n, i = self._samples, int(at[0])
+        n, width, i = self._samples, self.filter.slot, int(at[0])
         while i < n:
             number = np.array([last - n + 1 + i])
-            state = self._fuse.flat(state, slots[SLOT * i : SLOT * (i + 1)], number)
+            state = self._fuse.flat(state, slots[width * i : width * (i + 1)], number)
             if i == n - 1:
                 break
             state, at = self._move(state, slots, np.array([i + 1.0]))

@@ -1,17 +1,17 @@
 """Inertial navigation on SE(3) and the linear propagation of its error.
 
 Nominal state: pose `X_WB`, velocity v of Bo in W expressed in B, biases of gyroscope and
-accelerometer, and three slow errors of other sensors: scale of the DVL, offset of the depth gauge,
-wander of the compass. The true state is `retract(nominal, δ)` with the error δ in R¹⁸
+accelerometer, and one slow error of each other sensor: scale of the DVL, offset of the depth gauge,
+wander of the compass. The true state is `retract(nominal, δ)` with the error δ in R¹⁵⁺ⁿ
 
-    δ = [δp 3, δθ 3 | δv 3 | δb_g 3 | δb_a 3 | scale, offset, wander],    X_WB = X̂_WB exp([δp, δθ]),
+    δ = [δp 3, δθ 3 | δv 3 | δb_g 3 | δb_a 3 | slow errors n],    X_WB = X̂_WB exp([δp, δθ]),
 
 so the pose error is expressed in the body frame (left-invariant; Barrau and Bonnabel 2017) in the
 order of a twist; the other errors are additive. Functions take one state; `vmap` makes batches.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -20,12 +20,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ...models import se3
-from ...models.sensors import Compass, Imu
+from ...models.sensors import Imu, Sensor
 
-ERRORS = 18
+INERTIAL = 15
+"""Components of δ without the slow errors of sensors besides the IMU."""
 POSE, POSITION, ROTATION = slice(0, 6), slice(0, 3), slice(3, 6)
 VELOCITY, GYRO_BIAS, ACCEL_BIAS = slice(6, 9), slice(9, 12), slice(12, 15)
-SENSORS = slice(15, 18)
+SENSORS = slice(INERTIAL, None)
 
 
 class Navigation(NamedTuple):
@@ -35,7 +36,7 @@ class Navigation(NamedTuple):
     v_B: Float[Array, "3"]
     gyro_bias: Float[Array, "3"]
     accel_bias: Float[Array, "3"]
-    sensors: Float[Array, "3"]
+    sensors: Float[Array, "n"]
 
 
 class Increment(NamedTuple):
@@ -50,7 +51,7 @@ class Increment(NamedTuple):
     time: Float[Array, "*batch"]
 
 
-def retract(nominal: Navigation, delta: Float[Array, "18"]) -> Navigation:
+def retract(nominal: Navigation, delta: Float[Array, "e"]) -> Navigation:
     """The state whose error relative to `nominal` is δ."""
     return Navigation(
         se3.retract(nominal.X_WB, delta[POSE]),
@@ -61,7 +62,7 @@ def retract(nominal: Navigation, delta: Float[Array, "18"]) -> Navigation:
     )
 
 
-def error(nominal: Navigation, true: Navigation) -> Float[Array, "18"]:
+def error(nominal: Navigation, true: Navigation) -> Float[Array, "e"]:
     """The δ for which `retract(nominal, δ)` is `true`."""
     rest = [a - b for a, b in zip(true[1:], nominal[1:], strict=True)]
     return jnp.concatenate([se3.local(nominal.X_WB, true.X_WB), *rest])
@@ -142,8 +143,8 @@ def transition(
     rate: Float[Array, "3"],
     time: Float[Array, ""],
     imu: Imu,
-    compass: Compass,
-) -> tuple[Float[Array, "18 18"], Float[Array, "18 18"]]:
+    aids: Sequence[Sensor],
+) -> tuple[Float[Array, "e e"], Float[Array, "e e"]]:
     """F and Q of δ⁺ = F δ + noise over one sample (bias-free `force`, `rate`), first order in δ.
 
     With φ = rate · time, A = exp(φ)ᵀ and J = J_r(φ):
@@ -163,7 +164,7 @@ def transition(
     G, H = T * skew(g_B), -(T * T / 2) * skew(force)
     C_v = -(skew(A @ before.v_B) + G) @ J
     C_p = -H @ J
-    rho = jnp.exp(-T / compass.wander_time)
+    rho = decays(aids, T)
     rows = [
         jnp.concatenate(
             [A, H @ A - T * A @ skew(before.v_B), T * A, T * C_p, -(T * T / 2) * eye], 1
@@ -173,14 +174,14 @@ def transition(
         jnp.concatenate([zero, zero, zero, eye, zero], 1),
         jnp.concatenate([zero, zero, zero, zero, eye], 1),
     ]
-    slow = jnp.stack([jnp.ones_like(T), jnp.ones_like(T), rho])
+    n, slow = len(aids), jnp.diag(jnp.stack(rho))
     F = jnp.concatenate(
         [
-            jnp.concatenate([jnp.concatenate(rows), jnp.zeros((15, 3), force.dtype)], 1),
-            jnp.concatenate([jnp.zeros((3, 15), force.dtype), jnp.diag(slow)], 1),
+            jnp.concatenate([jnp.concatenate(rows), jnp.zeros((INERTIAL, n), force.dtype)], 1),
+            jnp.concatenate([jnp.zeros((n, INERTIAL), force.dtype), slow], 1),
         ]
     )
-    rest = jnp.zeros((9, 3), force.dtype)
+    rest = jnp.zeros((6 + n, 3), force.dtype)
     N_g = jnp.concatenate([C_p, -J, C_v, rest])
     N_a = jnp.concatenate([-(T / 2) * eye, zero, -eye, rest])
     s_g, s_a = imu.gyroscope_density**2 / 2, imu.accelerometer_density**2 / 2
@@ -195,8 +196,18 @@ def transition(
             jnp.zeros(9, force.dtype),
             jnp.full(3, imu.gyroscope_walk**2, force.dtype) * T,
             jnp.full(3, imu.accelerometer_walk**2, force.dtype) * T,
-            jnp.zeros(2, force.dtype),
-            compass.wander**2 * (1 - rho * rho)[None],
+            *(
+                jnp.zeros(1, force.dtype)
+                if math.isinf(each.slow_error[1])
+                else (each.slow_error[0] ** 2 * (1 - r * r))[None]
+                for each, r in zip(aids, rho, strict=True)
+            ),
         ]
     )
     return F, Q + jnp.diag(walk)
+
+
+def decays(aids: Sequence[Sensor], time: Float[Array, ""]) -> list[Float[Array, ""]]:
+    """Factor on each sensor's slow error over a time (s)."""
+    lasting = [each.slow_error[1] for each in aids]
+    return [jnp.ones_like(time) if math.isinf(x) else jnp.exp(-time / x) for x in lasting]

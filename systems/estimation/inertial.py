@@ -149,7 +149,7 @@ def take(
 
     # The sample's prediction error is compared with the standard deviation of such errors.
     step = jnp.concatenate([force, rate]) - memory.foreseen
-    noise = jnp.repeat(jnp.asarray(imu.noise_std(), dtype), 3)
+    noise = jnp.asarray(imu.noise_std, dtype)
     floor = jnp.asarray((2.0,) * 3 + (0.5,) * 3, dtype)
     bound = _ODD * jnp.sqrt(jnp.diag(memory.steps) + noise**2) + floor
     far = (jnp.abs(step) > bound) & jnp.repeat(good, 3) & (memory.count > FEW)

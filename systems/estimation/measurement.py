@@ -1,98 +1,49 @@
 """Measurement updates of an error-state filter: gate, gain, Joseph form."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import accumulate
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ...models import se3
-from ...models.sensors import Compass, DepthSensor, Dvl, wrap
-from .error_state import ERRORS, GYRO_BIAS, POSE, SENSORS, VELOCITY, Navigation, retract
+from ...models.sensors import Sensor
+from .error_state import GYRO_BIAS, INERTIAL, POSE, VELOCITY, Navigation, retract
 
 
 class Innovation(NamedTuple):
     """Residual y − h(x̂), its Jacobian in the error and the measurement's covariance."""
 
     residual: Float[Array, "m"]
-    H: Float[Array, "m 18"]
+    H: Float[Array, "m e"]
     R: Float[Array, "m m"]
 
 
-def _along_pose(h: Callable[[Array], Array], X_WB: Float[Array, "7"]) -> tuple[Array, Array]:
-    """Value of h at a pose and its Jacobian in the pose's error, by forward differentiation."""
-    value, slope = jax.linearize(h, X_WB)
-    return value, jax.vmap(slope, in_axes=1, out_axes=1)(_tangents(X_WB))
-
-
-def _tangents(X_WB: Float[Array, "7"]) -> Float[Array, "7 6"]:
-    """The derivative of X exp(ξ) at ξ = 0: q̇ = q (0, δθ) / 2, ṗ = R δp."""
-    w, x, y, z = jnp.unstack(X_WB[:4] / 2)
-    turns = jnp.stack([-x, -y, -z, w, -z, y, z, w, -x, -y, x, w]).reshape(4, 3)
-    zero = jnp.zeros((3, 3), X_WB.dtype)
-    moves = jnp.concatenate([se3.rotation_matrix(X_WB), zero], axis=1)
-    return jnp.concatenate([jnp.concatenate([jnp.zeros_like(turns), turns], axis=1), moves])
-
-
-def _noise(std: float, size: int, like: Array) -> Array:
-    return std**2 * jnp.eye(size, dtype=like.dtype)
-
-
-def dvl_innovation(
-    dvl: Dvl, nominal: Navigation, rate: Float[Array, "3"], reading: Float[Array, "3"]
+def innovation(
+    sensor: Sensor,
+    number: int,
+    nominal: Navigation,
+    rate: Float[Array, "3"],
+    values: Float[Array, "m"],
 ) -> Innovation:
-    """(1 + scale) R_SB (v + ω × r); `rate` is the gyroscope's reading, its bias still in it."""
+    """The innovation of sensor `number`; `rate` is the gyroscope's, with its bias."""
     V = jnp.concatenate([nominal.v_B, rate - nominal.gyro_bias])
-    E = dvl.expected(jnp.eye(6, dtype=V.dtype))  # the measurement is linear in the twist
-    EV, scale = E @ V, 1 + nominal.sensors[0]
-    H = jnp.zeros((3, ERRORS), V.dtype)
-    H = H.at[:, VELOCITY].set(scale * E[:, :3]).at[:, GYRO_BIAS].set(-scale * E[:, 3:])
-    H = H.at[:, SENSORS.start].set(EV)
-    return Innovation(reading - scale * EV, H, _noise(dvl.noise, 3, V))
-
-
-def depth_innovation(
-    depth: DepthSensor, nominal: Navigation, reading: Float[Array, "1"]
-) -> Innovation:
-    """Depth of the gauge and its offset."""
-    expected, H = _along_pose(depth.expected, nominal.X_WB)
-    residual = reading - expected - nominal.sensors[1:2]
-    return Innovation(residual, _pose_row(H, 1), _noise(depth.noise, 1, residual))
-
-
-def compass_innovation(
-    compass: Compass, nominal: Navigation, reading: Float[Array, "1"]
-) -> Innovation:
-    """Component of the bow perpendicular to the compass heading, corrected for the wander.
-
-    The component of the bow perpendicular to the true heading is zero at every attitude, and is
-    differentiable where yaw is not. A yaw error Δ makes it cos θ sin Δ, so the residual is cos θ
-    times that of yaw; beyond 90° it is clipped. The noise, cos θ times that of the compass, is
-    taken as the compass' own: a compass is no more accurate than that while the bow is up.
-    """
-    yaw = compass.expected(nominal.X_WB)
-    off = jnp.clip(wrap(reading - yaw - nominal.sensors[2:3]), -math.pi / 2, math.pi / 2)
-    shown = yaw + off
-    across = jnp.concatenate([-jnp.sin(shown), jnp.cos(shown), jnp.zeros_like(shown)])
-    bow = jnp.eye(3, dtype=yaw.dtype)[0]
-    h, H = _along_pose(lambda X: (across @ se3.rotate(X, bow))[None], nominal.X_WB)
-    level = jnp.linalg.norm(se3.rotate(nominal.X_WB, bow)[:2]) * jnp.cos(off[0])
-    return Innovation(-h, _pose_row(H, 2, level), _noise(compass.noise, 1, h))
-
-
-def _pose_row(
-    H: Float[Array, "1 6"], sensor: int, times: float | Float[Array, ""] = 1.0
-) -> Float[Array, "1 18"]:
-    """The row of H of a measurement of the pose plus `times` one sensor's slow error."""
-    row = jnp.zeros((1, ERRORS), H.dtype).at[:, POSE].set(H)
-    return row.at[:, SENSORS.start + sensor].set(times)
+    slow = nominal.sensors[number : number + 1]
+    found = sensor.innovation(nominal.X_WB, V, slow, values)
+    H = jnp.zeros((values.size, INERTIAL + nominal.sensors.size), V.dtype)
+    for part, slope in ((POSE, found.pose), (VELOCITY, found.velocity)):
+        H = H if slope is None else H.at[:, part].set(slope)
+    if found.rate is not None:
+        H = H.at[:, GYRO_BIAS].set(-found.rate)
+    if found.slow is not None:
+        H = H.at[:, INERTIAL + number].set(found.slow)
+    variances = [std**2 for std in sensor.noise_std]
+    return Innovation(found.residual, H, jnp.diag(jnp.asarray(variances, V.dtype)))
 
 
 def small_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Inverse of a positive matrix of 1, 3 or up to 6 rows in plain arithmetic, by blocks."""
+    """Inverse of a positive matrix of any size in plain arithmetic, by blocks of 3."""
     m = S.shape[0]
     if m == 1:
         return 1 / S
@@ -142,18 +93,18 @@ class Update(NamedTuple):
     """A corrected state, and the statistics of the update."""
 
     nominal: Navigation
-    P: Float[Array, "18 18"]
+    P: Float[Array, "e e"]
     nis: Float[Array, " n"]
     """Of each sensor."""
     accepted: Bool[Array, " n"]
     """Whether a sensor's reading was used and passed its gate."""
-    gain: Float[Array, "18 m"]
+    gain: Float[Array, "e m"]
     """K, with zero columns for readings that were not used."""
 
 
 def update(
     nominal: Navigation,
-    P: Float[Array, "18 18"],
+    P: Float[Array, "e e"],
     found: Sequence[Innovation],
     used: Bool[Array, " n"],
     gates: Sequence[float],
@@ -176,7 +127,7 @@ def update(
     # Rows that are not used have zero gain: the inverse is block-diagonal in them.
     K = jnp.where(mark[None], PH @ jnp.where(both, S_inverse, 0), 0)
     delta = K @ jnp.where(mark, r, 0)
-    eye = jnp.eye(ERRORS, dtype=P.dtype)
+    eye = jnp.eye(P.shape[0], dtype=P.dtype)
     gamma = eye.at[POSE, POSE].add(-se3.ad(delta[POSE]) / 2)
     L = gamma @ (eye - K @ H)
     GK = gamma @ K

@@ -19,27 +19,24 @@ A sensor whose mean NIS is above its expected value has its noise variance raise
 (covariance matching; Mehra 1970); if several do, the IMU's noise variance is raised instead.
 """
 
+from collections.abc import Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ...models.sensors import Compass, DepthSensor, Dvl, Imu
+from ...models.sensors import Imu, Sensor
+from .error_state import INERTIAL, POSITION
 from .measurement import small_inverse
 
-SIZES = (3, 1, 1)
-"""Values in a reading of DVL, depth gauge and compass."""
-
-_PARTS = (slice(0, 3), slice(3, 4), slice(4, 5))
-_STUCK_TOGETHER = 2  # repeats of all three velocities
-_STUCK_ALONE = (4, 8, 4)  # repeats of one value; a gauge's resolution may be as coarse as its noise
-_BEYOND = 1.1  # factor on the highest speed above which a velocity is invalid
+_STUCK_TOGETHER = 2  # repeats of all values of a sensor with several
 _OFF = 20.0  # bound on the IMU's error, in standard deviations of its bias
 _SUSPECT = 60.0  # s: shortest time for which a sensor is suspect
 _MOVES_AGAIN = 3.0  # s for which a sensor that was stuck is suspect: it was right before
 _RECENT = 20.0  # memory, in readings, of the pulls of a sensor that is not suspect
-_ALONE = (10.0, 60.0, 60.0)
+_ALONE = {"velocity": 10.0, "position": 60.0, "attitude": 60.0}
 """Time (s) for which the IMU alone predicts velocity, depth and yaw accurately enough."""
 _BIASED = 0.8  # mean of normalised innovations: white ones have a deviation of 0.16 over `_RECENT`
 _OUTLIER = 2.0
@@ -51,121 +48,150 @@ _GROWTH = 1.05  # of the IMU's variances, per reading while several sensors scat
 _UNUSUAL = 1.6  # threshold of the mean NIS per value over `_MATCHED` readings, above chance
 
 
-class Shown(NamedTuple):
-    """The sensors' last readings: v 3, depth, yaw."""
+def sizes(aids: Sequence[Sensor]) -> tuple[int, ...]:
+    """Numbers of values in the sensors' readings."""
+    return tuple(each.value_size for each in aids)
 
-    values: Float[Array, "5"]
-    stamps: Float[Array, "3"]
-    repeats: Float[Array, "5"]
+
+def parts(aids: Sequence[Sensor]) -> list[slice]:
+    """The sensors' places in their joined values."""
+    return [slice(b - n, b) for n, b in zip(sizes(aids), accumulate(sizes(aids)), strict=True)]
+
+
+def each_value(per_sensor: Array, aids: Sequence[Sensor]) -> Array:
+    """A number or mark of each sensor, repeated for its values."""
+    counts = sizes(aids)
+    return jnp.repeat(per_sensor, jnp.array(counts), total_repeat_length=sum(counts))
+
+
+class Shown(NamedTuple):
+    """The sensors' last readings, their values joined."""
+
+    values: Float[Array, "m"]
+    stamps: Float[Array, "n"]
+    repeats: Float[Array, "m"]
     """Number of readings for which each value has been the same."""
 
     @classmethod
-    def start(cls, dtype: jnp.dtype) -> "Shown":
+    def start(cls, aids: Sequence[Sensor], dtype: jnp.dtype) -> "Shown":
         """Before the first reading."""
-        never = jnp.full(3, -jnp.inf, dtype)
-        return cls(jnp.full(5, jnp.inf, dtype), never, jnp.zeros(5, dtype))
+        never, m = jnp.full(len(aids), -jnp.inf, dtype), sum(sizes(aids))
+        return cls(jnp.full(m, jnp.inf, dtype), never, jnp.zeros(m, dtype))
 
-    @property
-    def stuck(self) -> Bool[Array, "3"]:
+    def stuck(self, aids: Sequence[Sensor]) -> Bool[Array, "n"]:
         """Whether a sensor repeats the same values bit for bit in new readings."""
-        longest = jnp.stack([self.repeats[part].max() for part in _PARTS])
-        alone = longest >= jnp.asarray(_STUCK_ALONE, longest.dtype)
-        zeros = jnp.all(self.values[:3] == 0)  # lost bottom lock, reported as a zero velocity
-        return alone.at[0].set(alone[0] | (self.repeats[:3].min() >= _STUCK_TOGETHER) | zeros)
+        found = []
+        for each, part in zip(aids, parts(aids), strict=True):
+            repeats = self.repeats[part]
+            mark = repeats.max() >= each.stuck_after
+            if each.value_size > 1:
+                mark = mark | (repeats.min() >= _STUCK_TOGETHER)
+            if each.observes == "velocity":  # lost bottom lock, reported as a zero velocity
+                mark = mark | jnp.all(self.values[part] == 0)
+            found.append(mark)
+        return jnp.stack(found)
 
     def with_readings(
         self,
-        dvl: Dvl,
-        values: Float[Array, "5"],
-        valid: Bool[Array, "3"],
-        stamps: Float[Array, "3"],
-    ) -> tuple["Shown", Bool[Array, "3"]]:
+        aids: Sequence[Sensor],
+        values: Float[Array, "m"],
+        valid: Bool[Array, "n"],
+        stamps: Float[Array, "n"],
+    ) -> tuple["Shown", Bool[Array, "n"]]:
         """The memory with the present readings, and which of them are usable."""
         new = valid & (stamps != self.stamps) & jnp.isfinite(stamps)
-        fresh = jnp.repeat(new, jnp.array(SIZES), total_repeat_length=5)
+        fresh = each_value(new, aids)
         again = jnp.where(values == self.values, self.repeats + 1, 0)
         after = Shown(
             jnp.where(fresh, values, self.values),
             jnp.where(new, stamps, self.stamps),
             jnp.where(fresh, again, self.repeats),
         )
-        finite = jnp.stack([jnp.isfinite(values[part]).all() for part in _PARTS])
-        in_range = jnp.sum(values[:3] ** 2) <= (_BEYOND * dvl.highest_speed) ** 2
-        usable = valid & finite & jnp.isfinite(stamps) & ~after.stuck
-        return after, usable.at[0].set(usable[0] & in_range)
+        finite = jnp.stack([jnp.isfinite(values[part]).all() for part in parts(aids)])
+        in_range = [
+            jnp.sum(values[part] ** 2) <= each.largest**2
+            for each, part in zip(aids, parts(aids), strict=True)
+        ]
+        usable = valid & finite & jnp.isfinite(stamps) & ~after.stuck(aids)
+        return after, usable & jnp.stack(in_range)
 
 
 class Trust(NamedTuple):
-    """Statistics of DVL, depth gauge and compass."""
+    """Statistics of the sensors besides the IMU."""
 
-    nis: Float[Array, "3"]
+    nis: Float[Array, "n"]
     """Of the last reading."""
-    rejected: Float[Array, "3"]
+    rejected: Float[Array, "n"]
     """Readings in a row that failed the gate."""
-    passed: Float[Array, "3"]
+    passed: Float[Array, "n"]
     """Readings in a row that passed it."""
-    accepted_at: Float[Array, "3"]
+    accepted_at: Float[Array, "n"]
     """When a reading was last used (s)."""
-    jump: Float[Array, "3"]
+    jump: Float[Array, "n"]
     """Size of the residual with which the present rejections began."""
-    distrusted: Float[Array, "3"]
+    distrusted: Float[Array, "n"]
     """1 where a sensor is at fault and left out."""
-    scatter: Float[Array, "3"]
+    scatter: Float[Array, "n"]
     """Mean NIS per value, at the sensor's configured noise."""
-    mean: Float[Array, "5"]
+    mean: Float[Array, "m"]
     """Mean of the innovations divided by their standard deviations."""
-    suspected_at: Float[Array, "3"]
+    suspected_at: Float[Array, "n"]
     """When a sensor was last found suspect (s)."""
-    stuck_at: Float[Array, "3"]
+    stuck_at: Float[Array, "n"]
     """When its values were last stuck (s)."""
-    pulled: Float[Array, "3 18"]
+    pulled: Float[Array, "n e"]
     """Error δ of the estimate without a sensor's readings relative to the one with them."""
     imu_factor: Float[Array, ""]
     """Factor on the variances of the IMU's noises."""
 
     @classmethod
-    def start(cls, dtype: jnp.dtype) -> "Trust":
+    def start(cls, aids: Sequence[Sensor], dtype: jnp.dtype) -> "Trust":
         """No sensor is suspect."""
-        zero, one = jnp.zeros(3, dtype), jnp.ones(3, dtype)
-        never = jnp.full(3, -1e9, dtype)
-        five, pulled = jnp.zeros(5, dtype), jnp.zeros((3, 18), dtype)
-        return cls(zero, zero, zero, zero, zero, zero, one, five, never, never, pulled, one[0])
+        n = len(aids)
+        zero, one, never = jnp.zeros(n, dtype), jnp.ones(n, dtype), jnp.full(n, -1e9, dtype)
+        mean, pulled = jnp.zeros(sum(sizes(aids)), dtype), jnp.zeros((n, INERTIAL + n), dtype)
+        return cls(zero, zero, zero, zero, zero, zero, one, mean, never, never, pulled, one[0])
 
     @property
-    def _scattered(self) -> Bool[Array, "3"]:
+    def _scattered(self) -> Bool[Array, "n"]:
         return self.scatter > _UNUSUAL
 
     @property
-    def noise_factor(self) -> Float[Array, "3"]:
+    def noise_factor(self) -> Float[Array, "n"]:
         """Factors on the variances of the sensors' noises."""
         alone = jnp.sum(self._scattered) < 2
         return jnp.where(self._scattered & alone, self.scatter, 1)
 
-    def suspect(self, time: Float[Array, ""], within: float = _SUSPECT) -> Bool[Array, "3"]:
+    def suspect(self, time: Float[Array, ""], within: float = _SUSPECT) -> Bool[Array, "n"]:
         """Whether a sensor was found suspect `within` the last seconds before a time (s)."""
         stuck = time - self.stuck_at < min(within, _MOVES_AGAIN)
         return stuck | (time - self.suspected_at < within)
 
 
-def imu_off(imu: Imu, dvl: Dvl, depth: DepthSensor, compass: Compass) -> tuple[float, float, float]:
-    """Bounds on the IMU's error between two readings: m/s, m, rad."""
+def imu_off(imu: Imu, aids: Sequence[Sensor]) -> tuple[float, ...]:
+    """Bounds on the IMU's error between two readings of each sensor: m/s, m or rad."""
     a, w = _OFF * imu.accelerometer_bias, _OFF * imu.gyroscope_bias
-    return a / dvl.rate, a / depth.rate**2 / 2, w / compass.rate
+    bounds = {
+        "velocity": lambda rate: a / rate,
+        "position": lambda rate: a / rate**2 / 2,
+        "attitude": lambda rate: w / rate,
+    }
+    return tuple(bounds[str(each.observes)](each.rate) for each in aids)
 
 
 class Verdict(NamedTuple):
     """The judgement on the sensors before their readings are used."""
 
-    left_out: Bool[Array, "3"]
-    follow: Bool[Array, "3"]
+    left_out: Bool[Array, "n"]
+    follow: Bool[Array, "n"]
 
 
 def judged(
     trust: Trust,
-    used: Bool[Array, "3"],
-    off: tuple[float, float, float],
+    used: Bool[Array, "n"],
+    off: tuple[float, ...],
     patience: int,
-    well: Bool[Array, "3"],
+    well: Bool[Array, "n"],
 ) -> tuple[Trust, Verdict]:
     """Before an update: which sensors to leave out and which to follow regardless of their NIS.
 
@@ -183,13 +209,14 @@ def judged(
 
 
 def counted(
+    aids: Sequence[Sensor],
     trust: Trust,
-    used: Bool[Array, "3"],
-    accepted: Bool[Array, "3"],
-    nis: Float[Array, "3"],
-    plain_nis: Float[Array, "3"],
-    gates: tuple[float, float, float],
-    innovations: tuple[Float[Array, "5"], Float[Array, "5"]],
+    used: Bool[Array, "n"],
+    accepted: Bool[Array, "n"],
+    nis: Float[Array, "n"],
+    plain_nis: Float[Array, "n"],
+    gates: tuple[float, ...],
+    innovations: tuple[Float[Array, "m"], Float[Array, "m"]],
     time: Float[Array, ""],
 ) -> Trust:
     """After an update: the trust with these readings counted.
@@ -198,15 +225,15 @@ def counted(
     residuals and their standard deviations.
     """
     residuals, deviations = innovations
-    sizes = jnp.stack([jnp.linalg.norm(residuals[part]) for part in _PARTS])
+    norms = jnp.stack([jnp.linalg.norm(residuals[part]) for part in parts(aids)])
     passes = used & (nis <= jnp.asarray(gates, nis.dtype))
     fails = used & ~passes
     begins = fails & (trust.rejected < 1)
-    value = plain_nis / jnp.asarray(SIZES, nis.dtype)
+    value = plain_nis / jnp.asarray(sizes(aids), nis.dtype)
     value = jnp.minimum(value, _CLIPPED * jnp.maximum(trust.scatter, 1))
     matched = trust.scatter + (value - trust.scatter) / _MATCHED
     normal = jnp.clip(residuals / deviations, -_OUTLIER, _OUTLIER)
-    came = jnp.repeat(used, jnp.array(SIZES), total_repeat_length=5)
+    came = each_value(used, aids)
     mean = jnp.where(came, trust.mean + (normal - trust.mean) / _RECENT, trust.mean)
     several = jnp.sum(trust._scattered) > 1
     factor = jnp.where(several, trust.imu_factor * _GROWTH, trust.imu_factor / _GROWTH)
@@ -215,7 +242,7 @@ def counted(
         rejected=jnp.where(accepted, 0, trust.rejected + fails.astype(nis.dtype)),
         passed=jnp.where(passes, trust.passed + 1, jnp.where(fails, 0, trust.passed)),
         accepted_at=jnp.where(accepted, time, trust.accepted_at),
-        jump=jnp.where(begins, sizes, trust.jump),
+        jump=jnp.where(begins, norms, trust.jump),
         scatter=jnp.where(used & (trust.distrusted < 1), matched, trust.scatter),
         mean=mean,
         imu_factor=jnp.where(used.any(), jnp.clip(factor, 1, 1e4), trust.imu_factor),
@@ -223,12 +250,13 @@ def counted(
 
 
 def suspected(
+    aids: Sequence[Sensor],
     trust: Trust,
-    found: Bool[Array, "3"],
-    stuck: Bool[Array, "3"],
-    came: Bool[Array, "3"],
-    accepted: Bool[Array, "3"],
-    pulled: Float[Array, "3 18"],
+    found: Bool[Array, "n"],
+    stuck: Bool[Array, "n"],
+    came: Bool[Array, "n"],
+    accepted: Bool[Array, "n"],
+    pulled: Float[Array, "n e"],
     time: Float[Array, ""],
     elapsed: Float[Array, ""],
 ) -> Trust:
@@ -239,32 +267,35 @@ def suspected(
     accurate, and not at all while its readings are left out. `elapsed` is the time since the
     previous update (s).
     """
-    biased = jnp.stack([jnp.abs(trust.mean[part]).max() > _BIASED for part in _PARTS])
+    biased = jnp.stack([jnp.abs(trust.mean[part]).max() > _BIASED for part in parts(aids)])
     trust = trust._replace(
         suspected_at=jnp.where(found | biased, time, trust.suspected_at),
         stuck_at=jnp.where(stuck, time, trust.stuck_at),
     )
-    alone = jnp.exp(-elapsed / jnp.asarray(_ALONE, pulled.dtype))[:, None]
-    # no sensor corrects a horizontal position error: the DVL's pull on it does not decay
+    lasting = [_ALONE[str(each.observes)] for each in aids]
+    alone = jnp.exp(-elapsed / jnp.asarray(lasting, pulled.dtype))[:, None]
     fades = jnp.broadcast_to(jnp.where(accepted[:, None], alone, 1), pulled.shape)
-    fades = fades.at[0, :3].set(1)
+    if not any(each.observes == "position" and each.value_size > 1 for each in aids):
+        # no sensor corrects a horizontal position error: a velocity's pull on it does not decay
+        for i, each in enumerate(aids):
+            fades = fades.at[i, POSITION].set(1) if each.observes == "velocity" else fades
     of_others = jnp.where(came, 1 - 1 / _RECENT, 1)[:, None]
     fades = jnp.where(trust.suspect(time)[:, None], fades, of_others)
     return trust._replace(pulled=pulled * fades)
 
 
 def with_doubt(
-    P: Float[Array, "18 18"], pulled: Float[Array, "3 18"], suspect: Bool[Array, "3"]
-) -> Float[Array, "18 18"]:
+    P: Float[Array, "e e"], pulled: Float[Array, "n e"], suspect: Bool[Array, "n"]
+) -> Float[Array, "e e"]:
     """P inflated so that it covers the pulls of all suspects.
 
     If s = dᵀ B⁻¹ d > 1 for a pull d and the block B of position, attitude, velocity or a bias, B is
     multiplied by s: the pull is then one standard deviation.
     """
-    starts = range(0, 15, 3)
+    starts, n = range(0, INERTIAL, 3), pulled.shape[0]
     inverses = jax.vmap(small_inverse)(jnp.stack([P[k : k + 3, k : k + 3] for k in starts]))
-    d = pulled[:, :15].reshape(3, 5, 3)
+    d = pulled[:, :INERTIAL].reshape(n, len(starts), 3)
     s = jnp.sum(jnp.sum(d[:, :, None] * inverses[None], axis=3) * d, axis=2)
     s = jnp.maximum(jnp.max(jnp.where(suspect[:, None], s, 1), axis=0), 1)
-    scales = jnp.concatenate([jnp.repeat(jnp.sqrt(s), 3), jnp.ones(3, P.dtype)])
+    scales = jnp.concatenate([jnp.repeat(jnp.sqrt(s), 3), jnp.ones(n, P.dtype)])
     return scales[:, None] * P * scales[None]

@@ -1,6 +1,6 @@
 """The vehicle's sensors as one system, each with its own rate."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice, pairwise
@@ -12,7 +12,7 @@ from jaxtyping import Array
 from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
 
-from ...models.sensors import Compass, DepthSensor, Dvl, Imu, Sensor, SensorFault
+from ...models.sensors import SHIPPED, Sensor, SensorFault
 from ...models.sensors.faults import FaultySensor
 from ..compiled.jit import VectorFunction, value_or_none, value_or_zeros
 from ..compiled.pure import Event, Inputs, Pure, State
@@ -20,11 +20,12 @@ from ..compiled.pure import shown as shown_group
 
 Outputs = tuple[Array, ...]
 Motion = tuple[Array, Array, Array]
-NAMES = ("imu", "dvl", "depth", "compass")
 
 
 class SensorSuite(LeafSystem):
     """Measures the true motion with each sensor at its own rate and holds the readings.
+
+    Each sensor has an output port under its name; those of the shipped ones are
 
     - `imu` (6): specific force (m/s²), angular rate (rad/s), every IMU period;
     - `dvl` (7): velocity (m/s, 3), 1 if valid, altitude (m), figure of merit (m/s), time of
@@ -33,9 +34,9 @@ class SensorSuite(LeafSystem):
     - `compass` (3): yaw (rad), 1 once valid, time of the measurement (s).
 
     A new reading has a new time. At initialisation `initial_noise` draws the sensors' biases,
-    offsets and scale errors. All four sensors take their unit Gaussians from `noise`, which should
-    be redrawn every IMU period. Unconnected inputs count as zero, an unconnected pose as the
-    identity.
+    offsets and scale errors. All sensors take their unit Gaussians from `noise`, which should be
+    redrawn at every period of the first sensor, the IMU. Unconnected inputs count as zero, an
+    unconnected pose as the identity.
 
     Faults (`models.sensors.faults`) act on the outputs; the sensors' own states and noise are
     unchanged. Random faults have an input of their own, `fault_noise`, drawn like `noise`; without
@@ -59,18 +60,12 @@ class SensorSuite(LeafSystem):
     """
 
     def __init__(
-        self,
-        imu: Imu | None = None,
-        dvl: Dvl | None = None,
-        depth: DepthSensor | None = None,
-        compass: Compass | None = None,
-        faults: tuple[SensorFault, ...] = (),
+        self, on_board: Mapping[str, Sensor] = SHIPPED, faults: tuple[SensorFault, ...] = ()
     ):
-        """Use the given sensors, or their defaults, with `faults` in their outputs."""
+        """Measure with the sensors by their ports' names, with `faults` in their outputs."""
         super().__init__()
-        imu, dvl = imu or Imu(), dvl or Dvl()
-        depth, compass = depth or DepthSensor(), compass or Compass()
-        sensors: tuple[Sensor, ...] = (imu, dvl, depth, compass)
+        self._names, sensors = tuple(on_board), tuple(on_board.values())
+        count, base = len(sensors), sensors[0].rate
         self._X = self.DeclareVectorInputPort("X_WB", 7)
         self._V = self.DeclareVectorInputPort("V_WB_B", 6)
         self._A = self.DeclareVectorInputPort("A_WB_B", 6)
@@ -82,8 +77,7 @@ class SensorSuite(LeafSystem):
             "initial_noise", sum(initial_sizes), gaussian
         )
         shown = [
-            _Shown(s, tuple(f for f in faults if f.sensor == name))
-            for name, s in zip(NAMES, sensors, strict=True)
+            _Shown(s, tuple(f for f in faults if f.sensor == name)) for name, s in on_board.items()
         ]
         fault_sizes = [part.noise_size for part in shown]
         self._draws = [self._noise]
@@ -91,11 +85,11 @@ class SensorSuite(LeafSystem):
             port = self.DeclareVectorInputPort("fault_noise", sum(fault_sizes), gaussian)
             self._draws.append(port)
 
-        self._sizes = [*(s.state_size for s in sensors), 6, 7, 3, 3]
+        self._sizes = [*(s.state_size for s in sensors), *(s.port_size for s in sensors)]
         self._sizes += [part.memory_size for part in shown if part.faults]
         groups = [self.DeclareDiscreteState(size) for size in self._sizes]
-        self._states, self._shown = groups[:4], groups[4:8]
-        for name, index in zip(NAMES, self._shown, strict=True):
+        self._states = groups[:count]
+        for name, index in zip(self._names, groups[count:], strict=False):
             self.DeclareStateOutputPort(name, index)
 
         self._start = VectorFunction(
@@ -106,40 +100,42 @@ class SensorSuite(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._initialise)
         ends = np.cumsum([0, *sizes, *fault_sizes])
         draws = [slice(a, b) for a, b in pairwise(ends)]
-        memories = iter(range(8, len(groups)))
+        memories = iter(range(2 * count, len(groups)))
 
         def measured(i: int) -> _Part:
-            """A sensor's measurement; the DVL's is output separately, after its latency."""
+            """A sensor's measurement; a late sensor's is output separately, after its latency."""
             part, sensor = shown[i], sensors[i]
-            late = sensor is dvl
-            memory = (next(memories),) if part.faults and not late else ()
+            memory = (next(memories),) if part.faults and not sensor.late else ()
 
             def measure(motion: Motion, t: Array, w: Array, state: Array, *kept: Array) -> Outputs:
                 state = sensor.measure(state, *motion, t, w[draws[i]])
-                if late:
+                if sensor.late:
                     return (state,)
                 reading = sensor.reading(state, t)
-                if sensor is not imu:  # with a validity flag and its time
+                if sensor.port_size > reading.size:  # with a validity flag and its time
                     reading = jnp.concatenate([reading, jnp.stack([jnp.ones_like(t), t])])
-                return state, *part.show(reading, t, w[draws[4 + i]], *kept)
+                return state, *part.show(reading, t, w[draws[count + i]], *kept)
 
-            writes = (i,) if late else (i, 4 + i, *memory)
+            writes = (i,) if sensor.late else (i, count + i, *memory)
             return _Part(sensor.rate, measure, (i, *memory), writes)
 
-        def dvl_appears() -> _Part:
-            part = shown[1]
+        def appears(i: int) -> _Part:
+            part, sensor = shown[i], sensors[i]
             memory = (next(memories),) if part.faults else ()
 
             def appear(motion: Motion, t: Array, w: Array, state: Array, *kept: Array) -> Outputs:
                 del motion
-                return part.show_held(dvl.reading(state, t), w[draws[5]], *kept)
+                return part.show_held(sensor.reading(state, t), w[draws[count + i]], *kept)
 
-            return _Part(imu.rate, appear, (1, *((5, *memory) if memory else ())), (5, *memory))
+            held = count + i
+            return _Part(base, appear, (i, *((held, *memory) if memory else ())), (held, *memory))
 
-        parts = [measured(0), dvl_appears(), *(measured(i) for i in (1, 2, 3))]
+        parts: list[_Part] = []
+        for i, sensor in enumerate(sensors):
+            parts += [appears(i), measured(i)] if sensor.late else [measured(i)]
         self._parts = parts
         # Sensors whose period is a multiple of the IMU's share its events and compiled calls.
-        shared = [part for part in parts if _divides(part.rate, imu.rate)]
+        shared = [part for part in parts if _divides(part.rate, base)]
         self._declare(shared)
         for part in parts:
             if part not in shared:
@@ -164,7 +160,8 @@ class SensorSuite(LeafSystem):
                 return Event(1 / base, update, round(base / part.rate))
             return Event(1 / part.rate, update)
 
-        outputs = {name: shown_group(len(NAMES) + i) for i, name in enumerate(NAMES)}
+        count = len(self._names)
+        outputs = {name: shown_group(count + i) for i, name in enumerate(self._names)}
         noise = tuple(port.get_name() for port in self._draws)
         return Pure(tuple(event(part) for part in self._parts), outputs, noise)
 
@@ -262,27 +259,27 @@ class _Shown:
 
     @property
     def memory_size(self) -> int:
-        """Size of the faults' memory; the DVL's includes its last held reading."""
-        held = self.sensor.reading_size if isinstance(self.sensor, Dvl) else 0
+        """Size of the faults' memory; a late sensor's includes its last held reading."""
+        held = self.sensor.reading_size if self.sensor.late else 0
         return held + self._faulty.memory_size
 
     def show(self, reading: Array, t: Array, w: Array, *memory: Array) -> Outputs:
         """The output for a reading measured at t, and the faults' memory if there are any."""
         if not self.faults:
             return (reading,)
-        n = self.sensor.reading_size
-        marks = [jnp.stack([jnp.ones_like(t), t])] if reading.size == n else []  # the IMU's
+        bare = reading.size == self.sensor.value_size
+        marks = [jnp.stack([jnp.ones_like(t), t])] if bare else []
         kept, seen = self._faulty.show(memory[0], jnp.concatenate([reading, *marks]), t, w)
         return seen[: reading.size], kept
 
     def show_held(self, reading: Array, w: Array, *memory: Array) -> Outputs:
-        """The same for the DVL's held reading; faults act on it once, when it appears."""
+        """The same for a late sensor's held reading; faults act on it once, when it appears."""
         if not self.faults:
             return (reading,)
         before, kept = memory
         last, own = kept[: reading.size], kept[reading.size :]
-        bare = jnp.concatenate([reading[:4], reading[6:]])
-        own, seen = self._faulty.show(own, bare, reading[6], w)
-        seen = jnp.concatenate([seen[:4], reading[4:6], seen[4:]])
+        n = self.sensor.value_size + 1
+        own, seen = self._faulty.show(own, self.sensor.marked(reading), reading[-1], w)
+        seen = jnp.concatenate([seen[:n], reading[n:-1], seen[n:]])
         new = jnp.any(reading != last)
         return jnp.where(new, seen, before), jnp.where(new, jnp.concatenate([reading, own]), kept)

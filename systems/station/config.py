@@ -1,7 +1,9 @@
 """Configuration of the station: vehicle, water, sensors, start, seed."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -12,13 +14,16 @@ from ...models.dynamics import Dynamics
 from ...models.effects.effect_config import EffectConfig, check_distinct
 from ...models.effects.extended import Extended, core
 from ...models.files.checkpoint import load_model
-from ...models.sensors import Compass, DepthSensor, Dvl, Imu, SensorFault
+from ...models.sensors import SHIPPED, Compass, DepthSensor, Dvl, Imu, Sensor, SensorFault
+from ...models.sensors import Kind as SensorKind
 from ...models.spinn import Spinn
 from ...models.vehicles.vehicle import Vehicle, load_vehicle
 from ..estimation.delayed import EkfConfig
-from ..own import OwnFilter
+from ..own import OwnFilter, OwnSensor
 from ..planning.obstacles import Pylon
 from ..planning.paths import PoseConfig
+
+_TAKEN = ("F_Bo_B", "X_WB", "V_WB_B", "covariance", "pwm", "status", "health")
 
 
 @dataclass(frozen=True)
@@ -26,17 +31,63 @@ class Sensing:
     """The sensors on board, their faults, and the filter that fuses them.
 
     Attributes:
+        imu: the inertial unit.
+        dvl: the Doppler velocity log; none if null, and so for the next two.
+        depth: the depth gauge.
+        compass: the compass.
+        more: further sensors by the names of their ports.
         faults: of the sensors' outputs (`docs/sensor-faults.md`); the filter does not know of them.
         filter: user-defined, in place of the one that `ekf` configures.
     """
 
     imu: Imu = field(default_factory=Imu)
-    dvl: Dvl = field(default_factory=Dvl)
-    depth: DepthSensor = field(default_factory=DepthSensor)
-    compass: Compass = field(default_factory=Compass)
+    dvl: Dvl | None = field(default_factory=Dvl)
+    depth: DepthSensor | None = field(default_factory=DepthSensor)
+    compass: Compass | None = field(default_factory=Compass)
+    more: dict[str, SensorKind | OwnSensor | Sensor] = field(default_factory=dict)
     ekf: EkfConfig = field(default_factory=EkfConfig)
     faults: tuple[SensorFault, ...] = ()
     filter: OwnFilter | None = None
+
+    def __post_init__(self) -> None:
+        """Check the names of sensors, and the faults of those that need no user code."""
+        for name in self.more:
+            fit = name.isidentifier() and name not in (*SHIPPED, *_TAKEN)
+            remedy = "name each sensor by a word of its own, which no port of a station has"
+            require(fit, self, "more", remedy)
+        on_board = self._on_board()
+        for fault in self.faults:
+            if not isinstance(on_board.get(fault.sensor), OwnSensor):
+                fault.check(on_board)
+
+    def _on_board(self) -> dict[str, Any]:
+        shipped = {name: getattr(self, name) for name in SHIPPED}
+        return {name: each for name, each in (shipped | self.more).items() if each is not None}
+
+    @cached_property
+    def sensors(self) -> dict[str, Sensor]:
+        """The sensors on board by the names of their ports.
+
+        Raises:
+            UserError: one of the user's own can't be made, or does not have what a fault needs.
+        """
+        found = {
+            name: each.make({}) if isinstance(each, OwnSensor) else each
+            for name, each in self._on_board().items()
+        }
+        for fault in self.faults:
+            fault.check(found)
+        return found
+
+    @property
+    def fused(self) -> tuple[str, ...]:
+        """Names of the sensors that the filter fuses, besides the IMU."""
+        return tuple(n for n, each in self.sensors.items() if each.observes is not None)
+
+    @property
+    def water_depth(self) -> float:
+        """Depth of the bed as the DVL is told it (m); that of a DVL by default without one."""
+        return (self.dvl or Dvl()).water_depth
 
 
 @dataclass(frozen=True)

@@ -5,55 +5,24 @@ from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import ConstantVectorSource, RandomSource
 
+from ...models.sensors import Sensor
 from ..estimation.ekf import Ekf
 from ..own import check_ports
 from ..plant.allocation import ThrustAllocation
 from ..plant.disturbance_source import DisturbanceSource
 from ..plant.learned_plant import LearnedPlant
 from ..plant.sensor_suite import SensorSuite
-from .config import StationConfig
+from .config import Sensing, StationConfig
+from .ports import CHEATS, ESTIMATES, REPORTED, station_ports
 
-INPUTS = {"F_Bo_B": 6}
-"""Input ports and their sizes: the commanded wrench."""
-
-OUTPUTS = {
-    "X_WB": 7,
-    "V_WB_B": 6,
-    "covariance": 324,
-    "imu": 6,
-    "dvl": 7,
-    "depth": 3,
-    "compass": 3,
-    "pwm": 8,
-    "status": 10,
-    "health": 5,
-}
-"""Output ports and their sizes, in simulation and on hardware: estimates, readings, commands."""
-
-CHEATS = {
-    "X_WB_cheat": 7,
-    "V_WB_B_cheat": 6,
-    "F_disturbance_cheat": 6,
-    "flow_cheat": 6,
-}
-"""Output ports that only a simulation has: the truth."""
-
-_NEEDED = {"X_WB": 7, "V_WB_B": 6}
-_TOLD = {"covariance": 324, "status": 10, "health": 5}
-_READ = {"imu": 6, "dvl": 7, "depth": 3, "compass": 3}
 _NEVER = 1e9  # period (s) of noise that is drawn once
 _WATER = 2  # periods of the plant per step of the water: waves have periods of seconds
-
-
-def station_ports(hardware: bool = False) -> tuple[dict[str, int], dict[str, int]]:
-    """Names and sizes of a station's input and output ports."""
-    return dict(INPUTS), OUTPUTS | ({} if hardware else CHEATS)
 
 
 def make_station(
     config: StationConfig, hardware: bool = False, estimator: System | None = None
 ) -> Diagram:
-    """A diagram with `station_ports(hardware)`.
+    """A diagram with `station_ports(config, hardware)`.
 
     In simulation: allocation, plant with thrusters, disturbances, sensors and filter, as subsystems
     `allocation`, `plant`, `disturbances`, `sensors` and `ekf`. All noise comes from random sources
@@ -72,15 +41,17 @@ def make_station(
     return _simulated(config, estimator)
 
 
-def check_stand_in(system: System) -> None:
-    """Check that a system can stand in for a station.
+def check_stand_in(system: System, config: StationConfig) -> None:
+    """Check that a system can stand in for the station of a configuration.
 
     Raises:
         UserError: it lacks `F_Bo_B`, `X_WB` or `V_WB_B`, or a port has another size than a
             station's.
     """
-    known = {name: size for name, size in (OUTPUTS | CHEATS).items() if name != "pwm"}
-    check_ports("station", system, (INPUTS, _NEEDED), ({}, known))
+    inputs, known = station_ports(config)
+    needed = {port.name: known.pop(port.name) for port in ESTIMATES}
+    del known["pwm"]
+    check_ports("station", system, (inputs, needed), ({}, known))
 
 
 def add_noise(builder: DiagramBuilder, system: System, name: str, period: float) -> None:
@@ -93,84 +64,131 @@ def add_noise(builder: DiagramBuilder, system: System, name: str, period: float)
     builder.Connect(source.get_output_port(), port)
 
 
+class StationBuilder:
+    """Takes in the sensors of a station: each adds itself by its `add_to`.
+
+    Attributes:
+        builder: of the station's diagram.
+        measured: the sensors that the `SensorSuite` measures, by the names of their ports.
+        systems: those that are Drake systems of their own, by the names of their output ports.
+    """
+
+    def __init__(self, builder: DiagramBuilder):
+        self.builder = builder
+        self.measured: dict[str, Sensor] = {}
+        self.systems: dict[str, System] = {}
+
+    def measure(self, name: str, sensor: Sensor) -> None:
+        """Let the suite measure a sensor, whose output port gets this name."""
+        self.measured[name] = sensor
+
+    def add_system(self, name: str, system: System) -> None:
+        """Add a Drake system with an output port of this name.
+
+        Of the inputs X_WB, V_WB_B, A_WB_B (the truth) and `noise` those that it has are connected.
+        """
+        self.systems[name] = self.builder.AddNamedSystem(name, system)
+
+    def connect(self, source: System, output: str, target: System, name: str = "") -> None:
+        """Connect ports by their names, which differ if `name` is given."""
+        self.builder.Connect(source.GetOutputPort(output), target.GetInputPort(name or output))
+
+    def add_sensors(self, sensing: Sensing, plant: System) -> dict[str, System]:
+        """Add all sensors; return the systems by the names of their output ports."""
+        for name, sensor in sensing.sensors.items():
+            sensor.add_to(self, name)
+        suite = SensorSuite(self.measured, sensing.faults)
+        self.builder.AddNamedSystem("sensors", suite)
+        for name, system in self.systems.items():
+            check_ports("sensor", system, ({}, {name: sensing.sensors[name].port_size}))
+        truth = {"X_WB": "X_WB_seen", "V_WB_B": "V_WB_B_seen", "A_WB_B": "A_WB_B"}
+        for system in (suite, *self.systems.values()):
+            for name, seen in truth.items():
+                if system.HasInputPort(name):
+                    self.connect(plant, seen, system, name)
+        return dict.fromkeys(self.measured, suite) | self.systems
+
+
 def _simulated(config: StationConfig, estimator: System | None) -> Diagram:
     thrusters = config.load_vehicle().thrusters()
     X0, V0 = config.initial_state()
-    s = config.sensing
     water_period = _WATER * config.period
     builder = DiagramBuilder()
-    add = builder.AddNamedSystem
+    station, add = StationBuilder(builder), builder.AddNamedSystem
     allocation = add("allocation", ThrustAllocation(thrusters, config.voltage))
     body = LearnedPlant(config.dynamics(), config.period, config.substeps, X0, V0, thrusters)
     plant = add("plant", body)
     water = add("disturbances", DisturbanceSource(config.disturbance(), water_period))
-    sensors = add("sensors", SensorSuite(s.imu, s.dvl, s.depth, s.compass, s.faults))
+    sensors = station.add_sensors(config.sensing, plant)
     ekf = add("ekf", estimator or _filter(config))
-    commands = {"pwm": allocation.GetOutputPort("pwm").size()}
-    check_ports("filter", ekf, ({}, _NEEDED), (_READ | commands, _TOLD))
+    sizes = station_ports(config)[1]
+    needed, reported = ({port.name: sizes[port.name] for port in x} for x in (ESTIMATES, REPORTED))
+    offered = {name: sizes[name] for name in (*sensors, "pwm")}
+    check_ports("filter", ekf, ({}, needed), (offered, reported))
 
-    def connect(source, output: str, target, name: str | None = None) -> None:
-        builder.Connect(source.GetOutputPort(output), target.GetInputPort(name or output))
-
-    connect(allocation, "pwm", plant)
-    connect(water, "F_disturbance_Bo_B", plant)
-    connect(water, "flow_W", plant)
-    for reader, seen in ((water, ""), (sensors, "_seen")):
-        connect(plant, f"X_WB{seen}", reader, "X_WB")
-        connect(plant, f"V_WB_B{seen}", reader, "V_WB_B")
-    connect(plant, "A_WB_B", sensors)
-    for source, names in ((sensors, _READ), (allocation, ("pwm",))):
-        for name in names:
-            if ekf.HasInputPort(name):
-                connect(source, name, ekf)
+    station.connect(allocation, "pwm", plant)
+    for name in ("F_disturbance_Bo_B", "flow_W"):
+        station.connect(water, name, plant)
+    for name in ("X_WB", "V_WB_B"):
+        station.connect(plant, name, water)
+    for name, source in (sensors | {"pwm": allocation}).items():
+        if ekf.HasInputPort(name):
+            station.connect(source, name, ekf)
     nominal = float(thrusters.nominal_voltage)
     volts = nominal if config.voltage is None else config.voltage
     battery = add("battery", ConstantVectorSource([volts]))
     builder.Connect(battery.get_output_port(), plant.GetInputPort("voltage"))
-
-    add_noise(builder, plant, "noise", config.period)
-    add_noise(builder, water, "noise", water_period)
-    add_noise(builder, sensors, "noise", 1 / s.imu.rate)
-    for system in (water, sensors, ekf):
-        if system.HasInputPort("initial_noise"):
-            add_noise(builder, system, "initial_noise", _NEVER)
-    if sensors.HasInputPort("fault_noise"):  # last: the other sources keep their seeds
-        add_noise(builder, sensors, "fault_noise", 1 / s.imu.rate)
+    _add_noises(builder, config, sensors, (plant, water, ekf))
 
     builder.ExportInput(allocation.GetInputPort("F_Bo_B"), "F_Bo_B")
-    for name in ("X_WB", "V_WB_B"):
-        builder.ExportOutput(ekf.GetOutputPort(name), name)
-    for name in _READ:
-        builder.ExportOutput(sensors.GetOutputPort(name), name)
-    builder.ExportOutput(allocation.GetOutputPort("pwm"), "pwm")
-    for name, size in _TOLD.items():
+    for name, source in (dict.fromkeys(needed, ekf) | sensors | {"pwm": allocation}).items():
+        builder.ExportOutput(source.GetOutputPort(name), name)
+    for name, size in reported.items():
         if ekf.HasOutputPort(name):
             builder.ExportOutput(ekf.GetOutputPort(name), name)
         else:
-            value = np.array([0.0, 1, 1, 1, 1]) if name == "health" else np.full(size, np.nan)
-            untold = add(f"no_{name}", ConstantVectorSource(value))
-            builder.ExportOutput(untold.get_output_port(), name)
-    builder.ExportOutput(plant.GetOutputPort("X_WB"), "X_WB_cheat")
-    builder.ExportOutput(plant.GetOutputPort("V_WB_B"), "V_WB_B_cheat")
-    builder.ExportOutput(water.GetOutputPort("F_disturbance_Bo_B"), "F_disturbance_cheat")
-    builder.ExportOutput(water.GetOutputPort("flow_W"), "flow_cheat")
-    station = builder.Build()
-    station.set_name("station")
-    return station
+            value = [0.0, *[1.0] * (size - 1)] if name == "health" else [np.nan] * size
+            unknown = add(f"no_{name}", ConstantVectorSource(value))
+            builder.ExportOutput(unknown.get_output_port(), name)
+    truth = ((plant, "X_WB"), (plant, "V_WB_B"), (water, "F_disturbance_Bo_B"), (water, "flow_W"))
+    for cheat, (system, name) in zip(CHEATS, truth, strict=True):
+        builder.ExportOutput(system.GetOutputPort(name), cheat.name)
+    diagram = builder.Build()
+    diagram.set_name("station")
+    return diagram
+
+
+def _add_noises(
+    builder: DiagramBuilder,
+    config: StationConfig,
+    sensors: dict[str, System],
+    others: tuple[System, System, System],
+) -> None:
+    """Feed all noise ports; a source's seed is its place in this order."""
+    plant, water, ekf = others
+    suite, period = sensors["imu"], 1 / config.sensing.imu.rate
+    add_noise(builder, plant, "noise", config.period)
+    add_noise(builder, water, "noise", _WATER * config.period)
+    add_noise(builder, suite, "noise", period)
+    for system in (water, suite, ekf):
+        if system.HasInputPort("initial_noise"):
+            add_noise(builder, system, "initial_noise", _NEVER)
+    if suite.HasInputPort("fault_noise"):  # last: the other sources keep their seeds
+        add_noise(builder, suite, "fault_noise", period)
+    for name, system in sensors.items():
+        if system is not suite and system.HasInputPort("noise"):
+            add_noise(builder, system, "noise", 1 / config.sensing.sensors[name].rate)
 
 
 def _filter(config: StationConfig) -> System:
     """The configured filter."""
     s, (X0, V0) = config.sensing, config.initial_state()
     if s.filter is None:
-        return Ekf(s.imu, s.dvl, s.depth, s.compass, s.ekf, X0, V0)
+        return Ekf(s.sensors, s.ekf, X0, V0)
     return s.filter.make(
         {
+            **{name: lambda sensor=sensor: sensor for name, sensor in s.sensors.items()},
             "vehicle": config.load_vehicle,
-            "imu": lambda: s.imu,
-            "dvl": lambda: s.dvl,
-            "depth": lambda: s.depth,
-            "compass": lambda: s.compass,
             "X0_WB": lambda: X0,
             "V0_WB_B": lambda: V0,
             "station": lambda: config,

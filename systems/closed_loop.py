@@ -74,14 +74,15 @@ def build_diagram(
             builder.Connect(plant.GetOutputPort(name), control.GetInputPort(name))
     builder.Connect(control.GetOutputPort("F_Bo_B"), plant.GetInputPort("F_Bo_B"))
     truth = _truth(plant, control)
-    if log_periods is None:
-        log_periods = default_log_periods(station) | CONTROLLER_PERIODS
+    periods = log_periods
+    if periods is None:
+        periods = default_log_periods(station) | CONTROLLER_PERIODS
     for system in (plant, control):
         for i in range(system.num_output_ports()):
             port = system.get_output_port(i)
             name = port.get_name()
-            if name in log_periods:
-                add_log(builder, port, name, log_periods[name], (system, i) in truth)
+            if name in periods:
+                add_log(builder, port, name, periods[name], (system, i) in truth)
     if extend is not None:
         extend(builder, plant, control)
     diagram = builder.Build()

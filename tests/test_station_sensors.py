@@ -1,6 +1,7 @@
 """A station's sensors follow from its configuration, and its ports and filter from them."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -143,8 +144,8 @@ def test_without_dvl_and_compass_the_filter_says_what_it_does_not_know():
 class Thermometer(Sensor):
     """A sensor that is a Drake system of its own, and that no filter fuses."""
 
-    state_size = noise_size = initial_noise_size = 0
-    reading_size = 1
+    state_size = noise_size = initial_noise_size = 0  # pyright: ignore[reportAssignmentType]
+    reading_size = 1  # pyright: ignore[reportAssignmentType]
 
     def initial(self, w):
         raise NotImplementedError
@@ -164,7 +165,8 @@ class Colder(LeafSystem):
         X = self.DeclareVectorInputPort("X_WB", 7)
 
         def show(context, output: BasicVector):
-            output.SetFromVector([20.0 + X.Eval(context)[6], 1.0, context.get_time()])
+            pose: Any = X.Eval(context)
+            output.SetFromVector([20.0 + pose[6], 1.0, context.get_time()])
 
         self.DeclareVectorOutputPort("temperature", 3, show)
 
@@ -175,7 +177,7 @@ def test_a_sensor_may_be_a_drake_system_of_its_own():
     made = make_station(station)
     context = made.CreateDefaultContext()
     made.GetInputPort("F_Bo_B").FixValue(context, np.zeros(6))
-    seen = made.GetOutputPort("temperature").Eval(context)
+    seen: Any = made.GetOutputPort("temperature").Eval(context)
     np.testing.assert_allclose(seen, [20 - 1.5, 1, 0])
 
 

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from ...models.sensors import Sensor
-from ..estimation.delayed import health_names, status_names
 from ..estimation.error_state import INERTIAL
 from .config import StationConfig
 
@@ -14,74 +13,57 @@ class StationPort(NamedTuple):
 
     Attributes:
         name: of the port.
-        size: its length, for a station's configuration.
-        told: the length in words.
+        length: in words; n is the number of sensors that the filter fuses, m that of thrusters.
+        size: the length, given n and m.
         holds: what it holds.
         period: at which a closed loop logs it (s).
     """
 
     name: str
-    size: Callable[[StationConfig], int]
-    told: str
+    length: str
+    size: Callable[[int, int], int]
     holds: str
-    period: float
+    period: float = 0.05
 
 
-def _fixed(size: int) -> tuple[Callable[[StationConfig], int], str]:
-    return (lambda config: size), str(size)
-
-
-def _of_fused(
-    size: Callable[[list[str]], int], told: str
-) -> tuple[Callable[[StationConfig], int], str]:
-    """Of a length that follows from the sensors that the filter fuses."""
-    return (lambda config: size(list(config.sensing.fused))), told
-
-
-def _thrusters(config: StationConfig) -> int:
-    return len(config.load_vehicle().propulsion.mounts)
-
-
-INPUTS = (StationPort("F_Bo_B", *_fixed(6), "commanded wrench about Bo (N, N·m)", 0.05),)
+INPUTS = (StationPort("F_Bo_B", "6", lambda n, m: 6, "commanded wrench about Bo (N, N·m)"),)
 
 ESTIMATES = (
-    StationPort("X_WB", *_fixed(7), "estimated pose", 0.05),
-    StationPort("V_WB_B", *_fixed(6), "estimated twist (m/s, rad/s)", 0.05),
+    StationPort("X_WB", "7", lambda n, m: 7, "estimated pose"),
+    StationPort("V_WB_B", "6", lambda n, m: 6, "estimated twist (m/s, rad/s)"),
 )
 
-COMMANDS = (
-    StationPort(
-        "pwm", _thrusters, "number of thrusters", "pulse widths of the thrusters (µs)", 0.05
-    ),
-)
+COMMANDS = (StationPort("pwm", "m", lambda n, m: m, "pulse widths of the thrusters (µs)"),)
 
 REPORTED = (
     StationPort(
         "covariance",
-        *_of_fused(lambda fused: (INERTIAL + len(fused)) ** 2, "(15 + n)²"),
+        "(15 + n)²",
+        lambda n, m: (INERTIAL + n) ** 2,
         "of the estimate's error, by rows (`systems.estimation.error_state`)",
         0.2,
     ),
     StationPort(
         "status",
-        *_of_fused(lambda fused: len(status_names(fused)), "1 + 3 n"),
+        "1 + 3 n",
+        lambda n, m: 1 + 3 * n,
         "time of the filter's horizon (s); NIS, rejections in a row, age (s) of each fused sensor",
         0.2,
     ),
     StationPort(
         "health",
-        *_of_fused(lambda fused: len(health_names(fused)), "2 + n"),
+        "2 + n",
+        lambda n, m: 2 + n,
         "0 good, 1 degraded, 2 lost; then 1 where the imu and each fused sensor are trusted",
-        0.05,
     ),
 )
 """What a filter may leave out: NaN then, and good health."""
 
 CHEATS = (
-    StationPort("X_WB_cheat", *_fixed(7), "true pose", 0.05),
-    StationPort("V_WB_B_cheat", *_fixed(6), "true twist (m/s, rad/s)", 0.05),
-    StationPort("F_disturbance_cheat", *_fixed(6), "disturbances' wrench about Bo (N, N·m)", 0.05),
-    StationPort("flow_cheat", *_fixed(6), "water's velocity and acceleration in W", 0.05),
+    StationPort("X_WB_cheat", "7", lambda n, m: 7, "true pose"),
+    StationPort("V_WB_B_cheat", "6", lambda n, m: 6, "true twist (m/s, rad/s)"),
+    StationPort("F_disturbance_cheat", "6", lambda n, m: 6, "disturbances' wrench (N, N·m)"),
+    StationPort("flow_cheat", "6", lambda n, m: 6, "water's velocity and acceleration in W"),
 )
 """Ports that only a simulation has: the truth."""
 
@@ -90,17 +72,13 @@ def sensor_ports(config: StationConfig) -> tuple[StationPort, ...]:
     """An output for each sensor on board, under its name."""
 
     def row(name: str, sensor: Sensor) -> StationPort:
-        n, size = sensor.value_size, sensor.port_size
-        more = "" if size == n else ", valid, time (s)" if size == n + 2 else ", valid, …, time (s)"
-        period = 0.05 if size == n else 0.2 if sensor.late else 0.1
-        words = f"{type(sensor).__name__}: {_counted(n)}{more}"
-        return StationPort(name, *_fixed(size), words, period)
+        values, size = sensor.value_size, sensor.port_size
+        period = 0.05 if size == values else 0.2 if sensor.late else 0.1
+        marks = {0: "", 2: ", valid, time (s)"}.get(size - values, ", valid, …, time (s)")
+        holds = f"{type(sensor).__name__}: {values} value{'s' * (values > 1)}{marks}"
+        return StationPort(name, str(size), lambda n, m: size, holds, period)
 
     return tuple(row(name, sensor) for name, sensor in config.sensing.sensors.items())
-
-
-def _counted(n: int) -> str:
-    return "1 value" if n == 1 else f"{n} values"
 
 
 def outputs(config: StationConfig, hardware: bool = False) -> tuple[StationPort, ...]:
@@ -114,8 +92,9 @@ def station_ports(
 ) -> tuple[dict[str, int], dict[str, int]]:
     """Names and sizes of a station's input and output ports."""
     config = config or StationConfig()
+    counts = len(config.sensing.fused), len(config.load_vehicle().propulsion.mounts)
     rows = (INPUTS, outputs(config, hardware))
-    first, second = ({port.name: port.size(config) for port in part} for part in rows)
+    first, second = ({port.name: port.size(*counts) for port in part} for part in rows)
     return first, second
 
 
@@ -127,6 +106,7 @@ def default_log_periods(config: StationConfig) -> dict[str, float]:
 def ports_page() -> str:
     """The text of `docs/ports.md`."""
     config = StationConfig()
+    sizes = dict(pair for part in station_ports(config) for pair in part.items())
     parts = (
         ("Input", INPUTS),
         ("Outputs: estimate and commands", (*ESTIMATES, *COMMANDS, *REPORTED)),
@@ -136,7 +116,7 @@ def ports_page() -> str:
     lines = [_HEAD]
     for title, rows in parts:
         lines += [f"## {title}", "", "| port | length | by default | holds |", "|---|---|---|---|"]
-        lines += [f"| `{p.name}` | {p.told} | {p.size(config)} | {p.holds} |" for p in rows]
+        lines += [f"| `{p.name}` | {p.length} | {sizes[p.name]} | {p.holds} |" for p in rows]
         lines.append("")
     return "\n".join(lines).rstrip() + "\n"
 
@@ -146,5 +126,6 @@ _HEAD = """# Ports of a station
 A station (`systems.station.simulated.make_station`) is the diagram from the commanded wrench to the
 estimated state. Its ports follow from its configuration and the table `systems/station/ports.py`,
 from which this page is written (`spinndrift.systems.station.ports.ports_page()`). *n* is the number
-of sensors that the filter fuses. Frames and the order of components are those of `models/se3.py`.
+of sensors that the filter fuses, *m* that of thrusters. Frames and the order of components are
+as in `models/se3.py`.
 """

@@ -12,10 +12,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
 
-from spinndrift.models.vehicles.vehicle import Vehicle
-from spinndrift.systems.closed_loop import build_diagram, logged, seeded
-from spinndrift.systems.controllers.kinds import Own
-from spinndrift.systems.station.config import StationConfig
+from spinndrift import Own, StationConfig, Vehicle, build_diagram, logged, seeded
 
 PERIOD = 0.02  # s
 

@@ -12,12 +12,11 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import BasicVector, LeafSystem
 from scipy.spatial.transform import Rotation
 
+from spinndrift import OwnFilter, StationConfig, build_diagram, logged, seeded
 from spinndrift.models.sensors import Imu
-from spinndrift.systems.closed_loop import build_diagram, logged, seeded
 from spinndrift.systems.controllers.kinds import TrackReference
-from spinndrift.systems.own import OwnFilter
 from spinndrift.systems.planning.paths import FigureEight, PoseConfig
-from spinndrift.systems.station.config import Sensing, StationConfig
+from spinndrift.systems.station.config import Sensing
 
 
 class DeadReckoning(LeafSystem):

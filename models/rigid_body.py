@@ -28,6 +28,11 @@ class FossenDynamics(Dynamics):
     """M = M_RB + M_A, D, D^f, weight and buoyancy, all constant; b constant.
 
     With a diagonal `quadratic_drag` the fluid drag is Fossen's D_n(ν)ν = diag(d_i |ν_i|) ν.
+
+    Example:
+        >>> model = load_vehicle("bluerov2_heavy").dynamics(diffusion=np.full(6, 0.5))
+        >>> float(model.diffusion[0])
+        0.5
     """
 
     rigid_inertia: Float[Array, "6 6"]

@@ -100,6 +100,12 @@ class Spinn(Dynamics):
     The order of the networks is (b, M, D, D^f), without b if not `stochastic` or if b is
     `distance_aware`, and without M if `constant_mass`: the second stage of a Heun step evaluates a
     prefix of them.
+
+    Example:
+        >>> physics = load_vehicle("bluerov2_heavy").dynamics()
+        >>> model = Spinn.create(TrainingConfig().model, physics, jax.random.key(0))
+        >>> model.stochastic
+        True
     """
 
     config: SpinnConfig = eqx.field(static=True)

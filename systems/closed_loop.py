@@ -61,6 +61,12 @@ def build_diagram(
     Raises:
         UserError: a configuration names what can't be read, or controller or stand-in lack a port.
         NotImplementedError: `hardware` is true.
+
+    Example:
+        >>> scenario = load_scenario("trajectory_tracking_calm")
+        >>> diagram = build_diagram(scenario.station, scenario.controller)
+        >>> diagram.HasSubsystemNamed("station")
+        True
     """
     builder = DiagramBuilder()
     if stand_in is None:
@@ -91,7 +97,13 @@ def build_diagram(
 
 
 def seeded(diagram: Diagram, context: Context, seed: int) -> None:
-    """Draw all random state of a diagram's context from one seed; equal seeds give equal runs."""
+    """Draw all random state of a diagram's context from one seed; equal seeds give equal runs.
+
+    Example:
+        >>> scenario = load_scenario("trajectory_tracking_calm")
+        >>> diagram = build_diagram(scenario.station, scenario.controller)
+        >>> seeded(diagram, diagram.CreateDefaultContext(), seed=3)
+    """
     diagram.SetRandomContext(context, RandomGenerator(seed))
 
 
@@ -100,6 +112,14 @@ def logged(diagram: Diagram, context: Context) -> dict[str, Signal]:
 
     After `AdvanceTo(t)` the updates of t are still pending, and so is its row. A Drake log that
     `extend` has added under a name `log_…` is returned unchanged.
+
+    Example:
+        >>> scenario = load_scenario("trajectory_tracking_calm")
+        >>> simulator = Simulator(build_diagram(scenario.station, scenario.controller))
+        >>> simulator.AdvanceTo(0.5).reason().name
+        'kReachedBoundaryTime'
+        >>> logged(simulator.get_system(), simulator.get_context())["X_WB"].value.shape
+        (10, 7)
     """
     found: dict[str, Any] = {
         system.get_name().removeprefix("log_"): system

@@ -96,6 +96,11 @@ class OwnFilter(OwnSystem):
     are among its inputs. Its constructor receives, if it has arguments of these names, the
     station's `vehicle`, its sensors' configurations by their names, the start `X0_WB` and
     `V0_WB_B`, and the whole configuration `station`.
+
+    Example:
+        >>> estimator = OwnFilter("examples/own_filter.py:DeadReckoning")
+        >>> estimator.parameters
+        {}
     """
 
 

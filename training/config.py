@@ -90,7 +90,12 @@ class DriftConfig:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """One training run; the defaults suit a few minutes of data of one vehicle on two cores."""
+    """One training run; the defaults suit a few minutes of data of one vehicle on two cores.
+
+    Example:
+        >>> TrainingConfig(steps=1000, seed=1).batch
+        16
+    """
 
     objective: ObjectiveConfig = field(default_factory=Fdm)
     model: SpinnConfig = field(default_factory=lambda: SpinnConfig(constant_mass=True))

@@ -20,6 +20,10 @@ class EffectConfig:
         where: axis, thruster or frame; may be left out where there is one place, or `all`.
         parameters: by name, in the units that the effect's class states; zero if left out.
         options: further fields of the class (the `floor` and `walls` of `proximity`).
+
+    Example:
+        >>> half = EffectConfig("thruster_gain", where="3", parameters={"gain": -0.5})
+        >>> station = StationConfig(effects=(half,))  # thruster 3 pushes half as much
     """
 
     name: str

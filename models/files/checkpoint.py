@@ -92,6 +92,10 @@ def save_model(
 
     Raises:
         ValueError: the class is not registered, or the metadata is not JSON.
+
+    Example:
+        >>> model = load_vehicle("bluerov2_heavy").dynamics()
+        >>> save_model("physics.spinn", model, {"data": "none"})
     """
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(dynamics, eqx.is_array))]
     header = {
@@ -119,6 +123,12 @@ def load_model(
     Raises:
         UserError: the file is missing, of another kind, truncated, damaged or of a later version,
             or holds float64 while JAX runs in float32 and no `dtype` is given.
+
+    Example:
+        >>> save_model("physics.spinn", load_vehicle("bluerov2_heavy").dynamics(), {"data": "none"})
+        >>> model, metadata = load_model("physics.spinn")
+        >>> metadata
+        {'data': 'none'}
     """
     header, leaves = _read(path)
     try:

@@ -34,6 +34,12 @@ class Trajectory:
         commands: one or more of `F_Bo_B` (N, 6), `thruster_force` (N, 8), `pwm` (N, 8).
         sensors: optional further variables of the schema, `voltage` (N,) and the like.
         start: time of index 0 on the source's clock (s).
+
+    Example:
+        >>> X_WB, zero = np.tile([1.0, 0, 0, 0, 0, 0, -2], (41, 1)), np.zeros((41, 6))
+        >>> run = Trajectory("hover", X_WB, zero, {"F_Bo_B": zero})
+        >>> Recording.from_trajectories([run], dt=0.05).duration
+        2.0
     """
 
     scenario: str

@@ -128,6 +128,12 @@ def write_csv(
 
     Raises:
         UserError: if the folder exists and is not empty.
+
+    Example:
+        >>> vehicle = load_vehicle("bluerov2_heavy")
+        >>> write_csv(generate(GenerateConfig(trajectories=1, duration=4.0), vehicle), "runs")
+        >>> load_data("runs").scenarios[0]
+        'surge-forward'
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

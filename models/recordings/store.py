@@ -40,6 +40,13 @@ class Recording:
 
     Raises:
         ValueError: at construction, if the dataset does not follow `docs/recording.md`.
+
+    Example:
+        >>> vehicle = load_vehicle("bluerov2_heavy")
+        >>> recording = generate(GenerateConfig(trajectories=1, duration=4.0), vehicle)
+        >>> learn, held_out = recording.split_by_time(0.25, gap=0.5)
+        >>> learn.commands
+        ('F_Bo_B', 'thruster_force')
     """
 
     dataset: xr.Dataset

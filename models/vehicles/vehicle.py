@@ -73,6 +73,11 @@ class Vehicle:
 
     `sources` gives the source of each entry by its path, such as `propulsion.mounts`; [E] marks an
     engineering estimate. The file of every shipped preset has one for every number.
+
+    Example:
+        >>> lighter = dataclasses.replace(load_vehicle("bluerov2_heavy"), mass=11.0)
+        >>> float(lighter.dynamics().rigid_inertia[0, 0])
+        11.0
     """
 
     name: str
@@ -158,6 +163,10 @@ def load_vehicle(name_or_path: str | Path) -> Vehicle:
 
     Raises:
         UserError: there is no such preset or file, or its content is not a vehicle.
+
+    Example:
+        >>> load_vehicle("bluerov2_heavy").mass
+        13.5
     """
     if isinstance(name_or_path, Path) or Path(name_or_path).suffix:
         if not os.path.exists(name_or_path):  # the name may come from data: name its kind

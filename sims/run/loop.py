@@ -92,6 +92,11 @@ def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engin
         UserError: start or goal are in an obstacle, the scenario names what can't be read, its
             controller lacks a port, has no plan though `FollowPath` needs one or has no finite
             wrench at t = 0, or the engine `compiled` is given and the diagram can't be compiled.
+
+    Example:
+        >>> scenario = load_scenario("trajectory_tracking_calm", text="duration: 0.5")
+        >>> simulate(scenario).outcome.reason
+        'duration'
     """
     return next(simulate_seeds(scenario, [scenario.seed], progress, engine))
 

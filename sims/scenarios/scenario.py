@@ -51,6 +51,11 @@ class Scenario:
         success: the success criterion.
         safety: limits that end any run.
         log: settings of the log.
+
+    Example:
+        >>> known = load_scenario("station_keeping_calm")
+        >>> Scenario("later", known.controller, known.success, duration=90.0).station.vehicle
+        'bluerov2_heavy'
     """
 
     name: str
@@ -136,6 +141,10 @@ def load_scenario(name_or_path: str | Path, text: str = "") -> Scenario:
 
     Raises:
         UserError: there is no such scenario, or it is not valid, with or without `text`.
+
+    Example:
+        >>> load_scenario("station_keeping_calm", text="station: {seed: 7}").station.seed
+        7
     """
     path = Path(name_or_path)
     if not path.suffix:

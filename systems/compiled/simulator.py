@@ -30,6 +30,16 @@ class CompiledSimulator:
     read; only the noise sources are not advanced there. Two runs with one seed are bit-identical.
     They differ from Drake's own run by rounding only, because one program rounds in other places
     than several.
+
+    Example:
+        >>> scenario = load_scenario("trajectory_tracking_calm")
+        >>> diagram = build_diagram(scenario.station, scenario.controller)
+        >>> simulator = CompiledSimulator(diagram)
+        >>> seeded(diagram, simulator.get_mutable_context(), seed=3)
+        >>> simulator.Initialize()
+        >>> simulator.AdvanceTo(0.5)
+        >>> simulator.get_mutable_context().get_time()
+        0.5
     """
 
     def __init__(self, diagram: Diagram, log_periods: Mapping[str, float] | None = None):

@@ -184,6 +184,12 @@ class MppiImpedance(Controller):
             pushes as white noise. A wrench of standard deviation σ and time constant τ has
             b = σ √(2τ).
         tracking: settings of the tracking.
+
+    Example:
+        >>> controller = load_scenario("pylon_crossing_calm").controller
+        >>> isinstance(controller, MppiImpedance)
+        True
+        >>> learned = dataclasses.replace(controller, model=Path("runs/mine/model.spinn"))
     """
 
     goal: PoseConfig
@@ -260,6 +266,11 @@ class Own(OwnSystem, Controller):
     W, m) if the run has one, and the whole configuration `station`. An input port `health` receives
     the health of the estimate. With an output port `plan` and an attribute `layout`, the plan's
     `PlanLayout`, its plans are logged and judged.
+
+    Example:
+        >>> controller = Own("examples/own_controller.py:PidController", {"yaw": 0.5})
+        >>> controller.parameters
+        {'yaw': 0.5}
     """
 
     def build(self, station: StationConfig, goal: Goal = None) -> System:

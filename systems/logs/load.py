@@ -134,6 +134,12 @@ def load_data(
     Raises:
         UserError: if the data can't be read, a stored recording has another rate, or options for
             logs are given for something else.
+
+    Example:
+        >>> vehicle = load_vehicle("bluerov2_heavy")
+        >>> generate(GenerateConfig(trajectories=1, duration=4.0), vehicle).save("dive.nc")
+        >>> load_data("dive.nc").vehicle
+        'bluerov2_heavy'
     """
     path = Path(path)
     options = options or LogOptions()

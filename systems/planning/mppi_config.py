@@ -59,6 +59,10 @@ class MppiConfig:
             towards the goal's attitude; false samples the whole wrench.
         shown_paths: sampled paths in the output for reports.
         threads: the sequences are rolled out in so many parts, each in a thread of its own.
+
+    Example:
+        >>> controller = load_scenario("pylon_crossing_calm").controller
+        >>> quick = dataclasses.replace(controller, planner=MppiConfig(sequences=200, horizon=40))
     """
 
     horizon: int = 80

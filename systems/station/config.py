@@ -109,6 +109,10 @@ class StationConfig:
         period: of plant, thrusters and disturbances (s).
         substeps: Lie-group steps of the plant in a period.
         seed: of everything that is random.
+
+    Example:
+        >>> StationConfig(disturbance_set="harbour", seed=1).load_vehicle().name
+        'bluerov2_heavy'
     """
 
     vehicle: str = "bluerov2_heavy"

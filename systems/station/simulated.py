@@ -33,6 +33,11 @@ def make_station(
         NotImplementedError: `hardware` is true.
         UserError: a part of the configuration names what can't be read, or the estimator lacks a
             port.
+
+    Example:
+        >>> station = make_station(StationConfig(disturbance_set="harbour"))
+        >>> station.GetOutputPort("X_WB").size()
+        7
     """
     if hardware:
         raise NotImplementedError(

@@ -20,7 +20,12 @@ from .maneuvers import MANEUVERS, maneuver_wrench
 
 @dataclass(frozen=True)
 class GenerateConfig:
-    """Simulation settings; the defaults are the paper's sparse regime."""
+    """Simulation settings; the defaults are the paper's sparse regime.
+
+    Example:
+        >>> GenerateConfig(maneuvers=("surge-forward", "yaw-left"), seed=2).trajectories
+        20
+    """
 
     maneuvers: tuple[str, ...] = tuple(MANEUVERS)
     trajectories: Annotated[int, Within(1, 100_000)] = 20
@@ -62,6 +67,11 @@ def generate(
     Raises:
         UserError: a maneuver is unknown.
         ValueError: the simulated motion is not finite.
+
+    Example:
+        >>> vehicle = load_vehicle("bluerov2_heavy")
+        >>> generate(GenerateConfig(trajectories=1, duration=4.0), vehicle).duration
+        40.0
     """
     dtype = jnp.result_type(float)
     if dynamics is None:

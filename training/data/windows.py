@@ -166,6 +166,12 @@ def make_windows(
 
     Raises:
         UserError: no trajectory is long enough, or a channel of pose or twist is missing.
+
+    Example:
+        >>> vehicle = load_vehicle("bluerov2_heavy")
+        >>> recording = generate(GenerateConfig(trajectories=1, duration=4.0), vehicle)
+        >>> make_windows(recording, length_s=1.0).steps
+        20
     """
     if recording.uneven:
         raise UserError(

@@ -74,6 +74,10 @@ class DiagnoseConfig:
         most: causes at most.
         horizon: length of the simulations for validation (s).
         seed: of bootstraps and simulated noise.
+
+    Example:
+        >>> DiagnoseConfig(alpha=0.001, refit="none").most
+        6
     """
 
     alpha: float = 0.01
@@ -386,6 +390,12 @@ def diagnose(
 
     Raises:
         UserError: the recording lacks pose or twist, or is too short.
+
+    Example:
+        >>> vehicle = load_vehicle("bluerov2_heavy")
+        >>> made = GenerateConfig(("surge-forward", "yaw-left"), trajectories=3, duration=6.0)
+        >>> config = DiagnoseConfig(refit="none", most=1, horizon=1.0)
+        >>> found = diagnose(generate(made, vehicle), vehicle, config=config)
     """
     # threads of BLAS busy-wait for each other: with other load on the cores it is five times slower
     from threadpoolctl import threadpool_limits  # the import sets an environment variable

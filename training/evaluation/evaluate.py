@@ -149,6 +149,14 @@ def evaluate(
 
     `samples` must be one less than a multiple of 20, so that the bands of 50 and 90 % are exact.
     A model without diffusion has bands of zero width.
+
+    Example:
+        >>> vehicle = load_vehicle("bluerov2_heavy")
+        >>> recording = generate(GenerateConfig(trajectories=1, duration=4.0), vehicle)
+        >>> windows = make_windows(recording, length_s=1.0)
+        >>> physics = vehicle.dynamics(dtype=np.float32)
+        >>> evaluate({"preset": physics}, windows, samples=19).dataset.sizes["horizon"]
+        20
     """
     parts = [
         _evaluate_one(model, windows, samples, substeps, seed).expand_dims(model=[name])

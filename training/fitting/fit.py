@@ -93,6 +93,15 @@ def fit(
     Raises:
         UserError: the starting model or all windows are not finite, or the checkpoint doesn't fit.
         TrainingError: more non-finite steps than `max_recoveries`; the last good state is saved.
+
+    Example:
+        >>> vehicle = load_vehicle("bluerov2_heavy")
+        >>> recording = generate(GenerateConfig(trajectories=1, duration=4.0), vehicle)
+        >>> config = TrainingConfig(steps=2, batch=4)
+        >>> physics = vehicle.dynamics(dtype=np.float32)
+        >>> start = Spinn.create(config.model, physics, jax.random.key(0))
+        >>> fit(config, start, make_windows(recording, length_s=1.0)).steps
+        2
     """
     return Run(config, model, windows, out_dir, validation, metadata).go(progress, resume)
 

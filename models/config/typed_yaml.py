@@ -16,25 +16,23 @@ loader adds file, line and field to its message.
 """
 
 import dataclasses
-import difflib
 import inspect
 import math
 import sys
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+from types import NoneType
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import numpy as np
-from cattrs import Converter, ForbiddenExtraKeysError
+from cattrs import Converter
 from cattrs.cols import (
     homogenous_tuple_structure_factory,
     list_structure_factory,
     mapping_structure_factory,
 )
 from cattrs.errors import (
-    AttributeValidationNote,
     BaseValidationError,
     IterableValidationError,
     IterableValidationNote,
@@ -43,14 +41,12 @@ from cattrs.gen import make_dict_structure_fn
 
 from .checks import LARGEST
 from .errors import UserError
+from .yaml_messages import dotted, fault, faults, fields, is_array, is_union, needed, wanted
 from .yaml_text import Tagged, emit, line_of, parse
 
 T = TypeVar("T")
 _LARGEST_INT = 2**53
 """Integers up to this one are exact in floating point."""
-_SHOWN = 60
-"""Number of characters of a found value that a message shows."""
-FieldPath = tuple[str | int, ...]
 
 
 def load(cls: type[T], path: str | PathLike[str], base: T | None = None) -> T:
@@ -79,8 +75,8 @@ def loads(cls: type[T], text: str, source: str = "text", base: T | None = None) 
     """
     data, node = parse(text, source)
     if data is None:
-        if base is None and (needed := _needed(cls)):
-            raise UserError(f"{source}: holds nothing; write a mapping with {', '.join(needed)}")
+        if base is None and (names := needed(cls)):
+            raise UserError(f"{source}: holds nothing; write a mapping with {', '.join(names)}")
         data = {}
     if base is not None:
         data = _overlaid(parse(dump(base), source)[0], data)
@@ -97,10 +93,10 @@ def structured(cls: type[T], data: Any, source: str, node: Any = None) -> T:
         return _CONVERTER.structure(data, cls)
     except (BaseValidationError, ValueError, TypeError) as error:
         lines = []
-        for path, message in _faults(error, (), cls):
+        for path, message in faults(error, (), cls):
             line = line_of(node, path)
             where = source if line is None else f"{source}:{line}"
-            lines.append(": ".join(part for part in (where, _dotted(path), message) if part))
+            lines.append(": ".join(part for part in (where, dotted(path), message) if part))
         raise UserError("\n".join(lines)) from error
 
 
@@ -126,69 +122,39 @@ def dump(obj: Any) -> str:
 # ---------------------------------------------------------------- one hook for each kind of field
 
 
-def _show(value: Any) -> str:
-    match value:
-        case None:
-            return "nothing"
-        case bool():
-            return f"`{str(value).lower()}` (a boolean)"
-        case str():
-            return f"`{_short(value)}` (text)"
-        case int() if abs(value) > 10**30:
-            return f"`{str(value)[:30]}…` (a number)"
-        case int() | float():
-            return f"`{value}` (a number)"
-        case list():
-            return f"a list of {len(value)}"
-        case dict():
-            return "a mapping" + (f" with {_short(', '.join(map(str, value)))}" if value else "")
-        case Tagged():
-            return f"`!{_short(value.tag)}`"
-    return _short(repr(value))
-
-
-def _short(text: str) -> str:
-    """The text, shortened to what a message shows."""
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
-
-
-def _fault(value: Any, remedy: str) -> ValueError:
-    return ValueError(f"found {_show(value)}; write {remedy}")
-
-
 def _bool(value: Any, _: Any) -> bool:
     if not isinstance(value, bool):
-        raise _fault(value, "true or false")
+        raise fault(value, "true or false")
     return value
 
 
 def _int(value: Any, _: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
-        raise _fault(value, "a whole number")
+        raise fault(value, "a whole number")
     if abs(value) > _LARGEST_INT:
-        raise _fault(value, f"a whole number of at most {_LARGEST_INT}")
+        raise fault(value, f"a whole number of at most {_LARGEST_INT}")
     return value
 
 
 def _float(value: Any, _: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise _fault(value, "a number")
+        raise fault(value, "a number")
     if abs(value) > sys.float_info.max or math.isnan(value):
-        raise _fault(value, "a finite number")
+        raise fault(value, "a finite number")
     if abs(value) > LARGEST:
-        raise _fault(value, f"a number of at most {LARGEST:g}")
+        raise fault(value, f"a number of at most {LARGEST:g}")
     return float(value)
 
 
 def _str(value: Any, _: Any) -> str:
     if not isinstance(value, str):
-        raise _fault(value, "text (in quotes if it looks like a number)")
+        raise fault(value, "text (in quotes if it looks like a number)")
     return value
 
 
 def _path(value: Any, _: Any) -> Path:
     if not isinstance(value, str) or not value:
-        raise _fault(value, "a path")
+        raise fault(value, "a path")
     return Path(value)
 
 
@@ -202,18 +168,14 @@ def _any(value: Any, _: Any) -> Any:
             return [_any(item, Any) for item in value]
         case dict() if all(isinstance(key, str) for key in value):
             return {key: _any(item, Any) for key, item in value.items()}
-    raise _fault(value, "numbers, text, lists, or mappings whose keys are text")
+    raise fault(value, "numbers, text, lists, or mappings whose keys are text")
 
 
 def _literal(value: Any, cls: Any) -> Any:
     for choice in get_args(cls):
         if type(value) is type(choice) and value == choice:
             return value
-    raise _fault(value, "one of " + ", ".join(map(str, get_args(cls))))
-
-
-def _is_array(cls: Any) -> bool:
-    return cls is np.ndarray or getattr(cls, "array_type", None) is np.ndarray
+    raise fault(value, "one of " + ", ".join(map(str, get_args(cls))))
 
 
 def _array(value: Any, cls: Any) -> np.ndarray:
@@ -223,7 +185,7 @@ def _array(value: Any, cls: Any) -> np.ndarray:
         return [convert(x) for x in item] if isinstance(item, list) else _float(item, float)
 
     if not isinstance(value, list):
-        raise _fault(value, f"a list of numbers{shape}")
+        raise fault(value, f"a list of numbers{shape}")
     try:
         array = np.asarray(convert(value), dtype=float)
     except ValueError as error:
@@ -240,7 +202,7 @@ def _list(cls: Any, converter: Converter) -> Any:
 
     def structure(value: Any, _: Any) -> list:
         if not isinstance(value, list):
-            raise _fault(value, "a list: [first, second]")
+            raise fault(value, "a list: [first, second]")
         return inner(value, cls)
 
     return structure
@@ -256,7 +218,7 @@ def _tuple(cls: Any, converter: Converter) -> Any:
 
     def structure(value: Any, _: Any) -> tuple:
         if not isinstance(value, list) or (size is not None and len(value) != size):
-            raise _fault(value, "a list" + ("" if size is None else f" of {size}"))
+            raise fault(value, "a list" + ("" if size is None else f" of {size}"))
         if inner is not None:
             return inner(value, cls)
         items, errors = [], []
@@ -279,14 +241,10 @@ def _dict(cls: Any, converter: Converter) -> Any:
 
     def structure(value: Any, _: Any) -> dict:
         if not isinstance(value, dict):
-            raise _fault(value, "a mapping {key: value}")
+            raise fault(value, "a mapping {key: value}")
         return inner(value, cls)
 
     return structure
-
-
-def _fields(cls: Any) -> list[str]:
-    return [field.name for field in dataclasses.fields(cls) if field.init]
 
 
 def _dataclass(cls: Any, converter: Converter) -> Any:
@@ -296,14 +254,10 @@ def _dataclass(cls: Any, converter: Converter) -> Any:
         if isinstance(value, Tagged) and value.tag == cls.__name__:
             value = value.value
         if not isinstance(value, Mapping):
-            raise _fault(value, f"a mapping with {', '.join(_fields(cls)) or 'nothing in it'}")
+            raise fault(value, f"a mapping with {', '.join(fields(cls)) or 'nothing in it'}")
         return inner(value, cls)
 
     return structure
-
-
-def _is_union(cls: Any) -> bool:
-    return get_origin(cls) in (Union, UnionType)
 
 
 def _union(cls: Any, converter: Converter) -> Any:
@@ -312,7 +266,7 @@ def _union(cls: Any, converter: Converter) -> Any:
     kinds: list[Any] = [member for member in members if dataclasses.is_dataclass(member)]
     classes = {kind.__name__: kind for kind in kinds}
     others = [member for member in members if not dataclasses.is_dataclass(member)]
-    choices = [f"!{name} {{…}}" for name in classes] + [_wanted(member) for member in others]
+    choices = [f"!{name} {{…}}" for name in classes] + [wanted(member) for member in others]
     remedy = "one of " + ", ".join(choices + (["null"] if optional else []))
 
     def structure(value: Any, _: Any) -> Any:
@@ -322,14 +276,14 @@ def _union(cls: Any, converter: Converter) -> Any:
             return converter.structure(value, members[0])
         if isinstance(value, Tagged):
             if value.tag not in classes:
-                raise _fault(value, remedy)
+                raise fault(value, remedy)
             return converter.structure(value, classes[value.tag])
         for member in others:
             try:
                 return converter.structure(value, member)
             except (ValueError, TypeError, BaseValidationError):
                 continue
-        raise _fault(value, remedy)
+        raise fault(value, remedy)
 
     return structure
 
@@ -352,93 +306,20 @@ def _converter() -> Converter:
     for cls, hook in scalars.items():
         converter.register_structure_hook(cls, hook)
     converter.register_structure_hook_func(lambda t: get_origin(t) is Literal, _literal)
-    converter.register_structure_hook_func(_is_array, _array)
+    converter.register_structure_hook_func(is_array, _array)
     converter.register_structure_hook_func(lambda t: t is Any, _any)
     for predicate, factory in (
         (lambda t: get_origin(t) is list, _list),
         (lambda t: get_origin(t) is tuple, _tuple),
         (lambda t: get_origin(t) is dict, _dict),
         (lambda t: isinstance(t, type) and dataclasses.is_dataclass(t), _dataclass),
-        (_is_union, _union),
+        (is_union, _union),
     ):
         converter.register_structure_hook_factory(predicate, factory)
-    converter.register_unstructure_hook_factory(_is_union, _untagged)
-    converter.register_unstructure_hook_func(_is_array, lambda value: np.asarray(value).tolist())
+    converter.register_unstructure_hook_factory(is_union, _untagged)
+    converter.register_unstructure_hook_func(is_array, lambda value: np.asarray(value).tolist())
     converter.register_unstructure_hook(Path, str)
     return converter
 
 
 _CONVERTER = _converter()
-
-
-# -------------------------------------------------------------------------------- error messages
-
-
-def _faults(error: BaseException, path: FieldPath, cls: Any) -> list[tuple[FieldPath, str]]:
-    """Every leaf of the exception tree as (path of the field, message)."""
-    names = [
-        note.name if isinstance(note, AttributeValidationNote) else note.index
-        for note in getattr(error, "__notes__", ())
-        if isinstance(note, AttributeValidationNote | IterableValidationNote)
-    ]
-    path = path + tuple(name if isinstance(name, str | int) else str(name) for name in names)
-    if isinstance(error, BaseValidationError):
-        return [fault for part in error.exceptions for fault in _faults(part, path, error.cl)]
-    if isinstance(error, ForbiddenExtraKeysError):
-        known = _fields(error.cl)
-        strange = sorted(map(str, error.extra_fields))
-        return [((*path, key), _unknown(key, known)) for key in strange]
-    if isinstance(error, KeyError) and names:
-        kind = next((f.type for f in dataclasses.fields(cls) if f.name == names[-1]), str)
-        return [(path, f"is missing; write {_wanted(kind)}")]
-    return [(path, str(error))]
-
-
-def _needed(cls: Any) -> list[str]:
-    """Fields of a dataclass that have no default."""
-    missing = dataclasses.MISSING
-    return [
-        field.name
-        for field in dataclasses.fields(cls)
-        if field.init and field.default is missing and field.default_factory is missing
-    ]
-
-
-def _wanted(cls: Any) -> str:
-    """Description of the values of a type, for messages."""
-    plain = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-    if cls in plain:
-        return plain[cls]
-    if cls is Path:
-        return "a path"
-    if get_origin(cls) is Literal:
-        return "one of " + ", ".join(map(str, get_args(cls)))
-    if get_origin(cls) in (list, tuple):
-        inner = [part for part in get_args(cls) if part is not Ellipsis]
-        size = f" of {len(inner)}" if get_origin(cls) is tuple and len(inner) > 1 else ""
-        return f"a list{size}"
-    if _is_array(cls):
-        return "a list of numbers"
-    if _is_union(cls):
-        members: tuple[Any, ...] = get_args(cls)
-        words = [
-            f"!{getattr(m, '__name__', m)} {{…}}" if dataclasses.is_dataclass(m) else _wanted(m)
-            for m in members
-            if m is not NoneType
-        ]
-        return words[0] if len(words) == 1 else "one of " + ", ".join(words)
-    if dataclasses.is_dataclass(cls):
-        return f"a mapping with {', '.join(_needed(cls) or _fields(cls))}"
-    return "a mapping" if get_origin(cls) is dict else "a value"
-
-
-def _unknown(key: Any, known: list[str]) -> str:
-    close = difflib.get_close_matches(str(key), known, 1)
-    hint = f"did you mean `{close[0]}`?" if close else f"known are {', '.join(known)}"
-    return f"is no key of this part; {hint}"
-
-
-def _dotted(path: FieldPath) -> str:
-    parts = (f"[{part}]" if isinstance(part, int) else f".{_short(str(part))}" for part in path)
-    text = "".join(parts)
-    return text.removeprefix(".")

@@ -13,12 +13,12 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array
 
 from ..config.errors import UserError
 from ..files.netcdf import load_netcdf, save_netcdf
 from ..se3 import WRENCH
 from .build import Trajectory, assemble, window
+from .commands import forces_of, thrusters_of, voltage_of
 from .schema import (
     COMMANDS,
     FORMAT,
@@ -32,6 +32,7 @@ from .schema import (
     observed,
     present,
 )
+from .splits import run_parts, time_parts
 
 
 @dataclass(frozen=True)
@@ -195,9 +196,10 @@ class Recording:
         """
         if "F_Bo_B" in self.dataset:
             return self.dataset["F_Bo_B"]
-        thrusters = self._resolve(vehicle).thrusters(jnp.result_type(float))
         name = self.commands[0]
-        F = np.moveaxis(np.asarray(thrusters.wrench(self._forces(name, thrusters))), 0, -1)
+        thrusters = thrusters_of(self.dataset, vehicle, name)
+        forces = forces_of(self.dataset, name, thrusters)
+        F = np.moveaxis(np.asarray(thrusters.wrench(forces)), 0, -1)
         return xr.DataArray(
             np.where(self.mask[..., None], F, np.nan),
             dims=(*LEADING, "wrench_component"),
@@ -222,49 +224,15 @@ class Recording:
         Raises:
             UserError: if no vehicle is known, or its thruster count differs.
         """
-        thrusters = self._resolve(vehicle).thrusters(jnp.result_type(float))
         name = self.thrust_from
+        thrusters = thrusters_of(self.dataset, vehicle, self.commands[0])
         if name == "F_Bo_B":
             F = np.moveaxis(self.dataset[name].to_numpy(), -1, 0)
             level = jnp.tensordot(thrusters.inverse, jnp.asarray(F), 1)
         else:
-            level = self._forces(name, thrusters)
-        volts = self._voltage(thrusters) / float(thrusters.nominal_voltage)
+            level = forces_of(self.dataset, name, thrusters)
+        volts = voltage_of(self.dataset, thrusters) / float(thrusters.nominal_voltage)
         return np.nan_to_num(np.moveaxis(np.asarray(level), 0, -1)), volts
-
-    def _forces(self, name: str, thrusters: Any) -> Array:
-        """Forces (n, scenario, trajectory, time) of a command in forces or PWM."""
-        values = self.dataset[name].to_numpy()
-        count = thrusters.allocation.shape[1]
-        if values.shape[-1] != count:
-            raise UserError(
-                f"{name}: the recording has {values.shape[-1]} thrusters, the vehicle {count}; "
-                "choose the vehicle it was recorded with"
-            )
-        rest = 1500.0 if name == "pwm" else 0.0
-        command = jnp.asarray(np.moveaxis(np.where(self.mask[..., None], values, rest), -1, 0))
-        if name == "thruster_force":
-            return command
-        return thrusters.force(command, jnp.asarray(self._voltage(thrusters)))
-
-    def _resolve(self, vehicle: Any) -> Any:
-        if vehicle is None and not self.vehicle:
-            raise UserError(
-                f"vehicle: the recording holds {self.commands[0]} and names no vehicle; "
-                "name one to turn it into a wrench"
-            )
-        if vehicle is None or isinstance(vehicle, str | os.PathLike):
-            from ..vehicles.vehicle import load_vehicle
-
-            return load_vehicle(self.vehicle if vehicle is None else os.fspath(vehicle))
-        return vehicle
-
-    def _voltage(self, thrusters: Any) -> np.ndarray:
-        nominal = float(thrusters.nominal_voltage)
-        if "voltage" not in self.dataset:
-            return np.full(self.mask.shape, nominal)
-        measured = self.dataset["voltage"].to_numpy()
-        return np.where(np.isfinite(measured), measured, nominal)
 
     # parts
 
@@ -303,16 +271,9 @@ class Recording:
 
         The `gap` (s) between them is dropped so that the two parts are nearly independent.
         """
-        _check_fraction(held_out)
-        skip = int(np.ceil(gap / self.dt - 1e-9))
-        known = np.rint(self.lengths * (1 - held_out)).astype(int)
-        if not (self.lengths > known + skip).any() or not (known > 1).any():
-            raise UserError(
-                f"split: trajectories of {self.lengths.max() * self.dt:g} s are too short for "
-                f"{held_out:g} held out after a gap of {gap:g} s"
-            )
+        known, rest = time_parts(self.lengths, self.dt, held_out, gap)
         learn = window(self.dataset, np.zeros_like(known), known)
-        return type(self)(learn), type(self)(window(self.dataset, known + skip, self.lengths))
+        return type(self)(learn), type(self)(window(self.dataset, rest, self.lengths))
 
     def split_by_run(
         self, held_out: float | Sequence[str] = 0.25, seed: int | None = None
@@ -325,25 +286,10 @@ class Recording:
         if not isinstance(held_out, float | int):
             inside = [name for name in self.scenarios if name not in set(held_out)]
             return self.select(inside), self.select(list(held_out))
-        _check_fraction(float(held_out))
-        lengths = self.lengths
-        learn, test = lengths.copy(), lengths.copy()
-        rng = np.random.default_rng(seed) if seed is not None else None
-        for j in range(lengths.shape[0]):
-            runs = np.flatnonzero(lengths[j])
-            if runs.size < 2:
-                raise UserError(
-                    f"split: scenario '{self.scenarios[j]}' has a single run; split by time "
-                    "or name the scenarios to hold out"
-                )
-            order = runs if rng is None else rng.permutation(runs)
-            count = int(np.clip(round(held_out * runs.size), 1, runs.size - 1))
-            learn[j, order[-count:]] = 0
-            test[j, order[:-count]] = 0
-        zero = np.zeros_like(lengths)
-        return type(self)(window(self.dataset, zero, learn)), type(self)(
-            window(self.dataset, zero, test)
-        )
+        learn, test = run_parts(self.lengths, self.scenarios, float(held_out), seed)
+        zero = np.zeros_like(learn)
+        parts = window(self.dataset, zero, learn), window(self.dataset, zero, test)
+        return type(self)(parts[0]), type(self)(parts[1])
 
     def split(
         self,
@@ -442,8 +388,3 @@ class Recording:
 def _is_recording(dataset: xr.Dataset) -> bool:
     """Whether a dataset has this format, in any version."""
     return str(dataset.attrs.get("format", "")).startswith(FORMAT.rsplit(" ", 1)[0])
-
-
-def _check_fraction(held_out: float) -> None:
-    if not 0 < held_out < 1:
-        raise UserError(f"held_out: must lie between 0 and 1, got {held_out:g}")

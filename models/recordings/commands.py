@@ -1,0 +1,50 @@
+"""Thruster forces of the commands that a recording has: recorded, or from PWM and voltage."""
+
+import os
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Array, Float
+
+from ..config.errors import UserError
+from ..vehicles.vehicle import load_vehicle
+
+
+def thrusters_of(dataset: xr.Dataset, vehicle: Any, command: str) -> Any:
+    """Thrusters of a `Vehicle`, a preset or file by name, or the one named in the recording."""
+    named = str(dataset.attrs.get("vehicle", ""))
+    if vehicle is None and not named:
+        raise UserError(
+            f"vehicle: the recording holds {command} and names no vehicle; "
+            "name one to turn it into a wrench"
+        )
+    if vehicle is None or isinstance(vehicle, str | os.PathLike):
+        vehicle = load_vehicle(named if vehicle is None else os.fspath(vehicle))
+    return vehicle.thrusters(jnp.result_type(float))
+
+
+def forces_of(dataset: xr.Dataset, name: str, thrusters: Any) -> Float[Array, "n J K N"]:
+    """Forces (N) of a command in forces or PWM; of none beyond a trajectory's end."""
+    values, mask = dataset[name].to_numpy(), dataset["mask"].to_numpy()
+    count = thrusters.allocation.shape[1]
+    if values.shape[-1] != count:
+        raise UserError(
+            f"{name}: the recording has {values.shape[-1]} thrusters, the vehicle {count}; "
+            "choose the vehicle it was recorded with"
+        )
+    rest = 1500.0 if name == "pwm" else 0.0
+    command = jnp.asarray(np.moveaxis(np.where(mask[..., None], values, rest), -1, 0))
+    if name == "thruster_force":
+        return command
+    return thrusters.force(command, jnp.asarray(voltage_of(dataset, thrusters)))
+
+
+def voltage_of(dataset: xr.Dataset, thrusters: Any) -> Float[np.ndarray, "J K N"]:
+    """Voltage at each sample (V), the nominal one where none was measured."""
+    nominal = float(thrusters.nominal_voltage)
+    if "voltage" not in dataset:
+        return np.full(dataset["mask"].shape, nominal)
+    measured = dataset["voltage"].to_numpy()
+    return np.where(np.isfinite(measured), measured, nominal)

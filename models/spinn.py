@@ -137,14 +137,8 @@ class Spinn(Dynamics):
         """
         dtype = reference.rigid_inertia.dtype if dtype is None else dtype
         v = np.asarray(config.velocity_scale)
-        M, D, Df = (
-            np.asarray(a, float)
-            for a in (
-                reference.mass.matrix(),
-                reference.linear_drag.matrix(),
-                reference.quadratic_drag.matrix(),
-            )
-        )
+        operators = (reference.mass, reference.linear_drag, reference.quadratic_drag)
+        M, D, Df = (np.asarray(operator.matrix(), float) for operator in operators)
         floor = 0.01 * np.diag(M)
         matrices = [M, _floored(D, floor), _floored(Df, floor / v)]
         drag = np.diag(matrices[1]) * v + np.diag(matrices[2]) * v**2

@@ -177,24 +177,15 @@ def learn(
     if resume and kept.exists() and (out / "checkpoint.npz").exists():
         model, _ = load_model(kept)
     else:
-        model = starting_model(
-            config,
-            vehicle,
-            parts.learn,
-            lambda step, total, loss: progress(_DRIFT * step / total, "drift first"),
-            given,
-            parts.validation,
-        )
+
+        def first(step: int, total: int, loss: float) -> None:
+            progress(_DRIFT * step / total, "drift first")
+
+        model = starting_model(config, vehicle, parts.learn, first, given, parts.validation)
         save_model(kept, model)
     preset = judged(vehicle.dynamics(), parts.learn)
     substeps = config.objective.substeps
-    metadata: dict[str, Any] = {
-        "vehicle": recording.vehicle or vehicle.name,  # a file's path; a name finds presets only
-        "source": recording.dataset.attrs.get("source", ""),
-        "dt": recording.dt,
-        "substeps": substeps,
-        "objective": type(config.objective).__name__,
-    }
+    metadata = _metadata(recording, vehicle, config)
     result = fit(
         config,
         model,
@@ -215,3 +206,13 @@ def learn(
     evaluation.save(out / "evaluation.json")
     save_model(out / "preset.spinn", preset, metadata | {"substeps": FINE_SUBSTEPS})
     return Learned(result.model, preset, parts, result, evaluation, substeps)
+
+
+def _metadata(recording: Recording, vehicle: Vehicle, config: TrainingConfig) -> dict[str, Any]:
+    return {
+        "vehicle": recording.vehicle or vehicle.name,  # a file's path; a name finds presets only
+        "source": recording.dataset.attrs.get("source", ""),
+        "dt": recording.dt,
+        "substeps": config.objective.substeps,
+        "objective": type(config.objective).__name__,
+    }

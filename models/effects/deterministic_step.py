@@ -59,9 +59,8 @@ def advance(
 ]:
     """Memory, pose and twist after `dt` s, and dV/dt and d²V/dt² at the end of the last substep.
 
-    The second derivative is the difference quotient of the first over that substep.
-
-    `dt` is a scalar, or (1, *batch) where columns have different steps.
+    The second derivative is the difference quotient of the first over that substep. `dt` is a
+    scalar, or (1, *batch) where columns have different steps.
 
     Runge–Kutta–Munthe-Kaas of order 4 for X' = X V (Munthe-Kaas 1999; Owren and Marthinsen 1999).
     Thruster forces are linear over a substep, with the means of its two halves: in a fast turn the
@@ -76,10 +75,8 @@ def advance(
     first, second = levels[..., ::2], levels[..., 1::2]
     middle, rise = (first + second) / 2, second - first
     h = jnp.asarray(dt / substeps, dtype)
-    batch = jnp.broadcast_shapes(
-        X_WB.shape[1:], V_WB_B.shape[1:], middle.shape[1:-1], inertia.inverse.shape[2:]
-        if inertia.inverse.ndim - 1 == V_WB_B.ndim else ()
-    )  # fmt: skip
+    own = inertia.inverse.shape[2:] if inertia.inverse.ndim - 1 == V_WB_B.ndim else ()
+    batch = jnp.broadcast_shapes(X_WB.shape[1:], V_WB_B.shape[1:], middle.shape[1:-1], own)
     X = jnp.broadcast_to(X_WB, (7, *batch))
     V = jnp.broadcast_to(V_WB_B, (6, *batch))
     table = tuple(jnp.asarray(column, dtype) for column in (_AT, _AHEAD, _WEIGHT))
@@ -103,7 +100,6 @@ def advance(
         return (se3.retract(X, h * twist), V + h * gain, rates), None
 
     start = (X, V, jnp.zeros((12, *batch), dtype))
-    (X, V, a), _ = jax.lax.scan(
-        substep, start, (jnp.moveaxis(middle, -1, 0), jnp.moveaxis(rise, -1, 0))
-    )
+    forces = (jnp.moveaxis(middle, -1, 0), jnp.moveaxis(rise, -1, 0))
+    (X, V, a), _ = jax.lax.scan(substep, start, forces)
     return memory, X, V, a

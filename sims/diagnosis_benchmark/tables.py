@@ -106,9 +106,8 @@ def _summary(rows: Sequence[Row]) -> Table:
         lines.append(("place of the first cause right", share(sum(placed), len(placed))))
     z = np.abs([z for r in rows for z in r["z"].values() if z == z])
     if len(z):
-        lines.append(
-            (f"parameters within {CLOSE:g} standard errors", share(int(sum(z <= CLOSE)), len(z)))
-        )
+        near = share(int(sum(z <= CLOSE)), len(z))
+        lines.append((f"parameters within {CLOSE:g} standard errors", near))
         lines.append(("median deviation of parameters, in standard errors", _middle(list(z))))
         off = [abs(x - 1) for r in rows for x in r["ratio"].values()]
         lines.append(
@@ -124,12 +123,8 @@ def _summary(rows: Sequence[Row]) -> Table:
     unknown = _of(rows, "unknown")
     if unknown:
         hits = sum(r["first_right"] for r in unknown)
-        lines.append(
-            (
-                "unmodelled structure reported as `unknown` with a right variable",
-                share(hits, len(unknown)),
-            )
-        )
+        what = "unmodelled structure reported as `unknown` with a right variable"
+        lines.append((what, share(hits, len(unknown))))
     if singles:
         wrong = sum("unknown" in r["named"] for r in singles)
         lines.append(("named effects reported as `unknown`", share(wrong, len(singles))))

@@ -79,6 +79,19 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
     )
     for problem in d.data.problems:
         page.text(f"**Data:** {problem}")
+    _add_causes(page, d)
+    _add_coefficients(page, d)
+    _add_experiments(page, finding)
+    _add_simulations(page, finding, shared)
+    _add_error_maps(page, shared)
+    _add_memory(page, shared)
+    _add_gain(page, d)
+    _add_data(page, d)
+    page.section("Words").table(_WORDS)
+    return page.footer(f"{d.tested} names, {d.seconds:.0f} s")
+
+
+def _add_causes(page: Page, d: Diagnosis) -> None:
     page.section("Causes")
     if d.causes:
         page.table(
@@ -114,6 +127,9 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
                 f"**Unknown:** {s.description} wins {s.heldout_gain:.0f} nats; the best name would "
                 f"win {s.best_name_gain:.0f} of them."
             )
+
+
+def _add_coefficients(page: Page, d: Diagnosis) -> None:
     if d.ratios:
         page.text("What the motion tells whatever the mass, over the inertia of the axis:")
         page.table(
@@ -128,6 +144,10 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
              for r in d.refitted],
             ("coefficient", "where", "believed", "fitted (95 %)"),
         )  # fmt: skip
+
+
+def _add_experiments(page: Page, finding: Finding) -> None:
+    d = finding.diagnosis
     page.figure(names_figure(finding), "Each name alone, fitted on the other scenarios.")
     following = experiments_figure(d)
     if following is not None:
@@ -141,6 +161,9 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
             [(t, MANEUVERS[t].text) for t in maneuvers if t in MANEUVERS],
             ("maneuver", "what to do"),
         )
+
+
+def _add_simulations(page: Page, finding: Finding, shared: Finding) -> None:
     page.section("Simulations beside the records")
     page.figure(
         bands_figure(finding),
@@ -155,6 +178,9 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
         runs_figure(shared),
         "Root mean square of all axes, run by run (long runs: piece by piece). " + _UNITS,
     )
+
+
+def _add_error_maps(page: Page, shared: Finding) -> None:
     page.section(
         "Where the error lives",
         "Innovations are the errors of one-step predictions, in units of what the noise explains. "
@@ -174,6 +200,9 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
         state_space_figure(shared),
         "Where in state space: the axes with most structure, over what tells most of each.",
     )
+
+
+def _add_memory(page: Page, shared: Finding) -> None:
     page.section("Error or noise")
     page.figure(
         repeats_figure(shared),
@@ -188,6 +217,9 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
         residual_figure(shared),
         "What is left by channel: errors of pose (seen from the vehicle) and twist.",
     )
+
+
+def _add_gain(page: Page, d: Diagnosis) -> None:
     page.section("Gain", _LEFT_OUT[d.left_out])
     page.table(
         _gains(d),
@@ -202,6 +234,9 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
         "of simulations with noise (m, rad, m/s and rad/s alike); bands: 95 %. ↑: the largest "
         "error of a model that is far beyond the panel.",
     )
+
+
+def _add_data(page: Page, d: Diagnosis) -> None:
     page.section("Data")
     page.table(
         {
@@ -214,8 +249,6 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
     )
     for limit in d.data.limits:
         page.text(f"Not told: {limit}.")
-    page.section("Words").table(_WORDS)
-    return page.footer(f"{d.tested} names, {d.seconds:.0f} s")
 
 
 def _noise(key: str) -> str:

@@ -17,12 +17,16 @@ from spinndrift.systems.controllers.impedance import ImpedanceGains
 from spinndrift.systems.planning.mppi import Mppi
 from spinndrift.systems.planning.mppi_config import MppiConfig
 from spinndrift.systems.planning.mppi_core import MppiPlanner
-from spinndrift.systems.planning.obstacles import Cylinders, Pylon, SphereHull
+from spinndrift.systems.planning.obstacles import Pylon
 from spinndrift.systems.planning.paths import PoseConfig
+from spinndrift.systems.planning.tasks import PylonCrossing
 from spinndrift.systems.plant.wrench_limits import ThrusterLimits
+from spinndrift.systems.station.config import StationConfig
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 PYLONS = [Pylon(1.5, y) for y in (-2.25, -0.65, 0.95)] + [Pylon(3.1, y) for y in (-3.0, -1.4, 0.2)]
+
+TASK = PylonCrossing(PoseConfig((4.5, -2.0, -1.5)))
 
 
 def model(kind: str):
@@ -54,9 +58,7 @@ def test_mppi_call(benchmark, kind, sequences, substeps):
     planner = MppiPlanner(
         model(kind),
         ThrusterLimits.create(VEHICLE.thrusters(), fraction=config.wrench_fraction),
-        Cylinders.create(PYLONS),
-        SphereHull.cover(VEHICLE.size),
-        PoseConfig((4.5, -2.0, -1.5)).pose(),
+        TASK.build(StationConfig(obstacles=tuple(PYLONS))),
         config=config,
         tracking=ImpedanceGains().matrices(VEHICLE.dynamics()),
     )

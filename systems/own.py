@@ -43,8 +43,10 @@ class OwnSystem:
         where, _, name = self.system.rpartition(":")
         return f"{Path(where).resolve() if where.endswith('.py') else where}:{name}"
 
-    def make(self, offered: Offered) -> Any:
+    def make(self, offered: Offered, check: Callable[[Any], None] = lambda made: None) -> Any:
         """Run the code and build the system; `parameters` take precedence over `offered`.
+
+        `check` may raise a sentence on what is wrong with the system.
 
         Raises:
             UserError: there is no such file, module or class, it fails, or it takes other
@@ -83,7 +85,9 @@ class OwnSystem:
                 f"{kind}.parameters do not fit {name}{signature}: {error}; give what it takes"
             ) from error
         with _blamed(f"{kind}.system: {name}"):
-            return found(**arguments)
+            made = found(**arguments)
+            check(made)
+            return made
 
 
 @dataclass(frozen=True)

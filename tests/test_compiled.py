@@ -1,5 +1,6 @@
 """A diagram steps in one compiled loop as it does in Drake."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,9 +15,11 @@ from pydrake.systems.primitives import (
     VectorLogSink,
 )
 
+from helpers import ROOT
 from spinndrift.models.config.errors import UserError
 from spinndrift.sims.run.loop import simulate
-from spinndrift.sims.scenarios.scenario import load_scenario
+from spinndrift.sims.scenarios.scenario import load_scenario, scenario_names
+from spinndrift.systems.closed_loop import build_diagram
 from spinndrift.systems.compiled.jit import value_or_zeros
 from spinndrift.systems.compiled.network import NotPureError
 from spinndrift.systems.compiled.pure import Event, Pure, shown
@@ -253,6 +256,44 @@ def test_the_station_in_a_harbour_flies_as_in_drake():
     np.testing.assert_allclose(loop.log.plans.X_WB, drake.log.plans.X_WB, atol=1e-9)
 
 
-def test_a_planner_is_stepped_by_drake_and_can_t_be_forced():
+PLANNER = """{duration: 0.7, controller: {planner: {horizon: 20, sequences: 40, realisations: 2,
+    knots: [2, 4], effective_samples: 4, shown_paths: 4}}}"""
+
+
+def test_a_planner_flies_as_in_drake():
+    """Four calls, each from what the ones before made, in the planner's single precision."""
+    scenario = load_scenario("pylon_crossing_calm", PLANNER)
+    drake, loop = (simulate(scenario, engine=engine) for engine in ("drake", "compiled"))
+    assert (drake.timing.engine, loop.timing.engine) == ("drake", "compiled")
+    assert loop.outcome == drake.outcome
+    wanted, found = drake.log.plans, loop.log.plans
+    assert wanted is not None
+    assert found is not None
+    assert wanted.time.size == 4
+    np.testing.assert_array_equal(found.time, wanted.time)
+    np.testing.assert_allclose(found.X_WB, wanted.X_WB, atol=1e-5)
+    np.testing.assert_allclose(found.figures, wanted.figures, rtol=1e-4)
+    for name in ("X_WB", "V_WB_B", "X_WB_estimate"):
+        np.testing.assert_allclose(loop.log[name], drake.log[name], atol=1e-6, err_msg=name)
+    np.testing.assert_allclose(loop.log["F_Bo_B"], drake.log["F_Bo_B"], atol=1e-4)
+    assert drake.timing.summary()["planner_median_ms"] is not None
+    assert loop.timing.summary()["planner_median_ms"] is None  # it is not a step of its own
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_every_shipped_scenario_is_one_loop(name):
+    """All of its systems tell what they compute; tracing, not compiling, shows that it fits."""
+    scenario = load_scenario(name)
+    diagram = build_diagram(scenario.station, scenario.controller, goal=scenario.goal)
+    simulator = CompiledSimulator(diagram)
+    sizes = [jax.ShapeDtypeStruct((n,), float) for n in simulator._sizes]
+    state, logged = jax.eval_shape(simulator._run, *sizes)
+    assert state.shape == sizes[0].shape
+    assert logged.size > 0
+
+
+def test_a_controller_without_pure_functions_is_stepped_by_drake_and_can_t_be_forced():
+    own = f"controller: !Own {{system: '{ROOT}/examples/own_controller.py:PidController'}}"
+    text = f"{{{own}, success: !ReachGoal {{goal: [1, 0, -1.5]}}}}"
     with pytest.raises(UserError, match="drake or auto"):
-        simulate(load_scenario("pylon_crossing_calm"), engine="compiled")
+        simulate(load_scenario("station_keeping_calm", text), engine="compiled")

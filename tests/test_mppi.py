@@ -23,9 +23,12 @@ from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.systems.controllers.impedance import ImpedanceGains
 from spinndrift.systems.planning.mppi import FIGURES, Mppi, key_from_gaussians
 from spinndrift.systems.planning.mppi_config import MppiConfig
-from spinndrift.systems.planning.mppi_core import MppiPlanner, MppiState, command_of_felt
+from spinndrift.systems.planning.mppi_core import MppiPlanner, MppiState
 from spinndrift.systems.planning.obstacles import Cylinders, Pylon, SphereHull
 from spinndrift.systems.planning.plan_samples import SampleLayout
+from spinndrift.systems.planning.rollouts import Situation
+from spinndrift.systems.planning.sampling import command_of_felt
+from spinndrift.systems.planning.tasks import PoseTask, StateCost
 from spinndrift.systems.plant.wrench_limits import BoxLimits, ThrusterLimits
 
 HULL = SphereHull.cover((0.4, 0.4, 0.3), (1, 1))
@@ -55,6 +58,18 @@ def at(x, y=0.0, z=0.0):
     return se3.identity().at[4:].set(jnp.array([x, y, z]))
 
 
+def reach(goal, pylons=(), hull=HULL, cost=None):
+    """The task to reach a pose."""
+    return PoseTask(cost or StateCost(), Cylinders.create(pylons), hull, goal)
+
+
+def situation(planner, X, dW=None):
+    """At rest at X with a time, a hold and a command before of zero."""
+    zero, h = jnp.zeros(6, jnp.float32), planner.config.horizon
+    times = planner.times(jnp.zeros(1))
+    return Situation(X.astype("f4"), zero, zero, zero, times, jnp.zeros((h, 6), "f4"), dW)
+
+
 def settle(planner, X, V, count, seed=0, bias=NONE):
     """Plan again and again from the same state: rows put in front undo the shift in time."""
     rows = planner.config.shift
@@ -74,15 +89,13 @@ FREE = MppiConfig(
     dt=0.1,
     sequences=400,
     realisations=1,
-    pose_weight=(1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
-    twist_weight=(0.5, 0.5, 0.5, 0.5, 0.5, 0.5),
     terminal_time=1.0,
     effort_weight=4.0,
     rate_weight=0.0,
-    speed_limit=None,
     noise=(0.3, 0.0, 0.0, 0.0, 0.0, 0.0),
     smallest_noise=0.02,
 )
+COST = StateCost(pose_weight=(1.0,) * 6, twist_weight=(0.5,) * 6, speed_limit=None)
 
 
 def double_integrator_optimum(config, distance, mass, limit):
@@ -93,11 +106,11 @@ def double_integrator_optimum(config, distance, mass, limit):
     time = np.full(n, h)
     time[-1] += config.terminal_time
     rows = [
-        np.sqrt(time * config.pose_weight[0])[:, None] * x_of_F,
-        np.sqrt(time * config.twist_weight[0])[:, None] * v_of_F,
+        np.sqrt(time * COST.pose_weight[0])[:, None] * x_of_F,
+        np.sqrt(time * COST.twist_weight[0])[:, None] * v_of_F,
         np.sqrt(h * config.effort_weight) / limit * np.eye(n),
     ]
-    aim = np.concatenate([np.sqrt(time * config.pose_weight[0]) * distance, np.zeros(2 * n)])
+    aim = np.concatenate([np.sqrt(time * COST.pose_weight[0]) * distance, np.zeros(2 * n)])
     A = np.vstack(rows)
     F = np.linalg.lstsq(A, aim, rcond=None)[0]
     return float(np.sum((A @ F - aim) ** 2)), F
@@ -105,7 +118,7 @@ def double_integrator_optimum(config, distance, mass, limit):
 
 def test_without_obstacles_it_finds_the_optimum_of_a_double_integrator():
     distance = 1.0
-    planner = MppiPlanner(neutral(), LIMIT, Cylinders.create([]), HULL, at(distance), config=FREE)
+    planner = MppiPlanner(neutral(), LIMIT, reach(at(distance), cost=COST), FREE)
     optimum, F = double_integrator_optimum(FREE, distance, 20.0, 40.0)
     idle = distance**2 * (FREE.horizon * FREE.dt + FREE.terminal_time)
     _, plan = settle(planner, at(0.0), NONE, 40)
@@ -121,10 +134,8 @@ def test_holding_counters_what_effects_add():
     model = Extended.create(vehicle.dynamics(), effects, vehicle.thrusters())
     X_WG = se3.retract(at(1.0, 2.0, -3.0), jnp.array([0, 0, 0, 0, 0, 0.7]))
     bias = jnp.array([3.0, 0.0, 2.0, 0.0, 0.0, 0.5])
-    planner = MppiPlanner(
-        model, LIMIT, Cylinders.create([]), HULL, X_WG, config=FREE, dtype=jnp.float64
-    )
-    hold = planner.hold_wrench(bias)
+    planner = MppiPlanner(model, LIMIT, reach(X_WG), FREE, dtype=jnp.float64)
+    hold = planner.rollouts.hold_wrenches(jnp.zeros(1), bias)[0]
     v_C = se3.rotate_inverse(X_WG, jnp.array([0.4, 0.1, 0.0]))
     drag = vehicle.dynamics().drag_wrench(-jnp.concatenate([v_C, jnp.zeros(3)]))
     expected = -drag - jnp.array([0, 0, 2.0 - 12.0, 0, 0, 0])  # 2 N: the preset's own buoyancy
@@ -153,12 +164,12 @@ def test_sampled_commands_are_felt_along_the_axes():
     assert command_of_felt(blind, at(0.0), scale) is None  # moments of this size do nothing at all
     limit = BoxLimits(1e3 * jnp.ones(6))
     config = replace(FREE, noise=(0.01, 0.01, 0.01, 0.01, 0.01, 0.01))
-    planner = MppiPlanner(dead, limit, Cylinders.create([]), HULL, at(0.0), config=config)
+    planner = MppiPlanner(dead, limit, reach(at(0.0)), config)
     nominal = jnp.zeros((config.horizon, 6), jnp.float32)
-    F = planner.sample(jax.random.key(0), nominal, jnp.zeros(6, jnp.float32))[:, :, 2:]
+    F = planner.sampler.sequences(jax.random.key(0), nominal, nominal)[:, :, 2:]
     felt = np.linalg.solve(command, np.asarray(F, float).reshape(-1, 6, F.shape[2]))
-    plain_planner = eqx.tree_at(lambda p: p.command, planner, None)
-    plainly = plain_planner.sample(jax.random.key(0), nominal, jnp.zeros(6, jnp.float32))
+    plain_sampler = eqx.tree_at(lambda s: s.command, planner.sampler, None)
+    plainly = plain_sampler.sequences(jax.random.key(0), nominal, nominal)
     np.testing.assert_allclose(felt, plainly[:, :, 2:], atol=1e-4)
 
 
@@ -183,10 +194,8 @@ def among(diffusion=0.0, pylons=PYLON, config=AMONG, **more):
     return MppiPlanner(
         neutral(drag=0.5, diffusion=diffusion),
         LIMIT,
-        Cylinders.create(pylons),
-        HULL,
-        more.pop("goal", at(2.0)),
-        config=config,
+        reach(more.pop("goal", at(2.0)), pylons),
+        config,
         **more,
     )
 
@@ -200,9 +209,8 @@ def test_weights_sum_to_one_and_the_plan_is_the_models_own_path():
     assert plan.F_Bo_B.shape == (6, 40)
     assert plan.paths.shape == (40, 3, 7)
     assert plan.valid
-    X, V = rollout(
-        planner.dynamics, plan.X_WB[:, 0], plan.V_WB_B[:, 0], plan.F_Bo_B.T, 0.1, substeps=2
-    )
+    model = planner.rollouts.dynamics
+    X, V = rollout(model, plan.X_WB[:, 0], plan.V_WB_B[:, 0], plan.F_Bo_B.T, 0.1, substeps=2)
     np.testing.assert_allclose(plan.X_WB[:, 1:].T, X, atol=2e-5)
     np.testing.assert_allclose(plan.V_WB_B[:, 1:].T, V, atol=2e-5)
 
@@ -213,12 +221,11 @@ def test_the_attitude_is_held_by_part_of_the_plans_own_wrench():
     planner = among(0.5, pylons=[], tracking=gains)
     turned = se3.exp(jnp.array([0.0, 0.0, 0.0, 0.3, -0.2, 1.5], jnp.float32))
     _, plan = settle(planner, turned, NONE, 1)
-    hold, limit = planner.hold_wrench(NONE.astype("f4")), np.asarray(LIMIT.limit)[:, None]
+    hold, limit = planner.init().F_Bo_B[0], np.asarray(LIMIT.limit)[:, None]
     assert np.all(np.abs(plan.F_Bo_B) <= limit * (1 + 1e-6))
     assert np.abs(plan.F_Bo_B[3:, 0] - hold[3:]).max() > 2  # from the first step
-    X, _ = rollout(
-        planner.dynamics, plan.X_WB[:, 0], plan.V_WB_B[:, 0], plan.F_Bo_B.T, 0.1, substeps=2
-    )
+    model = planner.rollouts.dynamics
+    X, _ = rollout(model, plan.X_WB[:, 0], plan.V_WB_B[:, 0], plan.F_Bo_B.T, 0.1, substeps=2)
     np.testing.assert_allclose(plan.X_WB[:, 1:].T, X, atol=2e-5)
     np.testing.assert_allclose(plan.X_WB[:4, -1], [1, 0, 0, 0], atol=0.05)
 
@@ -227,28 +234,26 @@ def test_in_a_current_a_held_attitude_keeps_sampled_vehicles_on_course():
     """Munk's moment turns a hull that makes way against a current; 4 s of wrenches can't help."""
     vehicle = load_vehicle("bluerov2_heavy")
     current = kind("current_steady").of("W", east=-0.25, north=0.35)
-    start, zero = at(0.0).astype("f4"), jnp.zeros(6, jnp.float32)
+    start = at(0.0).astype("f4")
 
     @eqx.filter_jit
     def ends(p):
-        F = p.sample(jax.random.key(2), p.init().F_Bo_B, zero)
-        return p._rollouts(start, zero, F, zero, None, lambda X, V, F: (X, F)).states
+        F = p.sampler.sequences(jax.random.key(2), *[p.init().F_Bo_B] * 2)
+        return p.rollouts(F, situation(p, start), lambda X, V, F: (X, F)).states
 
     broadside = []
     for held in (True, False):
         planner = MppiPlanner(
             Extended.create(vehicle.dynamics(), (current,), vehicle.thrusters()),
             ThrusterLimits.create(vehicle.thrusters(), fraction=0.8),
-            Cylinders.create([]),
-            SphereHull.cover(vehicle.size),
-            at(3.0),
+            reach(at(3.0), hull=SphereHull.cover(vehicle.size)),
             config=MppiConfig(realisations=1, hold_attitude=held),
             tracking=ImpedanceGains().matrices(vehicle.dynamics()),
         )
         X, F = ends(planner)
         turn = np.linalg.norm(np.asarray(se3.local(X[-1], start))[3:], axis=0)
         broadside.append(np.mean(turn > np.pi / 4))
-        np.testing.assert_allclose(planner._cut(F), F, atol=1e-3)
+        np.testing.assert_allclose(planner.sampler.cut(F), F, atol=1e-3)
     assert broadside[0] < broadside[1] / 5
     assert broadside[1] > 0.3
 
@@ -258,7 +263,8 @@ def test_wrenches_stay_in_the_feasible_set():
     _, plan = settle(planner, at(0.0), NONE, 6)
     limit = np.asarray(LIMIT.limit)[:, None]
     assert np.all(np.abs(plan.F_Bo_B) <= limit * (1 + 1e-6))
-    sampled = planner.sample(jax.random.key(0), planner.init().F_Bo_B + 30.0, NONE.astype("f4"))
+    hold = planner.init().F_Bo_B
+    sampled = planner.sampler.sequences(jax.random.key(0), hold + 30.0, hold)
     assert np.all(np.abs(sampled) <= np.asarray(LIMIT.limit)[None, :, None] * (1 + 1e-6))
 
 
@@ -287,7 +293,7 @@ def test_process_noise_makes_the_plan_keep_its_distance():
 
 
 def test_noise_paths_have_the_brownian_mean_and_spread():
-    dW = among()._process_noise(jax.random.key(4))
+    dW = among().sampler.process_noise(jax.random.key(4), tracked=False)
     assert dW is not None
     assert dW.shape == (40, 2, 6, 8)
     W = jnp.cumsum(dW.reshape(80, 6, 8), axis=0)
@@ -304,13 +310,10 @@ def test_a_tracked_vehicle_may_pass_closer_than_one_left_to_the_noise():
     spreads = []
     for tracking in (None, gains):
         planner = among(b, pylons=[], config=config, tracking=tracking)
-        dW = planner._process_noise(jax.random.key(7))
+        dW = planner.sampler.process_noise(jax.random.key(7), planner.rollouts.tracked)
         F = jnp.zeros((120, 6, 1), jnp.float32)
-        zero = jnp.zeros(6, jnp.float32)
         roll = jax.jit(
-            lambda p, dW, F=F, zero=zero: p._rollouts(
-                at(0.0).astype("f4"), zero, F, zero, dW, lambda X, V, F: (X[4:],)
-            )
+            lambda p, dW, F=F: p.rollouts(F, situation(p, at(0.0), dW), lambda X, V, F: (X[4:],))
         )
         spreads.append(jnp.var(roll(planner, dW).states[0][60:, 0], axis=1).mean())
     h, drag = 0.1, 0.5  # x'' + (2w + drag) x' + w² x = (b/m) white noise, in the planner's steps
@@ -334,8 +337,7 @@ def test_a_start_inside_a_pylon_gives_finite_numbers_and_a_way_out():
 def test_no_goal_is_so_far_that_a_collision_pays():
     """Behind a wall, 300 m away: being nearer would save more than any penalty costs."""
     wall = Pylon(11.5, 0.0, diameter=20.0, bottom=-50.0, top=50.0)
-    planner = among(1.5, pylons=[wall])
-    planner = eqx.tree_at(lambda p: p.X_WG, planner, at(300.0).astype(jnp.float32))
+    planner = among(1.5, pylons=[wall], goal=at(300.0))
     for moving in (NONE, NONE.at[0].set(0.3)):
         _, plan = settle(planner, at(0.0), moving, 6)
         assert float(plan.collision_probability) <= planner.config.collision_risk

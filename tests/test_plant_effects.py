@@ -21,7 +21,9 @@ from spinndrift.models.rigid_body import FossenDynamics
 from spinndrift.systems.compiled.simulator import CompiledSimulator
 from spinndrift.systems.planning.mppi_config import MppiConfig
 from spinndrift.systems.planning.mppi_core import MppiPlanner
-from spinndrift.systems.planning.obstacles import Cylinders, SphereHull
+from spinndrift.systems.planning.paths import PoseConfig
+from spinndrift.systems.planning.rollouts import Situation
+from spinndrift.systems.planning.tasks import StationKeeping
 from spinndrift.systems.plant.learned_plant import LearnedPlant
 from spinndrift.systems.plant.wrench_limits import BoxLimits
 from spinndrift.systems.station.config import StationConfig
@@ -203,16 +205,17 @@ def test_the_planner_knows_that_commands_come_late():
     planner = MppiPlanner(
         extended(kind("actuation_delay").of(delay=0.2)),
         BoxLimits(jnp.full(6, 40.0)),
-        Cylinders.create([]),
-        SphereHull.cover((0.4, 0.4, 0.3), (1, 1)),
-        se3.identity(),
-        config=config,
+        StationKeeping(at=PoseConfig()).build(StationConfig()),
+        config,
     )
     X, V = se3.identity(jnp.float32), jnp.zeros(6, jnp.float32)
     F = jnp.zeros((10, 6, 1), jnp.float32).at[:, 0].set(-4.0)
     before = jnp.asarray(SURGE, jnp.float32)
+    times, hold = planner.times(jnp.zeros(1)), jnp.zeros((10, 6), jnp.float32)
     roll = jax.jit(
-        lambda F, before: planner._rollouts(X, V, F, V, None, lambda X, V, F: (V[0],), before)
+        lambda F, before: planner.rollouts(
+            F, Situation(X, V, V, before, times, hold, None), lambda X, V, F: (V[0],)
+        )
     )
     speed = np.asarray(roll(F, before).states[0])[:, 0]
     expected = np.cumsum(np.repeat([PUSH, -4.0], [2, 8])) / MASS * 0.1

@@ -19,10 +19,11 @@ from spinndrift.systems.controllers.impedance import ImpedanceLaw
 from spinndrift.systems.estimation.disturbance_observer import MomentumObserver
 from spinndrift.systems.planning.mppi_config import MppiConfig
 from spinndrift.systems.planning.mppi_core import MppiPlanner
-from spinndrift.systems.planning.obstacles import Cylinders, SphereHull
-from spinndrift.systems.planning.paths import HoldPose, PoseConfig
+from spinndrift.systems.planning.paths import HoldPose
 from spinndrift.systems.planning.plan import PlanLayout
+from spinndrift.systems.planning.tasks import StationKeeping
 from spinndrift.systems.plant.wrench_limits import ThrusterLimits
+from spinndrift.systems.station.config import StationConfig
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 
@@ -34,9 +35,7 @@ def arguments() -> dict[str, dict]:
     planner = MppiPlanner(
         dynamics,
         limits,
-        Cylinders.create([]),
-        SphereHull.cover(VEHICLE.size),
-        PoseConfig().pose(),
+        StationKeeping().build(StationConfig()),
         config=MppiConfig(horizon=10, sequences=20, knots=(2,)),
     )
     return {

@@ -25,6 +25,7 @@ from spinndrift.systems.estimation.delayed import EkfConfig
 from spinndrift.systems.planning.mppi_config import MppiConfig
 from spinndrift.systems.planning.obstacles import BoxHull, Cylinders, Pylon
 from spinndrift.systems.planning.paths import HoldPose, PoseConfig
+from spinndrift.systems.planning.tasks import PylonCrossing
 from spinndrift.systems.station.config import Sensing, StationConfig
 from spinndrift.systems.station.ports import station_ports
 from spinndrift.systems.station.simulated import make_station
@@ -167,7 +168,7 @@ def test_the_planner_crosses_between_pylons_and_keeps_clear():
     pylons = (Pylon(1.0, -0.1), Pylon(1.0, 1.4), Pylon(1.0, -1.6))
     station = StationConfig(disturbance_set="harbour", obstacles=pylons, seed=2)
     planner = MppiConfig(horizon=40, dt=0.1, sequences=120, realisations=4, shown_paths=8)
-    logs = run(station, MppiImpedance(PoseConfig((2.0, -0.2, -1.5)), planner), 9.0)
+    logs = run(station, MppiImpedance(PylonCrossing(PoseConfig((2.0, -0.2, -1.5))), planner), 9.0)
     X = logs["X_WB_cheat"].value
     hull = BoxHull.create(load_vehicle(station.vehicle).size)
     clearance = jax.jit(lambda X: hull.clearance(X, Cylinders.create(pylons)))(jnp.asarray(X.T))
@@ -394,7 +395,9 @@ def test_configurations_come_back_from_yaml():
     station = loads(StationConfig, text)
     assert loads(StationConfig, dump(station)) == station
     assert len(station.disturbance().members) == 2
-    controller = MppiImpedance(PoseConfig((1.0, 0.0, -1.0)), tracking=Tracking(observer=None))
+    controller = MppiImpedance(
+        PylonCrossing(PoseConfig((1.0, 0.0, -1.0))), tracking=Tracking(observer=None)
+    )
     assert loads(MppiImpedance, dump(controller)) == controller
     with pytest.raises(UserError, match="disturbance"):
         loads(StationConfig, "disturbance_set: typhoon")

@@ -23,8 +23,8 @@ class Run:
     changed and run again. The same scenario and seed give the same run. After Ctrl-C the folder
     holds the run up to then.
 
-    A scenario with !Own or !OwnFilter runs the Python code that it names, which is printed before:
-    review that code first if the file is not your own.
+    A scenario with !Own, !OwnTask or !OwnFilter runs the Python code that it names, which is
+    printed before: review that code first if the file is not your own.
     """
 
     EXAMPLES: ClassVar = (
@@ -44,7 +44,8 @@ class Run:
     """Learned model (.spinn) for the planner; by default that of the scenario."""
     engine: Literal["auto", "drake", "compiled"] = "auto"
     """Engine that steps the diagram: Drake, or one compiled loop, which is faster but needs systems
-    with pure functions (no planner, no user-defined system without `pure`)."""
+    with pure functions (no user-defined system without `pure`). `auto` takes the loop for runs of
+    10 s and more, unless the planner uses several threads, which only Drake's stepping has."""
     duration: Annotated[float | None, SECONDS] = None
     """Longest simulated time (s); by default that of the scenario."""
     report: bool = True

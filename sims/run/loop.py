@@ -80,7 +80,8 @@ def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engin
 
     Drake steps the diagram, or one compiled loop does (`systems.compiled.simulator`), which is
     several times as fast and differs by rounding only. By default the loop is used if the diagram
-    can be compiled and the run may last long enough to repay the compilation.
+    can be compiled, the run may last long enough to repay the compilation, and no planner rolls out
+    in several threads: the loop has one.
 
     Ctrl-C ends the run after the current sample with the outcome `interrupted`; the run up to then
     is returned. A second Ctrl-C, or one before the first step, interrupts at once.
@@ -208,7 +209,11 @@ def _simulator(
     diagram: Diagram, scenario: Scenario, engine: Engine
 ) -> Simulator | CompiledSimulator:
     """The simulator that steps a diagram."""
-    if engine == "drake" or (engine == "auto" and scenario.duration < _WORTH_A_LOOP):
+    planner = getattr(plan_source(diagram), "planner", None)
+    parallel = planner is not None and planner.config.threads > 1
+    if engine == "auto" and (parallel or scenario.duration < _WORTH_A_LOOP):
+        engine = "drake"
+    if engine == "drake":
         return Simulator(diagram)
     try:
         return CompiledSimulator(diagram, {"log_F_acting": scenario.station.period})
@@ -240,6 +245,13 @@ def _fly(
     steps = max(1, round(scenario.duration / dt))
     stride = _samples_at_once(simulator, tap, dt)
     k, done, outcome = 0, 0.0, None
+
+    def called(k: int) -> bool:
+        """Whether a step that Drake makes alone calls the planner; the loop's steps are mixed."""
+        if tap.period is None or not isinstance(simulator, Simulator):
+            return False
+        return (k * dt + 1e-9) % tap.period < dt - 1e-9
+
     try:
         simulator.Initialize()
         outcome = monitor.check(0.0, *(port.Eval(own) for port in ports))
@@ -248,8 +260,7 @@ def _fly(
             started = time.perf_counter()
             simulator.AdvanceTo((k + stride) * dt)
             spent = time.perf_counter() - started
-            phase = (k * dt + 1e-9) % (tap.period or 1.0)
-            timing.add(spent, tap.period is not None and phase < dt - 1e-9, stride)
+            timing.add(spent, called(k), stride)
             tap.read(round(k * dt, 9))
             seen = [sink.FindLog(context).data() for sink in sinks]
             for n in range(k + 1, k + stride + 1):

@@ -9,6 +9,7 @@ from ...systems.controllers.kinds import ControllerKind, MppiImpedance
 from ...systems.planning.obstacles import Pylon
 from ...systems.planning.passage import Passage, upright_gap, widest_way
 from ...systems.planning.paths import PoseConfig
+from ...systems.planning.tasks import StationKeeping
 from ..scenarios.criteria import ReachGoal, clearance
 from ..scenarios.scenario import Scenario
 
@@ -21,8 +22,8 @@ def check_free(scenario: Scenario) -> None:
     """
     station = scenario.station
     _check("station.start", station.start, scenario)
-    if isinstance(scenario.controller, MppiImpedance):
-        _check("controller.goal", scenario.controller.goal, scenario)
+    if isinstance(scenario.controller, MppiImpedance) and scenario.controller.goal is not None:
+        _check("controller.task.goal", scenario.controller.goal, scenario)
     if isinstance(scenario.success, ReachGoal) and scenario.success.goal is not None:
         size = station.load_vehicle().size
         for pylon in station.obstacles:
@@ -55,11 +56,11 @@ def find_passage(scenario: Scenario) -> Passage | None:
 
 
 def holding(scenario: Scenario) -> ControllerKind:
-    """The scenario's controller; a planner gets the start pose as its goal, to hold it."""
+    """The scenario's controller; a planner gets the task to hold the start pose."""
     controller = scenario.controller
     if not isinstance(controller, MppiImpedance):
         return controller
-    return replace(controller, goal=scenario.station.start)
+    return replace(controller, task=StationKeeping())
 
 
 def no_safe_plan(scenario: Scenario, passage: Passage) -> str:

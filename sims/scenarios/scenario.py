@@ -101,8 +101,8 @@ class Scenario:
     @property
     def code(self) -> tuple[str, ...]:
         """The user code that runs with it: files or modules, with the class in them."""
-        sensing = self.station.sensing
-        parts = (self.controller, sensing.filter, *sensing.more.values())
+        sensing, task = self.station.sensing, getattr(self.controller, "task", None)
+        parts = (self.controller, task, sensing.filter, *sensing.more.values())
         return tuple(part.code for part in parts if isinstance(part, OwnSystem))
 
     def with_changes(

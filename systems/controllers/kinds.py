@@ -27,10 +27,10 @@ from ..own import OwnSystem, check_ports, port_sizes
 from ..planning.mppi import Mppi
 from ..planning.mppi_config import MppiConfig
 from ..planning.mppi_core import MppiPlanner
-from ..planning.obstacles import Cylinders, SphereHull
 from ..planning.paths import FigureEight, HoldPose, PoseConfig, Waypoints
 from ..planning.plan import PlanLayout
 from ..planning.reference import Reference
+from ..planning.tasks import PylonCrossing, TaskKind
 from ..plant.wrench_limits import ThrusterLimits
 from ..station.config import StationConfig
 from ..station.ports import station_ports
@@ -173,10 +173,10 @@ class Tracking:
 
 @dataclass(frozen=True)
 class MppiImpedance(Controller):
-    """Path integral planning among the station's obstacles, tracked by impedance control.
+    """Path integral planning of a task at the station, tracked by impedance control.
 
     Attributes:
-        goal: pose to reach.
+        task: what to plan for.
         planner: settings of the planner.
         model: a checkpoint of the dynamics to plan with; physics if left out.
         vehicle: whose physics to plan with; the station's if left out.
@@ -192,7 +192,7 @@ class MppiImpedance(Controller):
         >>> learned = dataclasses.replace(controller, model=Path("runs/mine/model.spinn"))
     """
 
-    goal: PoseConfig
+    task: TaskKind
     planner: MppiConfig = field(default_factory=MppiConfig)
     model: Path | None = None
     vehicle: str | None = None
@@ -203,6 +203,11 @@ class MppiImpedance(Controller):
         """Check numbers."""
         check_numbers(self)
         require(min(self.diffusion) >= 0, self, "diffusion", "give six numbers of zero or more")
+
+    @property
+    def goal(self) -> PoseConfig | None:
+        """The pose to reach, if the task has one."""
+        return self.task.goal if isinstance(self.task, PylonCrossing) else None
 
     def dynamics(self, station: StationConfig) -> Dynamics:
         """The model to plan with."""
@@ -219,7 +224,6 @@ class MppiImpedance(Controller):
         return vehicle.dynamics(np.array(self.diffusion)), {}
 
     def build(self, station: StationConfig, goal: Goal = None) -> Diagram:
-        del goal  # `self.goal` is used
         vehicle = station.load_vehicle()
         model, metadata = self._model(station)
         c = self.planner.with_substeps_of(metadata)
@@ -227,9 +231,7 @@ class MppiImpedance(Controller):
         planner = MppiPlanner(
             model,
             limits,
-            Cylinders.create(station.obstacles),
-            SphereHull.cover(vehicle.size),
-            self.goal.pose(),
+            self.task.build(station, goal),
             config=c,
             tracking=self.tracking.gains.matrices(model),
         )
@@ -274,14 +276,7 @@ class Own(OwnSystem, Controller):
     """
 
     def build(self, station: StationConfig, goal: Goal = None) -> System:
-        return self.make(
-            {
-                "vehicle": station.load_vehicle,
-                "obstacles": lambda: station.obstacles,
-                "goal": lambda: None if goal is None else np.array(goal, float),
-                "station": lambda: station,
-            }
-        )
+        return self.make(station.offered(goal))
 
 
 ControllerKind = MppiImpedance | TrackReference | Own

@@ -14,9 +14,11 @@ from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from ..compiled.jit import Program, compiled, require_double, together, value_or_zeros
-from .mppi_core import Draw, MppiPlanner, MppiState, Rolled
+from ..compiled.pure import Event, Inputs, Pure, State, shown
+from .mppi_core import Draw, MppiPlanner, MppiState
 from .plan import Plan
 from .plan_samples import SampleLayout
+from .rollouts import Rolled, Situation
 
 FIGURES = (
     "cost",
@@ -59,7 +61,7 @@ class Mppi(LeafSystem):
     """
 
     def __init__(self, planner: MppiPlanner):
-        """The planner contains model, limits, obstacles, goal and settings.
+        """The planner contains model, limits, task and settings.
 
         Raises:
             ValueError: if JAX runs in single precision.
@@ -95,27 +97,24 @@ class Mppi(LeafSystem):
         """Programs that draw, roll out (one for each part; equal parts share it) and choose."""
         vector = {n: jax.ShapeDtypeStruct((n,), np.float64) for n in (1, 4, 6, 7)}
         nominal = jax.ShapeDtypeStruct((6 * self.planner.config.horizon,), np.float64)
-        now = vector[7], vector[6], vector[6]
-        of_draw = nominal, vector[6], vector[4]
+        of_draw = vector[1], nominal, vector[7], vector[6], vector[6], vector[4]
         draw = jax.eval_shape(self._draw, *of_draw)
-        roll = [compiled(self._roll, part, draw.dW, draw.before, *now) for part in draw.parts]
-        rolled = [jax.eval_shape(self._roll, p, draw.dW, draw.before, *now) for p in draw.parts]
-        choose = compiled(self._choose, vector[1], draw, rolled, *now)
+        roll = [compiled(self._roll, part, draw.at) for part in draw.parts]
+        rolled = [jax.eval_shape(self._roll, part, draw.at) for part in draw.parts]
+        choose = compiled(self._choose, vector[1], draw, rolled)
         return compiled(self._draw, *of_draw), roll, choose
 
-    def _draw(self, nominal: Array, bias: Array, noise: Array) -> Draw:
+    def _draw(
+        self, t: Array, nominal: Array, X: Array, V: Array, bias: Array, noise: Array
+    ) -> Draw:
         state = MppiState(nominal.reshape(-1, 6))
-        return self.planner.draw(state, key_from_gaussians(noise), bias)
+        return self.planner.draw(state, key_from_gaussians(noise), X, V, bias, t)
 
-    def _roll(
-        self, part: Array, dW: Array | None, before: Array, X: Array, V: Array, bias: Array
-    ) -> Rolled:
-        return self.planner.roll(part, dW, X, V, bias, before)
+    def _roll(self, part: Array, at: Situation) -> Rolled:
+        return self.planner.roll(part, at)
 
-    def _choose(
-        self, t: Array, draw: Draw, rolled: Sequence[Rolled], X: Array, V: Array, bias: Array
-    ):
-        state, out = self.planner.choose(draw, rolled, X, V, bias)
+    def _choose(self, t: Array, draw: Draw, rolled: Sequence[Rolled]) -> Array:
+        state, out = self.planner.choose(draw, rolled)
         wide = jax.tree.map(lambda a: a.astype(t.dtype), out)
         plan = self.layout.pack(Plan(t[0], wide.X_WB, wide.V_WB_B, wide.F_Bo_B))
         samples = self.samples.pack(t[0], wide.paths, wide.path_weights)
@@ -137,11 +136,27 @@ class Mppi(LeafSystem):
         `nominal` holds the wrenches (horizon × 6) planned by the previous call, from its time on.
         """
         draw, roll, choose = self._programs
-        now = X_WB, V_WB_B, F_bias_Bo_W
-        drawn = draw.call(nominal, F_bias_Bo_W, noise)
-        rolled = together(roll, [(part, drawn.dW, drawn.before, *now) for part in drawn.parts])
-        flat = np.asarray(choose.call(np.array([t]), drawn, rolled, *now))
+        now = np.array([t])
+        drawn = draw.call(now, nominal, X_WB, V_WB_B, F_bias_Bo_W, noise)
+        rolled = together(roll, [(part, drawn.at) for part in drawn.parts])
+        flat = np.asarray(choose.call(now, drawn, rolled))
         return [flat[part] for part in self._slices]
+
+    def pure(self) -> Pure:
+        """The update as a pure function; all sequences are rolled out in one thread."""
+
+        def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
+            now = t[None]
+            bias = inputs.get("F_bias_Bo_W", jnp.zeros(6))
+            draw = self._draw(
+                now, state[0], inputs["X_WB"], inputs["V_WB_B"], bias, inputs["noise"]
+            )
+            rolled = [self._roll(part, draw.at) for part in draw.parts]
+            flat = self._choose(now, draw, rolled)
+            return {group: flat[part] for group, part in enumerate(self._slices)}
+
+        outputs = {name: shown(1 + i) for i, name in enumerate(("plan", "samples", "figures"))}
+        return Pure((Event(self.planner.config.period, update),), outputs, ("noise",))
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         values = self.plan(

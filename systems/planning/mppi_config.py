@@ -13,7 +13,7 @@ _SUBSTEPS = 2
 
 @dataclass(frozen=True)
 class MppiConfig:
-    """Cost, sampling and risk of `systems.planning.mppi_core.MppiPlanner`.
+    """Sampling, risk and the wrench's cost of `systems.planning.mppi_core.MppiPlanner`.
 
     Six numbers are for x, y, z, roll, pitch, yaw.
 
@@ -27,14 +27,11 @@ class MppiConfig:
         realisations: noise paths of each sequence, an even number (pairs of opposite sign); 1
             plans with the model's drift alone.
             `sequences` × `realisations` is the number of rollouts.
-        pose_weight: diagonal of L in ‖log(g⁻¹ g_goal)‖²_L (1/m² and 1/rad²).
-        twist_weight: diagonal of Q in ‖ξ_goal − ξ‖²_Q (s²/m² and s²/rad²).
-        terminal_time: terminal cost, as this many seconds of the last state's running cost (s).
-        effort_weight: cost rate of the wrench beyond the one that holds the vehicle at the goal,
-            as a fraction of each axis' limit (0 gives the paper's cost).
+        terminal_time: the last state's running cost counts for this many seconds more: for what
+            follows the horizon, besides the task's own terminal cost.
+        effort_weight: cost rate of the wrench beyond the one that holds the vehicle in the wanted
+            state, as a fraction of each axis' limit (0 gives the paper's cost).
         rate_weight: the same for the rate of change of the wrench (1/s).
-        speed_limit: linear speed (m/s) above which `speed_weight` counts.
-        speed_weight: cost rate of (|v| − speed_limit)² (s²/m²).
         noise: standard deviation of the sampled wrenches as a fraction of each axis' limit.
         knots: numbers of spline pieces over the horizon; the sequences are divided among them, so
             that both slow and fast corrections are sampled.
@@ -42,8 +39,8 @@ class MppiConfig:
         wrench_fraction: part of the thrusters' feasible wrenches that a plan may use; the rest is
             left to the tracking controller.
         effective_samples: the temperature is set so that this many sequences carry the weight.
-        margin: distance (m) from the hull to an obstacle below which a soft cost begins.
-        margin_weight: cost rate at the obstacle's surface.
+        margin: clearance (m) below which a soft cost begins.
+        margin_weight: cost rate at a clearance of zero.
         risk: measure of the costs of a sequence's realisations: their mean, the mean of the worst
             `cvar_part` of them (CVaR), or the worst.
         cvar_part: part of the realisations that `cvar` counts.
@@ -56,7 +53,7 @@ class MppiConfig:
         tracked: the noise paths follow the plan under the tracking controller's gains, as the
             vehicle does; false lets them diverge in open loop over the horizon.
         hold_attitude: sequences are sampled in addition to the tracking controller's feedback
-            towards the goal's attitude; false samples the whole wrench.
+            towards the wanted attitude; false samples the whole wrench.
         shown_paths: sampled paths in the output for reports.
         threads: the sequences are rolled out in so many parts, each in a thread of its own.
 
@@ -71,13 +68,9 @@ class MppiConfig:
     period: float = 0.2
     sequences: int = 250
     realisations: int = 4
-    pose_weight: Vector6 = (1.0, 1.0, 2.0, 20.0, 20.0, 4.0)
-    twist_weight: Vector6 = (0.5, 0.5, 0.5, 1.0, 1.0, 1.0)
     terminal_time: float = 2.0
     effort_weight: float = 0.5
     rate_weight: float = 0.02
-    speed_limit: float | None = 0.5
-    speed_weight: float = 100.0
     noise: Vector6 = (0.35, 0.35, 0.2, 0.01, 0.02, 0.04)
     knots: tuple[int, ...] = (2, 4, 10)
     smallest_noise: float = 0.1
@@ -122,13 +115,11 @@ class MppiConfig:
             "terminal_time",
             "effort_weight",
             "rate_weight",
-            "speed_weight",
             "margin_weight",
             "risk_weight",
         ):
             require(getattr(self, name) >= 0, self, name, "give zero or more")
-        for name in ("pose_weight", "twist_weight", "noise"):
-            require(min(getattr(self, name)) >= 0, self, name, "give six numbers of zero or more")
+        require(min(self.noise) >= 0, self, "noise", "give six numbers of zero or more")
         require(
             bool(self.knots) and min(self.knots) >= 1, self, "knots", "give counts of 1 or more"
         )
@@ -150,12 +141,6 @@ class MppiConfig:
             self,
             "collision_risk",
             "give a probability in (0, 1), or null",
-        )
-        require(
-            self.speed_limit is None or self.speed_limit > 0,
-            self,
-            "speed_limit",
-            "give a speed above zero, or null",
         )
         shift = self.period / self.dt
         require(

@@ -19,7 +19,7 @@ from ...models.sensors import Kind as SensorKind
 from ...models.spinn import Spinn
 from ...models.vehicles.vehicle import Vehicle, load_vehicle
 from ..estimation.delayed import EkfConfig
-from ..own import OwnFilter, OwnSensor
+from ..own import Offered, OwnFilter, OwnSensor
 from ..planning.obstacles import Pylon
 from ..planning.paths import PoseConfig
 
@@ -184,3 +184,12 @@ class StationConfig:
     def initial_state(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6"]]:
         """X_WB and V_WB_B at t = 0."""
         return np.asarray(self.start.pose()), np.array(self.start_twist, float)
+
+    def offered(self, goal: Float[np.ndarray, "3"] | None) -> Offered:
+        """What the constructor of a user-defined class at this station may have as arguments."""
+        return {
+            "vehicle": self.load_vehicle,
+            "obstacles": lambda: self.obstacles,
+            "goal": lambda: None if goal is None else np.array(goal, float),
+            "station": lambda: self,
+        }

@@ -10,12 +10,11 @@ from hidden.scenarios import Plan
 from hidden.simulator import Noise
 
 from spinndrift.models.config.errors import UserError
-from spinndrift.models.effects import Extended
+from spinndrift.models.effects import Extended, kind
 from spinndrift.models.effects.drag import LinearDrag
 from spinndrift.models.recordings.csv import read_csv
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.diagnosis.disturbance.found import (
-    SLOW,
     _grown,
     all_laws,
     laws_of,
@@ -205,7 +204,7 @@ def test_a_wind_sea_is_no_slow_push(tmp_path):
     replace(case, effects=(sea,)).write(tmp_path / "data")
     problem = Diagnoser(read_csv(tmp_path / "data"), VEHICLE, VEHICLE.dynamics(LEVELS)).problem
     evaluation = problem.evaluate(problem.believed, [])
-    law = next(law for law in all_laws(problem, evaluation, 12.0) if law.name in SLOW)
+    law = next(law for law in all_laws(problem, evaluation, 12.0) if kind(law.name).slow)
     assert law.name == "waves"
     # that of a regular wave of the same orbital speed
     agrees(law, 2 * np.pi / 3.0, 0.7, np.sqrt(np.sum((a * omega) ** 2)) * 3.0 / (2 * np.pi), 0.3)

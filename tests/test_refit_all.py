@@ -123,7 +123,8 @@ def recording():
 
 
 def test_all_coefficients_of_another_vehicle_are_returned_as_ratios():
-    problem = with_coefficients(DiagnosisProblem.of(recording(), load_vehicle("bluerov2_heavy")))
+    problem = DiagnosisProblem.of(recording(), load_vehicle("bluerov2_heavy"))
+    problem = with_coefficients(problem, "all")
     theta = identify(problem)
     rows = [c.row for c in coefficients(problem)]
     found = {(r.name, r.where): r for r in ratios(problem, problem.evaluate(theta, rows), rows)}
@@ -142,7 +143,9 @@ def test_the_ranges_are_physical_and_wrenches_have_no_curve():
     F = np.zeros((len(pwm), 6))
     for commands, level in (({"pwm": pwm[:, 0]}, True), ({"F_Bo_B": F}, False)):
         run = Trajectory("one", X[:, 0], V[:, 0], commands)
-        problem = with_coefficients(DiagnosisProblem.of(Recording(assemble([run], DT)), belief))
+        problem = with_coefficients(
+            DiagnosisProblem.of(Recording(assemble([run], DT)), belief), "all"
+        )
         names = {problem.library.entries[c.row].cause for c in coefficients(problem)}
         assert ("thrust_table" in names) == ("thrust_curve" in names) == level
         assert ("thrust_offset" in names) == level

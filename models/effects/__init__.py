@@ -6,3 +6,4 @@ from .extended import Extended as Extended
 from .library import KINDS as KINDS
 from .library import Library as Library
 from .library import kind as kind
+from .library import register as register

@@ -3,9 +3,12 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .. import se3
+from ..dynamics import Dynamics
+from ..rigid_body import FossenDynamics
 from ..se3 import AXES
 from .base import Effect, Parameter, Plant
 
@@ -24,7 +27,21 @@ class AddedMass(Effect):
     family: ClassVar = "body"
     parameters: ClassVar = (Parameter("change", "kg or kg·m²", (0.05,), -60.0, 100.0, 25.0),)
     places: ClassVar = AXES
+    refits: ClassVar = ("linear", "all")
     source: ClassVar[str] = "published sets differ by a factor of 2"
+
+    @classmethod
+    def believed(cls, base: Dynamics, place: str) -> float:
+        if not isinstance(base, FossenDynamics):
+            return 0.0
+        i = AXES.index(place)
+        return float(base.mass.matrix()[i, i] - base.rigid_inertia[i, i])
+
+    @classmethod
+    def refit_prior(cls, base: Dynamics, place: str) -> tuple[float, float]:
+        """As much as the believed one, and a tenth of the rigid body's at least."""
+        old, rigid = cls.believed(base, place), np.diag(np.asarray(base.rigid_inertia))
+        return max(old, 0.1 * float(rigid[AXES.index(place)])), -old
 
     def inertia(self, plant: Plant) -> Float[Array, "6 6 *batch"]:
         eye = jnp.eye(6, dtype=self.values.dtype)

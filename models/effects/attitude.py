@@ -3,46 +3,34 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .. import se3
 from ..se3 import XYZ
-from .base import Effect, Parameter
+from .base import Parameter
+from .measurement import MeasurementEffect
 from .recent import Recent
 
 
-class GyroBias(Effect):
+class GyroBias(MeasurementEffect):
     """ω_recorded = ω + β (rad/s)."""
 
     name: ClassVar[str] = "gyro_bias"
-    family: ClassVar = "measurement"
     parameters: ClassVar = (Parameter("bias", "rad/s", (0.002,), -0.2, 0.2),)
     places: ClassVar = XYZ
     order: ClassVar[int] = 50
     source: ClassVar[str] = "mrad/s for MEMS gyros after warm-up"
 
-    def _bias(self, V: Array) -> Array:
-        beta = self.column(V)
-        return jnp.concatenate([jnp.zeros_like(beta), beta])
-
-    def measure(
-        self,
-        X_WB: Float[Array, "7 *#batch"],
-        V_WB_B: Float[Array, "6 *#batch"],
-        recent: Recent,
-    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        return X_WB, V_WB_B + self._bias(V_WB_B)
-
-    def unmeasure(
-        self,
-        X_WB: Float[Array, "7 *#batch"],
-        V_WB_B: Float[Array, "6 *#batch"],
-        recent: Recent,
-    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        return X_WB, V_WB_B - self._bias(V_WB_B)
+    def twist(
+        self, V_WB_B: Float[Array, "6 *#batch"], inverse: bool = False
+    ) -> Float[Array, "6 *#batch"]:
+        beta = self.column(V_WB_B)
+        bias = jnp.concatenate([jnp.zeros_like(beta), beta])
+        return V_WB_B - bias if inverse else V_WB_B + bias
 
 
-class HeadingError(Effect):
+class HeadingError(MeasurementEffect):
     """ψ_recorded = ψ + s sin ψ + c cos ψ + o: compass deviation by the vehicle's magnetic field.
 
     ψ is measured from east, counter-clockwise. s and c are the semicircular deviation (Bowditch
@@ -50,7 +38,6 @@ class HeadingError(Effect):
     """
 
     name: ClassVar[str] = "heading_error"
-    family: ClassVar = "measurement"
     parameters: ClassVar = (
         Parameter("sine", "rad", (0.01,), -0.8, 0.8),
         Parameter("cosine", "rad", (0.01,), -0.8, 0.8),
@@ -63,29 +50,20 @@ class HeadingError(Effect):
         s, c, o = (self.part(i, X) for i in range(3))
         return s * sine + c * cosine + o
 
-    def measure(
-        self,
-        X_WB: Float[Array, "7 *#batch"],
-        V_WB_B: Float[Array, "6 *#batch"],
-        recent: Recent,
-    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        return _turned(X_WB, self._error(X_WB, *_heading(X_WB))), V_WB_B
-
-    def unmeasure(
-        self,
-        X_WB: Float[Array, "7 *#batch"],
-        V_WB_B: Float[Array, "6 *#batch"],
-        recent: Recent,
-    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
+    def pose(
+        self, X_WB: Float[Array, "7 *#batch"], inverse: bool = False
+    ) -> Float[Array, "7 *#batch"]:
         sine, cosine = _heading(X_WB)
         error = self._error(X_WB, sine, cosine)
+        if not inverse:
+            return _turned(X_WB, error)
         for _ in range(2):  # fixed-point iteration; contracts by the size of the error
             s, c = jnp.sin(error), jnp.cos(error)
             error = self._error(X_WB, sine * c - cosine * s, cosine * c + sine * s)
-        return _turned(X_WB, -error), V_WB_B
+        return _turned(X_WB, -error)
 
 
-class ClockOffset(Effect):
+class ClockOffset(MeasurementEffect):
     """The time stamps of one channel are late by δ: the record at t holds the value at t - δ.
 
     `linear` and `angular` delay these velocities, `twist` both. `pose` records X exp(-Ω), with Ω
@@ -93,12 +71,17 @@ class ClockOffset(Effect):
     """
 
     name: ClassVar[str] = "clock_offset"
-    family: ClassVar = "measurement"
     parameters: ClassVar = (Parameter("delay", "s", (0.005, -0.005), -0.3, 0.3),)
     places: ClassVar = ("twist", "pose", "linear", "angular")
     echoes: ClassVar = ("thruster_lag", "actuation_delay")
     order: ClassVar[int] = 10
+    timing: ClassVar[bool] = True
     source: ClassVar[str] = "5 to 50 ms between computers"
+
+    def pose_delay(self) -> np.ndarray:
+        values = np.asarray(self.values, float)
+        twist, pose, linear, angular = values.reshape(4, -1).mean(axis=1)
+        return pose - twist - np.array([linear] * 3 + [angular] * 3)
 
     def _delays(self, V: Array) -> tuple[Array, Array]:
         """Delays (s) of the twist's six components, and of the pose."""

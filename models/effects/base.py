@@ -4,8 +4,8 @@ An effect is one possible difference between a simulation and the world. The sam
 simulator (`extended.Extended`), the one-step predictor of a diagnosis and the extended model that
 the diagnosis returns, so that a name means one equation everywhere.
 
-To add one, subclass `Effect`, state `name`, `family`, `parameters`, `places`, and override the
-hooks at the places of a simulation where it acts::
+To add one, subclass `Effect`, state `name`, `family`, `parameters`, `places` and which `Traits` it
+has, register it in `library`, and override the hooks of a simulation where it acts::
 
     command (n) → `actuate` (memory: lag, delay) → `thrust` (static, by thruster) → allocation
     → `together` (wrench of all thrusters) → `wrench` + `inertia` + `flow` (body and water)
@@ -29,6 +29,7 @@ from jaxtyping import Array, Float
 from ..config.errors import UserError
 from ..networks import expand
 from .recent import Recent
+from .traits import Traits
 
 Family = Literal["actuation", "body", "environment", "disturbance", "measurement"]
 THRUSTERS = ("1", "2", "3", "4", "5", "6", "7", "8")
@@ -48,6 +49,9 @@ class Parameter:
         high: largest admissible value.
         spread: prior standard deviation; 0 stands for a weak prior.
         usual: nominal value, reported where the value is zero; the value is relative to it.
+        refit: prior standard deviation in a fit of all coefficients; 0 stands for `spread`, and if
+            that is 0 too, the parameter is not fitted there.
+        start: where that fit starts, relative to the believed value.
     """
 
     name: str
@@ -57,6 +61,8 @@ class Parameter:
     high: float = math.inf
     spread: float = 0.0
     usual: float = 0.0
+    refit: float = 0.0
+    start: float = 0.0
 
 
 class Plant(NamedTuple):
@@ -73,7 +79,7 @@ class Plant(NamedTuple):
     """The centre of buoyancy."""
 
 
-class Effect(eqx.Module):
+class Effect(eqx.Module, Traits):
     """Base of all effects; every hook's default does nothing.
 
     Attributes:
@@ -81,10 +87,6 @@ class Effect(eqx.Module):
         name: the cause's name in reports.
         parameters: those of one place.
         places: where it can act (axis, thruster number, frame).
-        simpler: causes that explain the same data with less, preferred unless clearly worse.
-        echoes: causes with similar signatures, which may appear as each other's residue.
-        essential: parameters of which at least one must differ from zero for this cause.
-        absorber: whether it fits slow structure of any origin, and is therefore ranked last.
         order: actuation and measurement effects apply from small to large.
         source: where the admissible range comes from.
     """
@@ -95,10 +97,6 @@ class Effect(eqx.Module):
     family: ClassVar[Family] = "body"
     parameters: ClassVar[tuple[Parameter, ...]] = ()
     places: ClassVar[tuple[str, ...]] = ("all",)
-    simpler: ClassVar[tuple[str, ...]] = ()
-    echoes: ClassVar[tuple[str, ...]] = ()
-    essential: ClassVar[tuple[str, ...]] = ()
-    absorber: ClassVar[bool] = False
     order: ClassVar[int] = 0
     source: ClassVar[str] = ""
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -10,6 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .base import ALL_OR_ONE, Effect, Parameter
+from .traits import Region
+
+_LATEST, _STEPS = 0.25, (6, 16)
+"""Longest delay (s) that a diagnosis resolves, and fewest and most steps of the memory for it."""
 
 
 class ActuationDelay(Effect):
@@ -22,13 +26,22 @@ class ActuationDelay(Effect):
 
     name: ClassVar[str] = "actuation_delay"
     family: ClassVar = "actuation"
-    parameters: ClassVar = (Parameter("delay", "s", (0.01, 0.03, 0.08, 0.2), 0.0, 1.0),)
+    parameters: ClassVar = (Parameter("delay", "s", (0.01, 0.03, 0.08, 0.2), 0.0, 1.0, refit=0.01),)
     places: ClassVar = ALL_OR_ONE
     echoes: ClassVar = ("thruster_lag", "clock_offset")
     order: ClassVar[int] = 0
+    timing: ClassVar[bool] = True
+    refits: ClassVar = ("all",)
+    refit_needs: ClassVar = frozenset({"thrust"})
     source: ClassVar[str] = "a motor drive starts 110 ± 10 ms late (Blue Robotics forum, 11112)"
     thrusters: int = eqx.field(static=True, default=8)
     steps: int = eqx.field(static=True, default=6)
+
+    @classmethod
+    def options_for(cls, region: Region) -> dict[str, Any]:
+        """As many steps as resolve a delay of `_LATEST` s."""
+        steps = math.ceil(_LATEST / region.step - 1e-6) + 1
+        return {"steps": min(max(steps, _STEPS[0]), _STEPS[1])}
 
     @property
     def memory_size(self) -> int:

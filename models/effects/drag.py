@@ -5,6 +5,8 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..dynamics import Dynamics
+from ..rigid_body import FossenDynamics
 from ..se3 import AXES
 from .base import Effect, Parameter, Plant, axes_only
 
@@ -21,6 +23,16 @@ COUPLINGS = (
     ("surge_from_yaw", 0, 5),
 )
 """(place, axis of the force, axis of the velocity): those that symmetry allows."""
+_SPREAD = 3.0
+"""Prior standard deviation of drag in a fit of all coefficients, as a multiple of itself."""
+
+
+def _believed(base: Dynamics, axis: str) -> tuple[float, float]:
+    """Linear and quadratic coefficient of an axis; zero where the drag is not constant."""
+    if not isinstance(base, FossenDynamics):
+        return 0.0, 0.0
+    i = AXES.index(axis)
+    return float(base.linear_drag.dense[i, i]), float(base.quadratic_drag.dense[i, i])
 
 
 class LinearDrag(Effect):
@@ -30,7 +42,18 @@ class LinearDrag(Effect):
     family: ClassVar = "body"
     parameters: ClassVar = (Parameter("change", "N·s/m or N·m·s", (0.5,), -200.0, 200.0),)
     places: ClassVar = AXES
+    passive: ClassVar[bool] = True
+    refits: ClassVar = ("linear", "command", "all")
     source: ClassVar[str] = "published sets differ by factors"
+
+    @classmethod
+    def believed(cls, base: Dynamics, place: str) -> float:
+        return _believed(base, place)[0]
+
+    @classmethod
+    def refit_prior(cls, base: Dynamics, place: str) -> tuple[float, float]:
+        both = _believed(base, place)
+        return _SPREAD * max(*both, 1e-3), -both[0]
 
     def wrench(
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
@@ -45,7 +68,18 @@ class QuadraticDrag(Effect):
     family: ClassVar = "body"
     parameters: ClassVar = (Parameter("change", "N·s²/m² or N·m·s²", (2.0,), -500.0, 500.0),)
     places: ClassVar = AXES
+    passive: ClassVar[bool] = True
+    refits: ClassVar = ("linear", "command", "all")
     source: ClassVar[str] = "published sets differ by a factor of 8"
+
+    @classmethod
+    def believed(cls, base: Dynamics, place: str) -> float:
+        return _believed(base, place)[1]
+
+    @classmethod
+    def refit_prior(cls, base: Dynamics, place: str) -> tuple[float, float]:
+        both = _believed(base, place)
+        return _SPREAD * max(*both, 1e-3), -both[1]
 
     def wrench(
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant

@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 
 from .. import se3
 from ..se3 import AXES, XYZ
-from .base import Effect, Parameter
-from .recent import Recent
+from .base import Parameter
+from .measurement import MeasurementEffect
 
 
 def _turn(angles: Float[Array, "3 *batch"]) -> Float[Array, "7 *batch"]:
@@ -16,11 +16,10 @@ def _turn(angles: Float[Array, "3 *batch"]) -> Float[Array, "7 *batch"]:
     return se3.exp(jnp.concatenate([jnp.zeros_like(angles), angles]))
 
 
-class DvlLeverArm(Effect):
+class DvlLeverArm(MeasurementEffect):
     """v_recorded = v + ω × l: the DVL is mounted l away from its assumed position."""
 
     name: ClassVar[str] = "dvl_lever_arm"
-    family: ClassVar = "measurement"
     parameters: ClassVar = (Parameter("offset", "m", (0.02,), -1.0, 1.0),)
     places: ClassVar = XYZ
     order: ClassVar[int] = 20
@@ -31,59 +30,34 @@ class DvlLeverArm(Effect):
         v = se3.cross(jnp.broadcast_to(V[3:], shape), jnp.broadcast_to(self.column(V), shape))
         return jnp.concatenate([v, jnp.zeros_like(v)])
 
-    def measure(
-        self,
-        X_WB: Float[Array, "7 *#batch"],
-        V_WB_B: Float[Array, "6 *#batch"],
-        recent: Recent,
-    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        return X_WB, V_WB_B + self._lever(V_WB_B)
-
-    def unmeasure(
-        self,
-        X_WB: Float[Array, "7 *#batch"],
-        V_WB_B: Float[Array, "6 *#batch"],
-        recent: Recent,
-    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        return X_WB, V_WB_B - self._lever(V_WB_B)
+    def twist(
+        self, V_WB_B: Float[Array, "6 *#batch"], inverse: bool = False
+    ) -> Float[Array, "6 *#batch"]:
+        lever = self._lever(V_WB_B)
+        return V_WB_B - lever if inverse else V_WB_B + lever
 
 
-class DvlMisalignment(Effect):
+class DvlMisalignment(MeasurementEffect):
     """v_recorded = R(θ)ᵀ v: the DVL is rotated by the rotation vector θ relative to B."""
 
     name: ClassVar[str] = "dvl_misalignment"
-    family: ClassVar = "measurement"
     parameters: ClassVar = (Parameter("angle", "rad", (0.01,), -0.5, 0.5),)
     places: ClassVar = AXES[3:]
     order: ClassVar[int] = 30
     source: ClassVar[str] = "0.1 to 5°"
 
-    def measure(
-        self,
-        X_WB: Float[Array, "7 *#batch"],
-        V_WB_B: Float[Array, "6 *#batch"],
-        recent: Recent,
-    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        v = se3.rotate_inverse(_turn(self.column(V_WB_B)), V_WB_B[:3])
-        omega = jnp.broadcast_to(V_WB_B[3:], v.shape)
-        return X_WB, jnp.concatenate([v, omega])
-
-    def unmeasure(
-        self,
-        X_WB: Float[Array, "7 *#batch"],
-        V_WB_B: Float[Array, "6 *#batch"],
-        recent: Recent,
-    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        v = se3.rotate(_turn(self.column(V_WB_B)), V_WB_B[:3])
-        omega = jnp.broadcast_to(V_WB_B[3:], v.shape)
-        return X_WB, jnp.concatenate([v, omega])
+    def twist(
+        self, V_WB_B: Float[Array, "6 *#batch"], inverse: bool = False
+    ) -> Float[Array, "6 *#batch"]:
+        turn = se3.rotate if inverse else se3.rotate_inverse
+        v = turn(_turn(self.column(V_WB_B)), V_WB_B[:3])
+        return jnp.concatenate([v, jnp.broadcast_to(V_WB_B[3:], v.shape)])
 
 
-class DvlScale(Effect):
+class DvlScale(MeasurementEffect):
     """v_recorded = (1 + s) v: the DVL assumes a wrong speed of sound."""
 
     name: ClassVar[str] = "dvl_scale"
-    family: ClassVar = "measurement"
     parameters: ClassVar = (Parameter("scale", "1", (0.01,), -0.5, 0.5),)
     order: ClassVar[int] = 40
     source: ClassVar[str] = "0.1 to 1 % and worse with wrong salinity"
@@ -93,18 +67,8 @@ class DvlScale(Effect):
         s = self.part(0, V)[None] * like
         return jnp.concatenate([1 + s, jnp.ones_like(s)])
 
-    def measure(
-        self,
-        X_WB: Float[Array, "7 *#batch"],
-        V_WB_B: Float[Array, "6 *#batch"],
-        recent: Recent,
-    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        return X_WB, V_WB_B * self._factor(V_WB_B)
-
-    def unmeasure(
-        self,
-        X_WB: Float[Array, "7 *#batch"],
-        V_WB_B: Float[Array, "6 *#batch"],
-        recent: Recent,
-    ) -> tuple[Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-        return X_WB, V_WB_B / self._factor(V_WB_B)
+    def twist(
+        self, V_WB_B: Float[Array, "6 *#batch"], inverse: bool = False
+    ) -> Float[Array, "6 *#batch"]:
+        factor = self._factor(V_WB_B)
+        return V_WB_B / factor if inverse else V_WB_B * factor

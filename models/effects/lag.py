@@ -22,6 +22,7 @@ class ThrusterLag(Effect):
     places: ClassVar = ALL_OR_ONE
     echoes: ClassVar = ("actuation_delay", "clock_offset")
     order: ClassVar[int] = 1
+    timing: ClassVar[bool] = True
     source: ClassVar[str] = "0.05 to 0.2 s: Blue Robotics forum measurements, public simulators"
     thrusters: int = eqx.field(static=True, default=8)
 

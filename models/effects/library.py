@@ -43,61 +43,67 @@ from .thrust import (
 from .unknown import Unknown
 from .water import CurrentSteady, CurrentVarying, Waves
 
-KINDS: dict[str, type[Effect]] = {
-    kind.name: kind
-    for kind in (
-        ThrusterLag,
-        ActuationDelay,
-        ThrusterDeadZone,
-        ThrustAsymmetry,
-        ThrustCurve,
-        ThrusterGain,
-        ThrustScale,
-        VoltageSag,
-        LoadDroop,
-        InflowThrustLoss,
-        NetBuoyancy,
-        CentreOfGravity,
-        Payload,
-        LinearDrag,
-        QuadraticDrag,
-        DragAsymmetry,
-        DragCoupling,
-        CubicDrag,
-        Lift,
-        AddedMass,
-        AddedMassCoupling,
-        Proximity,
-        CurrentSteady,
-        CurrentVarying,
-        Waves,
-        Tether,
-        DisturbanceLevel,
-        DisturbanceColour,
-        DisturbanceImpacts,
-        DisturbanceStateDependence,
-        DvlLeverArm,
-        DvlMisalignment,
-        DvlScale,
-        GyroBias,
-        ClockOffset,
-        HeadingError,
-    )
-}
-"""Every named cause; a new one is added here."""
-
-COEFFICIENTS: dict[str, type[Effect]] = {
-    kind.name: kind
-    for kind in (
-        ThrustOffset,
-        ThrustTable,
-        VoltageExponent,
-        AxisThrust,
-        ThrustLever,
-        CentreOfBuoyancy,
-    )
-}
+_EVERY: tuple[type[Effect], ...] = (
+    ThrusterLag,
+    ActuationDelay,
+    ThrusterDeadZone,
+    ThrustAsymmetry,
+    ThrustCurve,
+    ThrusterGain,
+    ThrustScale,
+    VoltageSag,
+    LoadDroop,
+    InflowThrustLoss,
+    NetBuoyancy,
+    CentreOfGravity,
+    Payload,
+    LinearDrag,
+    QuadraticDrag,
+    DragAsymmetry,
+    DragCoupling,
+    CubicDrag,
+    Lift,
+    AddedMass,
+    AddedMassCoupling,
+    Proximity,
+    CurrentSteady,
+    CurrentVarying,
+    Waves,
+    Tether,
+    DisturbanceLevel,
+    DisturbanceColour,
+    DisturbanceImpacts,
+    DisturbanceStateDependence,
+    DvlLeverArm,
+    DvlMisalignment,
+    DvlScale,
+    GyroBias,
+    ClockOffset,
+    HeadingError,
+    ThrustOffset,
+    ThrustTable,
+    VoltageExponent,
+    AxisThrust,
+    ThrustLever,
+    CentreOfBuoyancy,
+)
+"""Every effect; a new one is added here."""
+KINDS: dict[str, type[Effect]] = {k.name: k for k in _EVERY if not k.refit_only}
+"""Every named cause."""
+COEFFICIENTS: dict[str, type[Effect]] = {k.name: k for k in _EVERY if k.refit_only}
 """Effects that `--refit` estimates and that are never reported as a cause."""
+
+
+def register(kind: type[Effect]) -> type[Effect]:
+    """Make an effect of one's own known: to scenarios, and as a cause to diagnoses.
+
+    Raises:
+        UserError: its name is taken.
+    """
+    if kind.name in (Unknown.name, *KINDS, *COEFFICIENTS):
+        raise UserError(f"effect {kind.name!r} is there already: take another name")
+    (COEFFICIENTS if kind.refit_only else KINDS)[kind.name] = kind
+    return kind
 
 
 def kind(name: str) -> type[Effect]:

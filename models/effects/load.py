@@ -6,6 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .. import se3
+from ..dynamics import Dynamics
+from ..rigid_body import FossenDynamics
 from ..se3 import XYZ
 from .base import Effect, Parameter, Plant, force_only
 
@@ -25,9 +27,15 @@ class NetBuoyancy(Effect):
 
     name: ClassVar[str] = "net_buoyancy"
     family: ClassVar = "body"
-    parameters: ClassVar = (Parameter("force", "N", (0.5,), -60.0, 60.0),)
+    parameters: ClassVar = (Parameter("force", "N", (0.5,), -60.0, 60.0, refit=20.0),)
     places: ClassVar = ("all", "centre_of_buoyancy")
+    at_rest: ClassVar[bool] = True
+    refits: ClassVar = ("linear", "command", "all")
     source: ClassVar[str] = "0.2 to 4 N: trim, foam, water density"
+
+    @classmethod
+    def believed(cls, base: Dynamics, place: str) -> float:
+        return float(base.buoyancy - base.weight) if isinstance(base, FossenDynamics) else 0.0
 
     def wrench(
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
@@ -49,6 +57,7 @@ class CentreOfGravity(Effect):
     family: ClassVar = "body"
     parameters: ClassVar = (Parameter("shift", "m", (0.001,), -0.1, 0.1),)
     places: ClassVar = XYZ
+    at_rest: ClassVar[bool] = True
     source: ClassVar[str] = "mm to cm: batteries, tools, ballast"
 
     def inertia(self, plant: Plant) -> Float[Array, "6 6 *batch"]:
@@ -67,7 +76,14 @@ class CentreOfBuoyancy(Effect):
     family: ClassVar = "body"
     parameters: ClassVar = (Parameter("shift", "m", (0.001,), -0.5, 0.5, 0.05),)
     places: ClassVar = XYZ
+    refits: ClassVar = ("all",)
+    refit_only: ClassVar[bool] = True
     source: ClassVar[str] = "0.01 to 0.1 m above Bo in published sets"
+
+    @classmethod
+    def believed(cls, base: Dynamics, place: str) -> float:
+        fossen = isinstance(base, FossenDynamics)
+        return float(base.p_BoCb_B[XYZ.index(place)]) if fossen else 0.0
 
     def wrench(
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant

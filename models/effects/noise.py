@@ -17,6 +17,7 @@ class DisturbanceLevel(Effect):
     family: ClassVar = "disturbance"
     parameters: ClassVar = (Parameter("change", "1", (0.1,), -1.0, 50.0),)
     places: ClassVar = AXES
+    random: ClassVar[bool] = True
     source: ClassVar[str] = "no model states it well"
 
     def diffusion(
@@ -32,6 +33,7 @@ class DisturbanceStateDependence(Effect):
     family: ClassVar = "disturbance"
     parameters: ClassVar = (Parameter("growth", "s²/m²", (1.0,), 0.0, 1e3),)
     places: ClassVar = AXES
+    random: ClassVar[bool] = True
     source: ClassVar[str] = "vortex shedding grows with speed squared"
 
     def diffusion(
@@ -52,6 +54,8 @@ class DisturbanceColour(Effect):
     )
     places: ClassVar = AXES
     absorber: ClassVar[bool] = True
+    random: ClassVar[bool] = True
+    slow: ClassVar[bool] = True
     source: ClassVar[str] = "0.3 to 3 N over 0.5 to 10 s"
 
     @property
@@ -91,6 +95,7 @@ class DisturbanceImpacts(Effect):
         Parameter("rate", "1/s", (0.2,), 0.0, 20.0),
     )
     places: ClassVar = AXES
+    random: ClassVar[bool] = True
     source: ClassVar[str] = "0.2 to 2 N·s: debris, contact, snapping cable"
 
     @property

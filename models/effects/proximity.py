@@ -1,6 +1,6 @@
 """Effects of a nearby bottom, surface or wall."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from .base import Effect, Parameter, Plant, force_only
 from .load import up_in_body
+from .traits import Region
 
 REACH = 0.5
 """Default decay length (m) of a boundary's effect, about the length of the hull."""
@@ -32,6 +33,12 @@ class Proximity(Effect):
     source: ClassVar[str] = "drag up by half within one hull height of a wall"
     floor: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=-10.0)
     walls: Float[Array, "4"] = eqx.field(converter=jnp.asarray, default=(-10.0, 10.0, -10.0, 10.0))
+
+    @classmethod
+    def options_for(cls, region: Region) -> dict[str, Any]:
+        """Boundaries just around the places where the vehicle was."""
+        (west, south, floor), (east, north, _) = region.low, region.high
+        return {"floor": floor, "walls": (west, east, south, north)}
 
     def assumed(self, place: str) -> dict[str, tuple[float, str]]:
         """Assumed position of the boundary (m in W: a height, or east or north)."""

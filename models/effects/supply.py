@@ -18,6 +18,7 @@ class VoltageSag(Effect):
     family: ClassVar = "actuation"
     parameters: ClassVar = (Parameter("exponent", "1", (0.3,), 0.0, 4.0),)
     order: ClassVar[int] = 15
+    needs: ClassVar = frozenset({"voltage"})
     source: ClassVar[str] = "T200: thrust falls by 30 % from 16 to 12 V (Blue Robotics, 2019)"
 
     def thrust(
@@ -35,6 +36,9 @@ class VoltageExponent(VoltageSag):
 
     name: ClassVar[str] = "voltage_exponent"
     parameters: ClassVar = (Parameter("exponent", "1", (0.3,), -4.0, 4.0, 1.0),)
+    refits: ClassVar = ("all",)
+    refit_only: ClassVar[bool] = True
+    refit_needs: ClassVar = frozenset({"voltage", "thrust"})
 
 
 class LoadDroop(Effect):

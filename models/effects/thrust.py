@@ -11,6 +11,9 @@ from .base import ALL_OR_ONE, THRUSTERS, Effect, Parameter, Plant
 
 REFERENCE = 10.0
 """Reference force F_0 (N), at which the exponent has no influence."""
+START = 0.3
+"""Dead zone and offset (N) that a fit of all coefficients starts from: at zero their responses are
+one-sided."""
 
 
 class ThrusterDeadZone(Effect):
@@ -18,9 +21,13 @@ class ThrusterDeadZone(Effect):
 
     name: ClassVar[str] = "thruster_dead_zone"
     family: ClassVar = "actuation"
-    parameters: ClassVar = (Parameter("width", "N", (0.2, 0.6, 1.5, 3.0), 0.0, 15.0),)
+    parameters: ClassVar = (
+        Parameter("width", "N", (0.2, 0.6, 1.5, 3.0), 0.0, 15.0, refit=3.0, start=START),
+    )
     places: ClassVar = ALL_OR_ONE
     order: ClassVar[int] = 10
+    refits: ClassVar = ("all",)
+    refit_needs: ClassVar = frozenset({"thrust"})
     source: ClassVar[str] = "0.3 to 2.5 N: 25 to 40 µs of a T200 around 1500 µs"
 
     def thrust(
@@ -44,13 +51,15 @@ class ThrustCurve(Effect):
     name: ClassVar[str] = "thrust_curve"
     family: ClassVar = "actuation"
     parameters: ClassVar = (
-        Parameter("exponent", "1", (0.04, -0.04, 0.12, -0.12), -0.5, 1.0),
+        Parameter("exponent", "1", (0.04, -0.04, 0.12, -0.12), -0.5, 1.0, refit=0.3),
         Parameter("gain", "1", (0.05,), -0.7, 0.7),
     )
     places: ClassVar = ALL_OR_ONE
     simpler: ClassVar = ("thrust_scale", "thruster_gain")
     essential: ClassVar = ("exponent",)
     order: ClassVar[int] = 11
+    refits: ClassVar = ("all",)
+    refit_needs: ClassVar = frozenset({"thrust"})
     source: ClassVar[str] = "5 to 15 % between bollard tests"
 
     def thrust(
@@ -70,9 +79,11 @@ class ThrustAsymmetry(Effect):
 
     name: ClassVar[str] = "thrust_asymmetry"
     family: ClassVar = "actuation"
-    parameters: ClassVar = (Parameter("reverse_gain", "1", (-0.05,), -0.6, 1.5),)
+    parameters: ClassVar = (Parameter("reverse_gain", "1", (-0.05,), -0.6, 1.5, refit=0.5),)
     places: ClassVar = ALL_OR_ONE
     order: ClassVar[int] = 12
+    refits: ClassVar = ("all",)
+    refit_needs: ClassVar = frozenset({"thrust"})
     source: ClassVar[str] = "reverse ≈ 0.78 of forward: Blue Robotics T200 data, 2019"
 
     def thrust(
@@ -112,6 +123,7 @@ class ThrustScale(Effect):
     family: ClassVar = "actuation"
     parameters: ClassVar = (Parameter("scale", "1", (0.03,), -0.8, 1000.0),)
     order: ClassVar[int] = 10
+    refits: ClassVar = ("scales",)
     source: ClassVar[str] = "bollard thrust of equal thrusters scatters by 10 to 20 %"
 
     def thrust(
@@ -139,6 +151,9 @@ class ThrustTable(Effect):
     parameters: ClassVar = (Parameter("correction", "1", (0.05,), -0.9, 3.0, 0.1),)
     places: ClassVar = tuple(f"{sign}{knot:g} N" for sign in "+-" for knot in KNOTS)
     order: ClassVar[int] = 13
+    refits: ClassVar = ("all",)
+    refit_only: ClassVar[bool] = True
+    refit_needs: ClassVar = frozenset({"thrust"})
     source: ClassVar[str] = "curves of one thruster differ with maker's rig, battery and software"
 
     def thrust(
@@ -171,8 +186,12 @@ class ThrustOffset(Effect):
 
     name: ClassVar[str] = "thrust_offset"
     family: ClassVar = "actuation"
-    parameters: ClassVar = (Parameter("force", "N", (0.05,), 0.0, 3.0, 1.0),)
+    parameters: ClassVar = (Parameter("force", "N", (0.05,), 0.0, 3.0, 1.0, start=START),)
     order: ClassVar[int] = 10
+    refits: ClassVar = ("all",)
+    refit_only: ClassVar[bool] = True
+    refit_needs: ClassVar = frozenset({"pwm"})
+    replaces: ClassVar = ("thruster_dead_zone",)
     source: ClassVar[str] = "dead bands of 25 to 40 µs around 1500 µs: speed controllers differ"
 
     def thrust(
@@ -198,6 +217,8 @@ class AxisThrust(Effect):
     parameters: ClassVar = (Parameter("scale", "1", (0.05,), -3.0, 20.0, 0.3),)
     places: ClassVar = AXES
     order: ClassVar[int] = 15
+    refits: ClassVar = ("command", "all")
+    refit_only: ClassVar[bool] = True
     source: ClassVar[str] = "thrusters 30 to 45° from the axis; moment arms differ by 10 to 100 %"
 
     def together(self, F_Bo_B: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:
@@ -223,6 +244,8 @@ class ThrustLever(Effect):
     parameters: ClassVar = (Parameter("lever", "m", (0.005,), -1.0, 1.0, 0.05),)
     places: ClassVar = tuple(name for name, _, _ in LEVERS)
     order: ClassVar[int] = 16
+    refits: ClassVar = ("all",)
+    refit_only: ClassVar[bool] = True
     source: ClassVar[str] = "positions of thrusters, and of Bo, are known to some cm"
 
     def together(self, F_Bo_B: Float[Array, "6 *#batch"]) -> Float[Array, "6 *#batch"]:

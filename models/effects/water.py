@@ -37,6 +37,8 @@ class CurrentVarying(Effect):
     places: ClassVar = ("W",)
     simpler: ClassVar = ("current_steady",)
     absorber: ClassVar[bool] = True
+    random: ClassVar[bool] = True
+    slow: ClassVar[bool] = True
     source: ClassVar[str] = "0 to 0.3 m/s over 10 s to minutes"
 
     @property
@@ -80,6 +82,8 @@ class Waves(Effect):
     )
     places: ClassVar = ("W",)
     absorber: ClassVar[bool] = True
+    random: ClassVar[bool] = True
+    slow: ClassVar[bool] = True
     source: ClassVar[str] = "wind sea of 3 to 8 s, swell of 8 to 16 s"
 
     @property

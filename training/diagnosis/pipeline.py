@@ -15,7 +15,7 @@ from ...models.dynamics import Dynamics
 from ...models.effects.base import Effect
 from ...models.effects.extended import Extended
 from ...models.effects.library import Library
-from ...models.effects.thrust import AxisThrust
+from ...models.effects.unknown import Unknown
 from ...models.recordings.store import Recording
 from ...models.se3 import AXES
 from ...models.vehicles.vehicle import Vehicle
@@ -127,8 +127,8 @@ class Diagnoser:
         self.faults, faulty = problems(recording)
         self.problem = DiagnosisProblem.of(recording, vehicle, base, faulty)
         require_enough(self.problem.data)
-        if self.config.refit == "command" and not self.problem.library.has("axis_thrust"):
-            self.problem = self.problem.with_effect(AxisThrust.neutral())
+        if self.config.refit == "command":
+            self.problem = with_coefficients(self.problem, "command")
         self.resampled = any("resampled" in note for note in recording.notes)
         self.command_period = recording.command_period
         directions = np.asarray(self.problem.model.allocate(jnp.eye(self.problem.data.u.shape[1])))
@@ -152,7 +152,7 @@ class Diagnoser:
         config, problem = self.config, self.problem
         self.progress(0.02, "one-step predictions")
         if config.refit == "all":
-            problem = self.problem = with_coefficients(problem)
+            problem = self.problem = with_coefficients(problem, "all")
         base = first = self._believed(problem)
         nuisance = refitted(problem, config.refit)
         if nuisance:
@@ -310,7 +310,7 @@ class Diagnoser:
             self.progress(0.52 + 0.1 * number, "structure without a name")
             if seen is None:
                 seen = find_structure(problem, nuisance, found, config.alpha, self.rng, self.quiet)
-            taken = {e.places[0] for e in problem.library.effects if e.name == "unknown"}
+            taken = {e.places[0] for e in problem.library.effects if e.name == Unknown.name}
             if seen is None or seen.matched.group.effect.acts_on in taken:
                 if number == 0 and not found.accepted:
                     problem = search.run(found).problem
@@ -318,7 +318,7 @@ class Diagnoser:
             problem = add_structure(problem, nuisance, found, seen, self.rng)
             nuisance = refitted(problem, config.refit)
             where = found.hypotheses[-1][1]
-            structures["unknown", where] = structure(problem, where, found.current.theta, seen)
+            structures[Unknown.name, where] = structure(problem, where, found.current.theta, seen)
             again = self._names(problem, nuisance, 0.55 + 0.1 * number, 0.6 + 0.1 * number)
             problem, seen = again.run(found).problem, None
         return problem, nuisance, structures

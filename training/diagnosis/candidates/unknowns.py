@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from ....models.effects.unknown import Unknown
 from ..disturbance.found import best_law
 from ..filter.problem import DiagnosisProblem, Evaluation
 from ..filter.sensitivities import whitened_sensitivities
@@ -108,7 +109,7 @@ def find_structure(
     law = best_law(problem, found.current)
     if gain < BEATS * name or gain < _OF_A_LAW * law:
         return None
-    known = [h for h in found.hypotheses if h[0] != "unknown"]
+    known = [h for h in found.hypotheses if h[0] != Unknown.name]
     if known and len(known) == len(found.hypotheses):
         at_first = screened(problem, found.first, nuisance, alpha, rng, quiet)
         evidence = found.first.evidence
@@ -134,7 +135,7 @@ def add_structure(
     rivals = sorted(found.left.items(), key=lambda item: -item[1].heldout_gain)[:5]
     wider = problem.with_effect(effect)
     theta = wider.moved(found.current.theta, problem.library)
-    hypothesis = ("unknown", effect.acts_on)
+    hypothesis = (Unknown.name, effect.acts_on)
     own = wider.library.at(*hypothesis)
     free = [wider.library.index(*_key(problem.library.entries[i])) for i in nuisance]
     rows = [*own, *parameters_of(wider.library, found.hypotheses), *free]
@@ -159,9 +160,9 @@ def structure(
 ) -> result.Structure:
     """The structure that was found, in words."""
     effect = next(
-        e for e in problem.library.effects if e.name == "unknown" and e.places == (where,)
+        e for e in problem.library.effects if e.name == Unknown.name and e.places == (where,)
     )
-    words = described(effect, theta[problem.library.at("unknown", where)], problem)  # pyright: ignore[reportArgumentType]
+    words = described(effect, theta[problem.library.at(Unknown.name, where)], problem)  # pyright: ignore[reportArgumentType]
     return result.Structure(
         **words, heldout_gain=found_structure.gain, best_name_gain=found_structure.name_gain
     )

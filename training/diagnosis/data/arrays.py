@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ....models.config.errors import UserError
+from ....models.effects.traits import Need, Region
 from ....models.recordings.kinematics import dead_reckoned
 from ....models.recordings.store import Recording
 from ....models.se3 import XYZ
@@ -22,6 +23,8 @@ REMEMBERED, _OF_A_RUN = 0.5, 0.1
 """Time (s) before a piece whose commands may set its actuator states; share of a run at most."""
 _BEYOND = 8.0
 """Multiple of a thruster's largest force above which commands can't be in newtons."""
+_MARGIN = 0.3
+"""Distance (m) between the places of a vehicle and the boundaries that are assumed around them."""
 _MOST_FOLDS = 10
 _FEW_RUNS = 6
 _EVEN = 1e-6
@@ -78,6 +81,20 @@ class Data:
         found = np.ones(12)
         found[:3] = not self.unmeasured
         return found
+
+    @property
+    def offers(self) -> frozenset[Need]:
+        """What of the `needs` of effects was recorded."""
+        level = self.command != "F_Bo_B"
+        offered = {"voltage": self.has_voltage, "thrust": level, "pwm": self.command == "pwm"}
+        return frozenset(need for need, there in offered.items() if there)  # pyright: ignore[reportReturnType]
+
+    @property
+    def region(self) -> Region:
+        """Where the vehicle was, with a margin, and the mean step."""
+        p = self.X[:, 4:]
+        low, high = p.min(axis=(0, 2)) - _MARGIN, p.max(axis=(0, 2)) + _MARGIN
+        return Region(tuple(low.tolist()), tuple(high.tolist()), self.dt)
 
     @property
     def left_out(self) -> Literal["scenario", "run", "block"]:

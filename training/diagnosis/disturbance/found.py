@@ -6,6 +6,13 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from ....models.effects.library import kind
+from ....models.effects.noise import (
+    DisturbanceColour,
+    DisturbanceImpacts,
+    DisturbanceStateDependence,
+)
+from ....models.effects.water import CurrentSteady, CurrentVarying
 from ....models.se3 import AXES
 from ..data.repeats import repeating
 from ..filter.noise import estimate
@@ -23,7 +30,6 @@ _SHORTEST, _SMALLEST = 3.0, 0.1
 """Least time constant of a colour (steps), and least relative change of a level."""
 _MOST_AXES = 3
 """Number of axes with repeating errors from which randomly moving water is ruled out."""
-SLOW = ("waves", "disturbance_colour", "current_varying")
 _AS_WELL = 1.0
 """Nats that growth with the speed may win less than a level and still explain it."""
 OF_OTHERS = 1e-3
@@ -47,13 +53,13 @@ def laws_of(problem: DiagnosisProblem, evaluation: Evaluation) -> list[Law]:
         data.dt,
         process_share(problem, evaluation),
     )
-    rows = problem.library.at("current_steady", "W")
+    rows = problem.library.at(CurrentSteady.name, "W")
     evidence = evaluation.plain
     if set(rows) <= set(evidence.design.owner.tolist()) and len(evidence.runs) > 2:
         columns = [evidence.column(i) for i in rows]
         sizes = np.array([problem.library.entries[i].parameter.probes[0] for i in rows])
         gain, values, loss = run_constants(evidence.runs, columns, sizes, evidence.fold)
-        found.append(Law("current_varying", "W", values, gain, loss))
+        found.append(Law(CurrentVarying.name, "W", values, gain, loss))
     return sorted(found, key=lambda law: -law.heldout_gain)
 
 
@@ -71,19 +77,19 @@ def all_laws(problem: DiagnosisProblem, evaluation: Evaluation, least: float) ->
     """Disturbance laws of the residual, waves and level included, largest gain first."""
     found = laws_of(problem, evaluation)
     alike = repeating(evaluation.z, problem.data)
-    slow = [law for law in found if law.name == "disturbance_colour"]
+    slow = [law for law in found if law.name == DisturbanceColour.name]
     if max((law.heldout_gain for law in slow), default=0.0) > least:
         waves, current = find_waves(problem, evaluation), find_current(problem, evaluation)
         if are_waves(waves, slow):
             found.append(waves)
         # one motion of the water against disturbances by axis, or against a constant current
-        stays = won_by("current_varying", found)
-        if current.heldout_gain > max(won_by("disturbance_colour", slow), stays + margin(stays)):
-            found = [law for law in found if law.name != "current_varying"]
+        stays = won_by(CurrentVarying.name, found)
+        if current.heldout_gain > max(won_by(DisturbanceColour.name, slow), stays + margin(stays)):
+            found = [law for law in found if law.name != CurrentVarying.name]
             found.append(current)
     # errors that repeat with the commands are not random
     water = {"W"} if len(alike) >= _MOST_AXES else set()
-    found = [law for law in found if law.name not in SLOW or law.where not in {*alike, *water}]
+    found = [law for law in found if not kind(law.name).slow or law.where not in {*alike, *water}]
     found += find_levels(problem, evaluation, least)
     return sorted(found, key=lambda law: -law.heldout_gain)
 
@@ -111,9 +117,9 @@ def reported_laws(
     if not shaped:
         return [levels] if levels else []
     shaped = [law for law in shaped if law.name == shaped[0].name]
-    if shaped[0].name == "disturbance_state_dependence":
+    if shaped[0].name == DisturbanceStateDependence.name:
         shaped, levels = _grown(laws, shaped, levels, problem, evaluation)
-    if levels and shaped[0].name in SLOW:
+    if levels and kind(shaped[0].name).slow:
         levels = levels_with_slow_noise(levels, problem, evaluation, least)
     kept = []
     for law in levels:
@@ -133,13 +139,13 @@ def _remaining_level(
 ) -> Law | None:
     """A level with the change that laws of one name leave to it, or None if they explain it."""
     i, name = AXES.index(law.where), shaped[0].name
-    if name in SLOW:
+    if kind(name).slow:
         return law
     own = [other for other in shaped if other.where == law.where]
     if not own:
         return law
     all_of_it = 1 + law.parameters["change"]
-    if name == "disturbance_impacts":
+    if name == DisturbanceImpacts.name:
         rest = all_of_it * _without_impacts(problem, evaluation)[i] / evaluation.noise.diffusion[i]
     else:
         rest = all_of_it * float(white_part(own, problem)[i])
@@ -198,7 +204,7 @@ def _without_impacts(problem: DiagnosisProblem, evaluation: Evaluation) -> Float
 
 def _is_apart(law: Law, problem: DiagnosisProblem) -> bool:
     """Whether errors of the noise levels alone can't imitate a law."""
-    if law.name == "disturbance_colour" and law.loss is not None:
+    if law.name == DisturbanceColour.name and law.loss is not None:
         return (
             float(np.exp(estimated(law, problem.data.cluster)[0][0])) > _SHORTEST * problem.data.dt
         )

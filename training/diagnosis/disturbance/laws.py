@@ -13,6 +13,11 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float, Int
 
+from ....models.effects.noise import (
+    DisturbanceColour,
+    DisturbanceImpacts,
+    DisturbanceStateDependence,
+)
 from ....models.se3 import AXES
 
 
@@ -217,9 +222,9 @@ def find_laws(
     for i, axis in enumerate(AXES):
         own = z[:, 6 + i]
         for name, fitted in (
-            ("disturbance_impacts", impacts(own, weight, fold)),
-            ("disturbance_state_dependence", speed_dependence(own, speed, weight, fold, share[i])),
-            ("disturbance_colour", colour(own, weight, fold, dt)),
+            (DisturbanceImpacts.name, impacts(own, weight, fold)),
+            (DisturbanceStateDependence.name, speed_dependence(own, speed, weight, fold, share[i])),
+            (DisturbanceColour.name, colour(own, weight, fold, dt)),
         ):
             gain, values, loss = fitted
             found.append(Law(name, axis, values, gain, loss))

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
+from ....models.effects.noise import DisturbanceLevel
 from ....models.se3 import AXES
 from ..filter.likely_noise import fit_with_slow_noise
 from ..filter.noise import Noise, estimate, score_of, unit_processes
@@ -15,7 +16,7 @@ from ..filter.problem import DiagnosisProblem, Evaluation
 from ..filter.transition import Transition
 from .laws import Law
 
-LEVEL = "disturbance_level"
+LEVEL = DisturbanceLevel.name
 
 
 def believed_levels(problem: DiagnosisProblem) -> Float[np.ndarray, "6"]:

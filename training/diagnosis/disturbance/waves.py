@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from ....models.effects.noise import DisturbanceColour
+from ....models.effects.water import CurrentVarying, Waves
 from ....models.se3 import AXES
 from ..candidates.structures import Screen
 from ..filter.gram import gram
@@ -43,9 +45,9 @@ def correlated_noise_of(
     problem: DiagnosisProblem, evaluation: Evaluation, laws: Sequence[Law]
 ) -> CorrelatedNoise:
     """The correlated noise that wins most: slow disturbances by axis, a current, or swell."""
-    slow = [law for law in laws if law.name == "disturbance_colour" and law.heldout_gain > _LEAST]
+    slow = [law for law in laws if law.name == DisturbanceColour.name and law.heldout_gain > _LEAST]
     pushes = sum(law.heldout_gain for law in slow)
-    stays = max((law.heldout_gain for law in laws if law.name == "current_varying"), default=0.0)
+    stays = max((law.heldout_gain for law in laws if law.name == CurrentVarying.name), default=0.0)
     wanders = find_current(problem, evaluation)
     if max(stays, wanders.heldout_gain) > pushes:
         whole = Screen(problem, evaluation, None, whole=True)
@@ -191,7 +193,7 @@ def find_current(problem: DiagnosisProblem, evaluation: Evaluation) -> Law:
         return run_constants(G, columns, spread, screen.fold)[2](logs[:1] + np.log(spread[0]))
 
     share = problem.data.steps / problem.data.weight[:, screen.kept].sum()
-    law = Law("current_varying", "W", numbers, heldout * share, loss=lost)
+    law = Law(CurrentVarying.name, "W", numbers, heldout * share, loss=lost)
     logs, covariance = estimated(law, np.arange(len(screen.kept)))
     numbers = dict(zip(numbers, np.exp(logs).tolist(), strict=True))
     unsure = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -328,7 +330,7 @@ def _found(problem: DiagnosisProblem, evaluation: Evaluation) -> tuple[Swell, La
     numbers = {"amplitude": size * speed, "frequency": best.frequency, "direction": turned}
     errors = {"amplitude": size * spread, "frequency": error, "direction": unsure}
     share = problem.data.steps / problem.data.weight[:, screen.kept].sum()
-    return best, Law("waves", "W", numbers, heldout * share, errors=errors)
+    return best, Law(Waves.name, "W", numbers, heldout * share, errors=errors)
 
 
 def _others(omega: float, direction: float) -> list[list[Swell]]:

@@ -152,23 +152,11 @@ def _jacobian(
     return whole + jnp.einsum("ijr,jkr->ikr", JJ, J) / 6, lower[:, 3:]
 
 
-def _late(library: Library, theta: np.ndarray) -> Float[np.ndarray, "6"]:
-    """Delay of recorded poses against twists, by axis (s); the mean over pieces."""
-    if not library.has("clock_offset"):
-        return np.zeros(6)
-
-    def delay(where: str) -> float:
-        return float(np.mean(theta[library.index("clock_offset", where, "delay")]))
-
-    own = [delay("linear")] * 3 + [delay("angular")] * 3
-    return delay("pose") - delay("twist") - np.array(own)
-
-
 def predict(model: Extended, library: Library, theta: np.ndarray, data: Data) -> Predictions:
     """Predictions of all samples with the effects' values `theta`: (p,), or (p, R) by piece."""
     effects = library.filled(theta.reshape(len(theta), -1))
     found = _predict(model, effects, as_arrays(data), substeps(data.longest))
-    found = found._replace(late=_late(library, theta))
+    found = found._replace(late=sum((e.pose_delay() for e in effects), np.zeros(6)))
     return (
         found._replace(error=found.error * data.measured[None, :, None])
         if data.unmeasured

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -13,10 +13,8 @@ from ....models.config.checks import require_double
 from ....models.dynamics import Dynamics
 from ....models.effects.base import Effect
 from ....models.effects.extended import Extended
-from ....models.effects.library import KINDS, Library
+from ....models.effects.library import KINDS, Library, kind
 from ....models.recordings.store import Recording
-from ....models.rigid_body import FossenDynamics
-from ....models.se3 import AXES, XYZ
 from ....models.vehicles.vehicle import Vehicle
 from ..data.arrays import Data, make_data
 from ..selection.correlated_noise import CorrelatedNoise
@@ -28,19 +26,12 @@ from .noise import Filter, Noise, estimate, judging_filter
 from .sensitivities import whitened_sensitivities
 from .transition import Transition
 
-_RANDOM = ("waves", "current_varying")
-"""Causes that are fitted as disturbance laws: they are random from run to run."""
-
-
-_DRAG = ("linear_drag", "quadratic_drag")
 _HALVINGS = 4
 """Steps that may fail before a fit ends."""
 WILD = 1e3
 """Errors (m, rad, m/s, rad/s) and Jacobian entries beyond which a one-step prediction diverged."""
 _WORSE = 20.0
 """Nats of one-step likelihood that a step may lose: the filtered fit weighs errors differently."""
-_LATEST, _STEPS = 0.25, (6, 16)
-"""Longest command delay (s) that is resolved, and fewest and most steps of its buffer."""
 _LIGHTEST = 0.1
 """Least share of the believed mass matrix, along any direction, that a step may leave."""
 
@@ -134,7 +125,9 @@ class DiagnosisProblem:
         rows = list(rows)
         entries = [self.library.entries[i] for i in rows]
         both = [self.bounds.get(_key(e), (e.parameter.low, e.parameter.high)) for e in entries]
-        least = [-self.believes(e.cause, e.where) if e.cause in _DRAG else -np.inf for e in entries]
+        least = [
+            -self.believes(e.cause, e.where) if kind(e.cause).passive else -np.inf for e in entries
+        ]
         low = np.maximum([b[0] for b in both], np.minimum(least, self.believed[rows]))
         return low, np.array([b[1] for b in both])
 
@@ -147,21 +140,7 @@ class DiagnosisProblem:
 
     def believes(self, cause: str, where: str) -> float:
         """The believed model's own coefficient that a cause changes; 0 where it has none."""
-        core = self.model.base
-        if not isinstance(core, FossenDynamics):
-            return 0.0
-        if cause == "net_buoyancy":
-            return float(core.buoyancy - core.weight)
-        if cause == "centre_of_buoyancy":
-            return float(core.p_BoCb_B[XYZ.index(where)])
-        if where not in AXES:
-            return 0.0
-        i = AXES.index(where)
-        if cause == "added_mass":
-            return float(core.mass.matrix()[i, i] - core.rigid_inertia[i, i])
-        if cause in ("linear_drag", "quadratic_drag"):
-            return float(getattr(core, cause).dense[i, i])
-        return 0.0
+        return kind(cause).believed(self.model.base, where)
 
     def mass(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "6 6"]:
         """The mass matrix under θ (kg, kg·m, kg·m²)."""
@@ -372,16 +351,9 @@ def _key(entry: tuple) -> tuple[str, str, str]:
 
 
 def _library(data: Data, effects: Sequence[Effect]) -> tuple[Library, np.ndarray]:
-    low, high = data.X[:, 4:].min(axis=(0, 2)) - 0.3, data.X[:, 4:].max(axis=(0, 2)) + 0.3
-    walls = (low[0], high[0], low[1], high[1])
-    options: dict[str, dict[str, Any]] = {
-        "proximity": {"floor": float(low[2]), "walls": tuple(map(float, walls))},
-        "actuation_delay": {"steps": int(np.clip(np.ceil(_LATEST / data.dt - 1e-6) + 1, *_STEPS))},
-    }
-    left_out = set(_RANDOM) | (set() if data.has_voltage else {"voltage_sag"})
-    kinds = [k for k in KINDS.values() if k.family != "disturbance" and k.name not in left_out]
+    kinds = [k for k in KINDS.values() if not k.random and k.needs <= data.offers]
     own = [e for e in effects if e.name not in {k.name for k in kinds}]
-    library = Library([*(k.neutral(**options.get(k.name, {})) for k in kinds), *own])
+    library = Library([*(k.neutral(**k.options_for(data.region)) for k in kinds), *own])
     theta = np.zeros(library.size)
     for effect in effects:
         rows = [i for where in effect.places for i in library.at(effect.name, where)]

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ....models.effects.library import kind
+from ....models.effects.noise import DisturbanceStateDependence
 from ..disturbance.laws import Law
 from ..filter.gram import gram
 from ..filter.innovations import predict
@@ -41,7 +42,6 @@ _BY_ITSELF = {
     "measurement": "hold the instrument against another one",
 }
 """Measurements for causes that no maneuver informs on, by the family of a cause."""
-_SLOW = ("current_varying", "waves", "disturbance_colour")
 _DEPTHS = "repeat at two depths and several headings"
 """Experiment that distinguishes moving water from slow disturbances."""
 
@@ -184,10 +184,10 @@ def of_law(
     taken whose speeds vary most, by the expected likelihood ratio ½ E[ρ - 1 - log ρ] of a variance
     that grows with the speed against a constant one.
     """
-    slow = [r.name for r in rivals if r.name in _SLOW]
-    if law.name in _SLOW and slow:
+    slow = [r.name for r in rivals if kind(r.name).slow]
+    if kind(law.name).slow and slow:
         return Experiment(f"to tell it from {slow[0]}: {_DEPTHS}", {})
-    if law.name == "disturbance_state_dependence":
+    if law.name == DisturbanceStateDependence.name:
         k = law.parameters["growth"]
         value = {
             t: _of_growth(k, v) / problem.data.dt * 60 for t, v in _speeds(problem, final).items()

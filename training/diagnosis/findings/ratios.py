@@ -16,7 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ....models import se3
+from ....models.effects.drag import LinearDrag, QuadraticDrag
 from ....models.effects.extended import Extended
+from ....models.effects.load import NetBuoyancy
 from ....models.rigid_body import FossenDynamics
 from ....models.se3 import AXES
 from ..filter.problem import DiagnosisProblem, Evaluation
@@ -30,12 +32,12 @@ _STEP = 0.1
 _SMALL = 1e-9
 _UNITS = {
     "inertia": ("1", "1"),
-    "quadratic_drag": ("1/m", "1"),
-    "linear_drag": ("1/s", "1/s"),
+    QuadraticDrag.name: ("1/m", "1"),
+    LinearDrag.name: ("1/s", "1/s"),
     "half_thrust": ("m/s²", "rad/s²"),
     "thrust": ("m/s²", "rad/s²"),
     "restoring": ("", "rad/s²"),
-    "net_buoyancy": ("m/s²", ""),
+    NetBuoyancy.name: ("m/s²", ""),
 }
 """Units of translations and of rotations."""
 
@@ -120,7 +122,7 @@ def _numbers(problem: DiagnosisProblem) -> Callable[[np.ndarray], dict[tuple[str
         inertia = np.diag(problem.mass(theta))
         level = at_rest(problem.model, effects, identity)
         found = {("inertia", a): inertia[i] / inertia[i // 3 * 3] for i, a in enumerate(AXES)}
-        for name in ("quadratic_drag", "linear_drag"):
+        for name in (QuadraticDrag.name, LinearDrag.name):
             for i, axis in enumerate(AXES):
                 change = theta[problem.library.index(name, axis, "change")]
                 value = problem.believes(name, axis) + change
@@ -134,7 +136,7 @@ def _numbers(problem: DiagnosisProblem) -> Callable[[np.ndarray], dict[tuple[str
             tilted = se3.retract(identity, jnp.zeros(6).at[i].set(_TILT))
             less = level[i] - at_rest(problem.model, effects, tilted)[i]
             found["restoring", axis] = float(less / _TILT / inertia[i])
-        found["net_buoyancy", "heave"] = float(level[2] / inertia[2])
+        found[NetBuoyancy.name, "heave"] = float(level[2] / inertia[2])
         return found
 
     return numbers

@@ -10,6 +10,10 @@ from jaxtyping import Float
 
 from ....models.effects.base import Effect
 from ....models.effects.library import kind
+from ....models.effects.noise import DisturbanceColour, DisturbanceImpacts
+from ....models.effects.thrust import ThrustScale
+from ....models.effects.unknown import Unknown
+from ....models.effects.water import CurrentVarying
 from ....models.se3 import AXES, CHANNELS
 from ..data.repeats import repeating
 from ..disturbance.laws import Law, estimated, run_constants
@@ -155,12 +159,12 @@ def left_over(
 
 
 def _is_random(name: str) -> bool:
-    return name in ("waves", "current_varying") or kind(name).family == "disturbance"
+    return kind(name).random
 
 
 def thrust_by_run(problem: DiagnosisProblem, evaluation: Evaluation) -> tuple[float, float]:
     """Held-out nats that a thrust scale by run wins, and the scales' standard deviation."""
-    evidence, at = evaluation.plain, problem.library.at("thrust_scale", "all")
+    evidence, at = evaluation.plain, problem.library.at(ThrustScale.name, "all")
     if not set(at) <= set(evidence.design.owner.tolist()) or len(evidence.runs) < 3:
         return 0.0, 0.0
     columns, size = [evidence.column(i) for i in at], np.array([_SCALE])
@@ -176,7 +180,7 @@ def following(
     A filter's estimates have autocorrelated errors of position too.
     """
     lasting = ("disturbance", "environment")
-    if any(kind(c.name).family in lasting for c in causes if c.name != "unknown"):
+    if any(kind(c.name).family in lasting for c in causes if c.name != Unknown.name):
         return []
     alike = {name: residual[name].autocorrelation for name in CHANNELS}
     of = [name for name in CHANNELS[6:] if alike[name] > _FOLLOWING]
@@ -239,10 +243,10 @@ def _law_values(
 
     def physical(x: np.ndarray) -> np.ndarray:
         v = np.exp(x)
-        if law.name == "disturbance_impacts":
+        if law.name == DisturbanceImpacts.name:
             share, size, rest = v[:3]
             return np.array([np.sqrt(max(size**2 - rest**2, 1e-12)) / once, share / data.dt])
-        if law.name == "disturbance_colour":
+        if law.name == DisturbanceColour.name:
             tau, kappa = v[0], min(v[1], 0.99)
             rho = np.exp(-data.dt / tau)
             square = (kappa / (1 - kappa) - rho**2 * kappa) / (1 - rho**2)
@@ -257,7 +261,7 @@ def _law_values(
     for name, value, s in zip(units, values, spread, strict=False):
         low, high = value * np.exp(-1.96 * s), value * np.exp(1.96 * s)
         found[name] = result.Value(float(value), units[name], (float(low), float(high)))
-    if law.name == "current_varying":
+    if law.name == CurrentVarying.name:
         least = float(data.weight.sum(axis=0).mean() * data.dt)  # constant over a run
         found["time_constant"] = result.Value(least, "s", (_NAN, _NAN))
     return found
@@ -284,7 +288,7 @@ def _unit_responses(
 
 def verdict(causes: Sequence[result.Cause], left: Sequence[str] = ()) -> result.Verdict:
     """The verdict on causes and on the residuals that they leave (`left_over`)."""
-    unknown = [c.name == "unknown" for c in causes]
+    unknown = [c.name == Unknown.name for c in causes]
     if not causes:
         return "unexplained" if left else "adequate"
     if not any(unknown):
@@ -307,7 +311,7 @@ def sentence(
         return first + "With its coefficients refitted, your model is adequate at this noise."
     if not causes:
         return first + "Your model is adequate at this noise."
-    named = ", ".join(f"{c.name} ({c.where})" for c in causes if c.name != "unknown")
+    named = ", ".join(f"{c.name} ({c.where})" for c in causes if c.name != Unknown.name)
     subject = "your model, its coefficients refitted," if refitted else "your model"
     text = f"The data differ from {subject} by: {named}." if named else ""
     for c in causes:

@@ -14,32 +14,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from ....models.effects.library import COEFFICIENTS
-from ....models.se3 import AXES
+from ....models.effects.library import COEFFICIENTS, Entry, kind
+from ....models.effects.traits import Group
 from ..filter.gram import least_within
 from ..filter.noise import Filter
 from ..filter.problem import DiagnosisProblem, Evaluation
 from .hypotheses import known_within
 
-WRENCH = ("axis_thrust", "thrust_lever", "centre_of_buoyancy")
-CURVE = ("thrust_table", "voltage_exponent")
-PULSES = ("thrust_offset",)
-OF_ALL = {
-    "thrust_curve": ("exponent", 0.3),
-    "thrust_asymmetry": ("reverse_gain", 0.5),
-    "thruster_dead_zone": ("width", 3.0),
-}
-"""Parameters of effects common to all thrusters, and their prior standard deviations."""
 _ROUNDS, _TRIES = 40, 8
 _ENOUGH = 1.0
 """Gain of a round (nats) below which the fit ends."""
-_START = 0.3
-"""Dead zone and offset (N) to start from: at zero their responses are one-sided."""
 _COMMON = 13
 """Prior weight (samples) of the pooled covariance in a piece's own: enough for an inverse."""
-_DRAG, _BUOYANCY, _DELAY = 3.0, 20.0, 0.01
-"""Prior standard deviations of drag (in multiples of itself), net buoyancy (N) and the commands'
-delay (s)."""
 
 
 @dataclass(frozen=True)
@@ -52,42 +38,36 @@ class Coefficient:
     high: float
 
 
-def with_coefficients(problem: DiagnosisProblem) -> DiagnosisProblem:
-    """The problem with the effects that only this fit has, and physical bounds."""
-    level, of_pulses = problem.data.command != "F_Bo_B", problem.data.command == "pwm"
-    for name, kind in COEFFICIENTS.items():
-        if (name in CURVE and not level) or (name in PULSES and not of_pulses):
-            continue
-        if name == "voltage_exponent" and not problem.data.has_voltage:
-            continue
-        problem = problem.with_effect(kind.neutral())
+def is_coefficient(entry: Entry, group: Group) -> bool:
+    """Whether a parameter belongs to a group: of effects with a place `all`, only there."""
+    cls = kind(entry.cause)
+    return group in cls.refits and (entry.where == "all" or "all" not in cls.places)
+
+
+def with_coefficients(problem: DiagnosisProblem, group: Group) -> DiagnosisProblem:
+    """The problem with the effects that only such a fit has and, for `all`, physical bounds."""
+    for cls in COEFFICIENTS.values():
+        there = cls.needs | cls.refit_needs <= problem.data.offers
+        if group in cls.refits and there and not problem.library.has(cls.name):
+            problem = problem.with_effect(cls.neutral())
+    if group != "all":
+        return problem
     return problem.within({c.row: (c.low, c.high) for c in coefficients(problem)})
 
 
 def coefficients(problem: DiagnosisProblem) -> list[Coefficient]:
     """All coefficients that are fitted."""
-    library, found = problem.library, []
-    level, of_pulses = problem.data.command != "F_Bo_B", problem.data.command == "pwm"
-    rigid = np.diag(np.asarray(problem.model.rigid_inertia))
-    for i, (cause, where, p) in enumerate(library.entries):
-        old, start = problem.believes(cause, where), problem.believed[i]
-        spread, low, high = p.spread, p.low, p.high
-        if cause in ("linear_drag", "quadratic_drag"):
-            both = [problem.believes(name, where) for name in ("linear_drag", "quadratic_drag")]
-            spread, low = _DRAG * max(*both, 1e-3), -old
-        elif cause == "added_mass":
-            spread, low = max(old, 0.1 * float(rigid[AXES.index(where)])), -old
-        elif (cause, where) == ("net_buoyancy", "all"):
-            spread = _BUOYANCY
-        elif (cause, where) == ("actuation_delay", "all") and level:
-            spread = _DELAY
-        elif cause in OF_ALL and level and where == "all" and p.name == OF_ALL[cause][0]:
-            if cause == "thruster_dead_zone" and of_pulses:
-                continue  # the offset of pulses replaces it
-            spread = OF_ALL[cause][1]
-        elif cause not in (*WRENCH, *CURVE, *PULSES):
+    library, found, base = problem.library, [], problem.model.base
+    replaced = {name for effect in library.effects for name in effect.replaces}
+    for i, entry in enumerate(library.entries):
+        cls, p = kind(entry.cause), entry.parameter
+        prior = cls.refit_prior(base, entry.where) or (p.refit or p.spread, p.low)
+        if not is_coefficient(entry, "all") or entry.cause in replaced or not prior[0]:
             continue
-        found.append(Coefficient(i, spread, start + min(low, 0.0), start + high))
+        if cls.refit_needs <= problem.data.offers:
+            start = problem.believed[i]
+            low, high = start + min(prior[1], 0.0), start + p.high
+            found.append(Coefficient(i, prior[0], low, high))
     return found
 
 
@@ -115,8 +95,7 @@ def identify(
     if start is None:
         theta = problem.believed.copy()
         for c in chosen:
-            if problem.library.entries[c.row].cause in ("thruster_dead_zone", "thrust_offset"):
-                theta[c.row] += _START
+            theta[c.row] += problem.library.entries[c.row].parameter.start
     else:
         theta = start.copy()
         theta[rows] = np.clip(theta[rows], low, high)

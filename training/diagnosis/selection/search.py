@@ -3,13 +3,16 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from ....models.effects.library import kind
+from ....models.effects.traits import Group
+from ....models.effects.unknown import Unknown
 from ....models.se3 import AXES
-from ..disturbance.found import SLOW, laws_of, won_by
+from ..disturbance.found import laws_of, won_by
 from ..disturbance.waves import correlated_noise_of
 from ..filter.noise import Filter
 from ..filter.problem import DiagnosisProblem, Evaluation
@@ -26,16 +29,8 @@ from .model_selection import (
     p_value,
     parameters_of,
 )
-from .refit_all import coefficients
+from .refit_all import coefficients, is_coefficient
 
-BELIEFS = ("added_mass", "linear_drag", "quadratic_drag", "net_buoyancy")
-"""Coefficients that a user would expect fitted."""
-UNSCALED = ("axis_thrust", "linear_drag", "quadratic_drag", "net_buoyancy")
-"""Coefficients to fit where commands have an unknown scale; the inertia stays as believed."""
-REFITS = {"none": (), "scales": ("thrust_scale",), "linear": BELIEFS, "command": UNSCALED}
-_HANGING = ("net_buoyancy", "centre_of_gravity")
-"""Causes that are identifiable without commands."""
-_TIMES = ("thruster_lag", "actuation_delay", "clock_offset")
 _CLOSE = 0.7
 _TAKEN_BACK = 2
 _OF_A_LAW = 0.02
@@ -85,23 +80,24 @@ class Found:
     @property
     def left_undescribed(self) -> float:
         """Nats that accepted unmodelled structure may leave unexplained."""
-        described = (c.fit.heldout_gain for c in self.accepted if c.hypothesis[0] == "unknown")
+        described = (c.fit.heldout_gain for c in self.accepted if c.hypothesis[0] == Unknown.name)
         return _OF_A_DESCRIPTION * sum(described)
 
 
-def refitted(problem: DiagnosisProblem, refit: str) -> list[int]:
+def refitted(problem: DiagnosisProblem, refit: Group | Literal["none", "auto"]) -> list[int]:
     """Nuisance parameters: free in the fit of every cause."""
     if refit == "all":
         return [c.row for c in coefficients(problem)]
-    entries = enumerate(problem.library.entries)
-    return [i for i, e in entries if e.cause in REFITS[refit] and e.where != "centre_of_buoyancy"]
+    if refit in ("none", "auto"):
+        return []
+    return [i for i, e in enumerate(problem.library.entries) if is_coefficient(e, refit)]
 
 
 def _asks_for_commands(named: Hypothesis, quiet: Sequence[str]) -> bool:
     """Whether a cause is not identifiable because its axis, or no axis at all, was driven."""
     name, where = named
     if len(quiet) == len(AXES):
-        return kind(name).family in ("actuation", "body") and name not in _HANGING
+        return kind(name).family in ("actuation", "body") and not kind(name).at_rest
     return where in quiet and kind(name).family == "body"
 
 
@@ -183,7 +179,7 @@ class Search:
         laws = laws_of(self.problem, found.current)
         if choice is None or not laws:
             return choice, fits
-        lasting = max(won_by(name, laws) for name in SLOW)
+        lasting = max((won_by(law.name, laws) for law in laws if kind(law.name).slow), default=0.0)
         law = max(lasting, laws[0].heldout_gain)
         if law < choice.fit.heldout_gain:
             return choice, fits
@@ -250,7 +246,7 @@ class Search:
         found.chance = current.evidence.chance(sets, free, self.rng)
         found.threshold = found.chance.exceeded(self.alpha)
         fits = {h: current.evidence.fit(s, free) for h, s in zip(open_names, sets, strict=True)}
-        for h in [h for h in open_names if h[0] in _TIMES]:
+        for h in [h for h in open_names if kind(h[0]).timing]:
             times = current.theta[list(fits[h].parameters)] + fits[h].values
             if np.all(np.abs(times) < self.shortest):
                 del fits[h]

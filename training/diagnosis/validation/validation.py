@@ -19,6 +19,7 @@ from ....models.effects.base import Effect
 from ....models.effects.deterministic_step import advance
 from ....models.effects.extended import FOR_EVER, Extended
 from ....models.effects.inertia import times
+from ....models.effects.noise import DisturbanceImpacts, DisturbanceStateDependence
 from ....models.effects.recent import Recent
 from ....models.se3 import AXES
 from ...evaluation.metrics import BANDS, order_statistics
@@ -157,10 +158,10 @@ def white_part(laws: Sequence[Law], problem: DiagnosisProblem) -> Float[np.ndarr
     speed2 = (data.V[:-1, :3] ** 2).sum(axis=1)
     for law in laws:
         p = law.parameters
-        if law.name == "disturbance_impacts":
+        if law.name == DisturbanceImpacts.name:
             square = (1 - p["share"]) * p["rest"] ** 2 + p["share"] * p["size"] ** 2
             share[AXES.index(law.where)] = p["rest"] / np.sqrt(square)
-        elif law.name == "disturbance_state_dependence":
+        elif law.name == DisturbanceStateDependence.name:
             grown = ((1 + p["growth"] * speed2) * data.weight).sum() / data.weight.sum()
             share[AXES.index(law.where)] = 1 / np.sqrt(grown)
     return share

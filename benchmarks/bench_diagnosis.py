@@ -20,7 +20,8 @@ from spinndrift.models.recordings.store import Recording
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.diagnosis.filter.innovations import predict
 from spinndrift.training.diagnosis.pipeline import Diagnoser
-from spinndrift.training.diagnosis.selection.search import Found, Search
+from spinndrift.training.diagnosis.selection.search import Search
+from spinndrift.training.diagnosis.selection.state import Selection
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 DIFFUSION = np.array([1.0, 1.0, 1.0, 0.03, 0.03, 0.03])
@@ -51,13 +52,11 @@ def test_predictions_of_all_samples(benchmark, recording):
 def test_all_single_causes(benchmark, recording):
     """One look at the data and the fit of every cause alone, single thrusters too."""
     problem = diagnoser(recording).problem
-    rng = np.random.default_rng(0)
     choices = []
 
     def single():
         first = problem.evaluate(problem.believed)
-        search = Search(problem, [], 0.01, 6, rng, lambda fraction, remark: None)
-        choices.append(search.next(Found(first, first, first))[0])
+        choices.append(Search().propose(Selection.start(problem, first)).proposed[0])
 
     benchmark.pedantic(single, rounds=3, warmup_rounds=1)
     assert choices[-1].hypothesis == ("thruster_lag", "all")

@@ -59,7 +59,8 @@ from spinndrift.training.diagnosis.pipeline import (
 )
 from spinndrift.training.diagnosis.selection.hypotheses import Fit
 from spinndrift.training.diagnosis.selection.model_selection import admissible, choose, is_itself
-from spinndrift.training.diagnosis.selection.search import Found, Search
+from spinndrift.training.diagnosis.selection.search import Search
+from spinndrift.training.diagnosis.selection.state import Selection
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(runs=2, seconds=6.0)
@@ -643,7 +644,8 @@ def test_commands_that_never_change_name_nothing_that_follows_them(tmp_path):
     diagnoser = Diagnoser(recording, VEHICLE)
     assert diagnoser.faults[0].startswith("thruster_force never changes")
     assert diagnoser.quiet == list(AXES)
-    names = {name for name, _ in diagnoser._names(diagnoser.problem, [], 0.0, 1.0).names}
+    search = diagnoser._selector(diagnoser.problem, [])
+    names = {name for name, _ in search.names(diagnoser.problem)}
     assert not names & {"thruster_lag", "quadratic_drag", "proximity", "payload"}
     assert names >= {"net_buoyancy", "current_steady", "dvl_scale"}
 
@@ -667,8 +669,8 @@ def test_times_below_those_of_sparse_commands_are_no_cause(tmp_path):
     for given, named in ((recording, True), (sparse, False)):
         diagnoser = Diagnoser(given, VEHICLE)
         evaluation = diagnoser.problem.evaluate(diagnoser.problem.believed)
-        search = diagnoser._names(diagnoser.problem, [], 0.0, 1.0)
-        choice = search.next(Found(evaluation, evaluation, evaluation))[0]
+        start = Selection.start(diagnoser.problem, evaluation)
+        choice, _ = diagnoser._selector(diagnoser.problem, []).propose(start).proposed
         assert (choice is not None and choice.hypothesis[0] == "clock_offset") == named
     assert "logged at 10 Hz" in limits(diagnoser.problem.data, [], False, command_period=0.1)[-1]
     assert limits(
@@ -688,9 +690,7 @@ def test_a_name_nested_in_another_keeps_the_data(tmp_path):
     _, recording = recorded(tmp_path, 12, names=("net_buoyancy",))
     problem = Diagnoser(recording, VEHICLE).problem
     evaluation = problem.evaluate(problem.believed)
-    found = Found(evaluation, evaluation, evaluation)
-    search = Search(problem, [], 0.01, 1, np.random.default_rng(0), lambda fraction, remark: None)
-    search.run(found)
+    found = Search(most=1).run(Selection.start(problem, evaluation))
     assert found.hypotheses == [("net_buoyancy", "all")]
     fits, won = found.fits, found.accepted[0].fit.heldout_gain
     tether = fits["tether", "W"]
@@ -709,8 +709,8 @@ def test_simulated_states_without_noise_are_no_clock_that_is_off():
     )
     diagnoser = Diagnoser(generate(config, VEHICLE), VEHICLE)
     evaluation = diagnoser.problem.evaluate(diagnoser.problem.believed)
-    search = diagnoser._names(diagnoser.problem, [], 0.0, 1.0)
-    assert search.next(Found(evaluation, evaluation, evaluation))[0] is None
+    start = Selection.start(diagnoser.problem, evaluation)
+    assert diagnoser._selector(diagnoser.problem, []).propose(start).proposed[0] is None
 
 
 def test_bands_hold_what_a_law_of_the_disturbance_adds(tmp_path):

@@ -32,7 +32,8 @@ from spinndrift.training.diagnosis.filter.noise import estimate, score_of
 from spinndrift.training.diagnosis.filter.transition import Transition
 from spinndrift.training.diagnosis.pipeline import Diagnoser
 from spinndrift.training.diagnosis.selection.correlated_noise import CorrelatedNoise
-from spinndrift.training.diagnosis.selection.search import Found, Search
+from spinndrift.training.diagnosis.selection.search import Search
+from spinndrift.training.diagnosis.selection.state import Selection
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 LEVELS = np.array([1.0] * 3 + [0.03] * 3)
@@ -96,10 +97,9 @@ def test_no_name_imitates_a_large_random_structure(problem_of, name):
     problem, _ = problem_of(name, 3.0)
     evaluation = problem.evaluate(problem.believed)
     assert laws_of(problem, evaluation)[0].heldout_gain > 1000
-    search = Search(problem, [], 0.01, 6, np.random.default_rng(0), lambda fraction, remark: None)
-    found = Found(evaluation, evaluation, evaluation)
-    best = max(f.heldout_gain for f in search._chosen(found)[1].values())
-    choice, fits = search.next(found)
+    search, start = Search(), Selection.start(problem, evaluation)
+    best = max(f.heldout_gain for f in search._chosen(start)[2].values())
+    choice, fits = search.propose(start).proposed
     assert best > 100
     assert choice is None
     assert max(f.heldout_gain for f in fits.values()) < 0.3 * best
@@ -111,12 +111,11 @@ def test_a_name_that_leaves_nothing_of_a_law_is_taken(tmp_path):
     case.write(tmp_path / "data")
     problem = Diagnoser(read_csv(tmp_path / "data"), VEHICLE, VEHICLE.dynamics(LEVELS)).problem
     evaluation = problem.evaluate(problem.believed)
-    search = Search(problem, [], 0.01, 6, np.random.default_rng(0), lambda fraction, remark: None)
-    found = Found(evaluation, evaluation, evaluation)
-    best = max(f.heldout_gain for f in search._chosen(found)[1].values())
+    search, start = Search(), Selection.start(problem, evaluation)
+    best = max(f.heldout_gain for f in search._chosen(start)[2].values())
     law = laws_of(problem, evaluation)[0].heldout_gain
     assert law > best
-    choice, _ = search.next(found)
+    choice, _ = search.propose(start).proposed
     assert choice is not None
     assert choice.hypothesis == ("tether", "W")
     assert choice.fit.heldout_gain > law
@@ -128,11 +127,10 @@ def test_what_a_name_wins_exactly_is_likelihood(tmp_path):
     case.write(tmp_path / "data")
     problem = Diagnoser(read_csv(tmp_path / "data"), VEHICLE, VEHICLE.dynamics(LEVELS)).problem
     evaluation = problem.evaluate(problem.believed)
-    search = Search(problem, [], 0.01, 6, np.random.default_rng(0), lambda fraction, remark: None)
-    found, h = Found(evaluation, evaluation, evaluation), ("thruster_lag", "all")
-    fit = search._chosen(found)[1][h]
-    theta, seen, _ = search._fitted(h, {h: fit}, found, None)
-    exact = search._exact(fit, theta, seen, found)
+    search, start, h = Search(), Selection.start(problem, evaluation), ("thruster_lag", "all")
+    fit = search._chosen(start)[2][h]
+    theta, seen, _ = search._fitted(start, h, {h: fit}, None)
+    exact = search._exact(start, fit, theta, seen)
     data, scores = problem.data, []
     for one in (evaluation, seen):
         error, jacobian = (np.asarray(a) for a in (one.predictions.error, one.predictions.jacobian))
@@ -275,8 +273,7 @@ def test_a_name_that_halves_the_errors_is_told_of_states_without_noise(problem_o
     problem, hidden = problem_of("current_steady", 1.0, noise=Noise.none())
     evaluation = problem.evaluate(problem.believed)
     assert evaluation.noise.estimated
-    search = Search(problem, [], 0.01, 6, np.random.default_rng(0), lambda done, remark: None)
-    choice, _ = search.next(Found(evaluation, evaluation, evaluation))
+    choice, _ = Search().propose(Selection.start(problem, evaluation)).proposed
     assert choice is not None
     assert choice.hypothesis == ("current_steady", "W")
     theta = problem.polish(problem.believed, problem.library.at(*choice.hypothesis))[0]

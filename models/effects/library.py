@@ -28,7 +28,7 @@ from .noise import (
 )
 from .proximity import Proximity
 from .supply import LoadDroop, VoltageExponent, VoltageSag
-from .tether import Tether
+from .tether import TetherEffect
 from .thrust import (
     AxisThrust,
     ThrustAsymmetry,
@@ -69,7 +69,7 @@ _EVERY: tuple[type[Effect], ...] = (
     CurrentSteady,
     CurrentVarying,
     Waves,
-    Tether,
+    TetherEffect,
     DisturbanceLevel,
     DisturbanceColour,
     DisturbanceImpacts,

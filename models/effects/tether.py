@@ -9,7 +9,7 @@ from .. import se3
 from .base import Effect, Parameter, Plant
 
 
-class Tether(Effect):
+class TetherEffect(Effect):
     """F = -k (p_T - p_A): a spring from the attachment T on the vehicle to an anchor A in W.
 
     Written as F_0 - k p_T in W; the anchor is p_A = F_0 / k. A force that does not grow with

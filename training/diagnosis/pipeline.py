@@ -1,9 +1,7 @@
 """From a recording and a believed model to named causes."""
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,14 +13,13 @@ from ...models.dynamics import Dynamics
 from ...models.effects.base import Effect
 from ...models.effects.extended import Extended
 from ...models.effects.library import Library
-from ...models.effects.unknown import Unknown
 from ...models.recordings.store import Recording
 from ...models.se3 import AXES
 from ...models.vehicles.vehicle import Vehicle
-from .candidates.unknowns import add_structure, find_structure, structure
+from .causes import LAW_MARGIN, Progress, find_causes
 from .data.arrays import Data
 from .data.checks import SPARSE, limits, problems, require_enough, unexcited
-from .disturbance.found import OF_OTHERS, all_laws, best_law, passing, reported_laws
+from .disturbance.found import OF_OTHERS, all_laws, passing, reported_laws
 from .disturbance.laws import Law
 from .disturbance.levels import LEVEL
 from .filter.problem import DiagnosisProblem, Evaluation
@@ -30,22 +27,16 @@ from .findings import reported, result
 from .findings.experiments import experiments
 from .findings.ratios import ratios
 from .selection.hypotheses import Fit
-from .selection.model_selection import Hypothesis, parameters_of
+from .selection.model_selection import parameters_of
 from .selection.refit_all import identify, with_coefficients
-from .selection.search import Found, Search, refitted
+from .selection.search import Refit, Search, refitted
+from .selection.state import Fits, Selection
 from .validation.blackbox import train
 from .validation.validation import Contender, Simulated, judge, model_gain, white_part
 
-Progress = Callable[[float, str], None]
-Refit = Literal["auto", "none", "scales", "linear", "command", "all"]
 _CLEARLY, _MANY = 0.05, 3
 """Held-out nats a sample by which refitted coefficients must beat all causes together before most
 of them count as wrong, and number of causes above which they may be."""
-_MOST_UNKNOWN, _NAMES_FIRST = 2, 2
-"""Most unmodelled structures, and number of causes after which the first is sought where more
-causes pass: unmodelled structure can mimic several named causes."""
-_RIVALS = 0.25
-"""Share of the best law's gain below which unmodelled structure is sought before causes."""
 _RESAMPLED, _OF_A_STEP, _NO_TIME = 0.02, 0.1, 0.06
 """In resampled data: nats a sample that a law must win, and least lag or delay (share of a step).
 In any data, delays below 6 % of a step are rejected: integration error looks like one. With ten
@@ -54,8 +45,6 @@ _OF_A_COMMAND = 0.1
 """Least lag or delay, as a share of the period of sparse commands: interpolation looks like one."""
 _FINEST = 0.02
 """Shortest step (s) that the extended model supports: it sets the length of delay buffers."""
-_LAW_MARGIN = 5.0
-"""Extra nats that a law must win: margin for the grid search's multiple comparisons."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +93,7 @@ class Finding:
     data: Data
     base: Evaluation
     final: Evaluation
-    fits: dict[Hypothesis, Fit]
+    fits: Fits
     laws: list[Law]
     simulated: dict[str, Simulated]
 
@@ -139,7 +128,6 @@ class Diagnoser:
                 f"{recording.commands[0]} never changes: what follows the commands can't be told; "
                 "check that the outputs of the runs were logged"
             )
-        self.rng = np.random.default_rng(self.config.seed)
 
     def progress(self, fraction: float, remark: str) -> None:
         """Report progress, which never decreases."""
@@ -157,8 +145,11 @@ class Diagnoser:
         nuisance = refitted(problem, config.refit)
         if nuisance:
             first = self._refitted(problem)
-        found = Found(base, first, first)
-        problem, nuisance, structures = self._search(problem, nuisance, found)
+        start = Selection.start(problem, base, first, config.seed)
+        found, nuisance, structures = find_causes(
+            start, nuisance, config.refit, self._selector, self.progress
+        )
+        problem = found.problem
         self.progress(0.72, "all causes together")
         rows = reported.joint_rows(found, nuisance, problem)
         final = fitted = found.current
@@ -167,18 +158,11 @@ class Diagnoser:
             theta, fitted, joint = self._together(problem, found, rows)
             final = problem.evaluate(theta)
         self.progress(0.78, "laws of the disturbance")
-        least = found.threshold + _LAW_MARGIN
-        if self.resampled:  # interpolation makes the noise uneven
-            least += _RESAMPLED * problem.data.steps
-        # the residual of imperfectly fitted causes is no law
-        least = max(least, OF_OTHERS * sum(choice.fit.heldout_gain for choice in found.accepted))
-        least = max(least, found.left_undescribed)
+        least = self._least_gain(found)
         laws = [] if final.noise.estimated else all_laws(problem, final, least)
         groups = reported_laws(laws, problem, final, least)
         shaped = [law for group in groups for law in group if law.name != LEVEL]
-        passed = passing(laws, problem, least)
-        tested = len(found.fits) + len(laws)
-        causes, random_effects = [], []
+        causes: list[result.Cause] = []
         if joint is not None:
             self.progress(0.8, "what to do next")
             following = experiments(problem, final, found.accepted, nuisance)
@@ -188,13 +172,17 @@ class Diagnoser:
                 )
                 for a in found.accepted
             ]
-        for group in groups:
-            rivals = [law for law in passed if law.name != group[0].name]
-            law_cause, effect = reported.law_cause(group, rivals, problem, final)
-            causes.append(law_cause)
-            random_effects.append(effect)
+        passed = passing(laws, problem, least)
+        made = [
+            reported.law_cause(
+                group, [law for law in passed if law.name != group[0].name], problem, final
+            )
+            for group in groups
+        ]
+        causes += [cause for cause, _ in made]
+        random_effects = tuple(effect for _, effect in made)
         gain, simulated = self._validate(
-            problem, found, fitted, rows, shaped, tuple(random_effects), bool(causes)
+            problem, found, fitted, rows, shaped, random_effects, bool(causes)
         )
         residual = reported.residual(problem, final)
         left = reported.left_over(residual, causes, problem, final, least)
@@ -211,32 +199,40 @@ class Diagnoser:
             residual=residual,
             gain=gain,
             left_out=d.left_out if len(np.unique(d.fold)) > 1 else "nothing",
-            data=result.DataSummary(
-                scenarios=list(d.names),
-                runs=len(np.unique(d.run)),
-                seconds=d.steps * d.dt,
-                step=d.dt,
-                command=d.command,
-                problems=self.faults,
-                limits=limits(
-                    d, self.quiet, self.resampled, final.noise.estimated, self.command_period
-                ),
-                noise=reported.noise_levels(problem, final),
-            ),
-            tested=tested,
+            data=self._summary(problem, final),
+            tested=len(found.fits) + len(laws),
             threshold=found.threshold,
             alpha=config.alpha,
             seconds=time.monotonic() - started,
         )
-        extended = Extended.create(
-            problem.model.base,
-            (*problem.library.used(final.theta), *random_effects),
-            problem.vehicle.thrusters(),
-        ).for_steps_of(_FINEST)
+        effects = *problem.library.used(final.theta), *random_effects
+        extended = Extended.create(problem.model.base, effects, problem.vehicle.thrusters())
         return Finding(
-            diagnosis, extended, problem.library, final.theta, d, base, final, found.fits, laws,
-            simulated,
+            diagnosis, extended.for_steps_of(_FINEST), problem.library, final.theta, d, base, final,
+            found.fits, laws, simulated,
         )  # fmt: skip
+
+    def _least_gain(self, found: Selection) -> float:
+        """Nats that a law must win."""
+        least = found.threshold + LAW_MARGIN
+        if self.resampled:  # interpolation makes the noise uneven
+            least += _RESAMPLED * found.problem.data.steps
+        # the residual of imperfectly fitted causes is no law
+        least = max(least, OF_OTHERS * sum(choice.fit.heldout_gain for choice in found.accepted))
+        return max(least, found.left_undescribed)
+
+    def _summary(self, problem: DiagnosisProblem, final: Evaluation) -> result.DataSummary:
+        d, estimated = problem.data, final.noise.estimated
+        return result.DataSummary(
+            scenarios=list(d.names),
+            runs=len(np.unique(d.run)),
+            seconds=d.steps * d.dt,
+            step=d.dt,
+            command=d.command,
+            problems=self.faults,
+            limits=limits(d, self.quiet, self.resampled, estimated, self.command_period),
+            noise=reported.noise_levels(problem, final),
+        )
 
     def _believed(self, problem: DiagnosisProblem) -> Evaluation:
         try:
@@ -259,7 +255,7 @@ class Diagnoser:
         return problem.evaluate(problem.polish(problem.believed, rows)[0])
 
     def _together(
-        self, problem: DiagnosisProblem, found: Found, rows: list[int]
+        self, problem: DiagnosisProblem, found: Selection, rows: list[int]
     ) -> tuple[np.ndarray, Evaluation, Fit]:
         """Joint fit of all causes and nuisance parameters."""
         if self.config.refit != "all":
@@ -269,64 +265,16 @@ class Diagnoser:
         fitted = problem.evaluate(theta, rows)
         return theta, fitted, fitted.evidence.fit(rows)
 
-    def _within(self, low: float, high: float) -> Progress:
-        return lambda fraction, remark: self.progress(low + (high - low) * fraction, remark)
-
-    def _names(
-        self, problem: DiagnosisProblem, nuisance: list[int], low: float, high: float
-    ) -> Search:
-        config, within = self.config, self._within(low, high)
+    def _selector(self, problem: DiagnosisProblem, nuisance: list[int]) -> Search:
         shortest = (_OF_A_STEP if self.resampled else _NO_TIME) * problem.data.dt
         if self.command_period > SPARSE * problem.data.dt:
             shortest = max(shortest, _OF_A_COMMAND * self.command_period)
-        return Search(
-            problem, nuisance, config.alpha, config.most, self.rng, within, self.quiet, shortest
-        )
-
-    def _search(
-        self, problem: DiagnosisProblem, nuisance: list[int], found: Found
-    ) -> tuple[DiagnosisProblem, list[int], dict[Hypothesis, result.Structure]]:
-        """Causes, unmodelled structure (a new effect in the library), and further causes.
-
-        Where a disturbance law wins far more than any cause, structure is sought first; where more
-        than two causes are needed, it is sought before the third.
-        """
-        config, structures = self.config, {}
-        search = self._names(problem, nuisance, 0.1, 0.5)
-        choice, found.left = search.next(found)
-        found.fits = found.left
-        best = 0.0 if choice is None else choice.fit.heldout_gain
-        law = best_law(problem, found.first)
-        seen = None
-        if _RIVALS * law < max(best, found.threshold + _LAW_MARGIN):
-            problem = search.run(found, _NAMES_FIRST).problem
-            if len(found.accepted) == _NAMES_FIRST and search.next(found)[0] is not None:
-                found.left = search.next(found)[1]
-                seen = find_structure(problem, nuisance, found, config.alpha, self.rng, self.quiet)
-            if found.accepted or seen is None:  # else structure replaces the causes
-                seen = None
-                problem = search.run(found).problem
-        for number in range(_MOST_UNKNOWN):
-            self.progress(0.52 + 0.1 * number, "structure without a name")
-            if seen is None:
-                seen = find_structure(problem, nuisance, found, config.alpha, self.rng, self.quiet)
-            taken = {e.places[0] for e in problem.library.effects if e.name == Unknown.name}
-            if seen is None or seen.matched.group.effect.acts_on in taken:
-                if number == 0 and not found.accepted:
-                    problem = search.run(found).problem
-                break
-            problem = add_structure(problem, nuisance, found, seen, self.rng)
-            nuisance = refitted(problem, config.refit)
-            where = found.hypotheses[-1][1]
-            structures[Unknown.name, where] = structure(problem, where, found.current.theta, seen)
-            again = self._names(problem, nuisance, 0.55 + 0.1 * number, 0.6 + 0.1 * number)
-            problem, seen = again.run(found).problem, None
-        return problem, nuisance, structures
+        return Search(nuisance, self.config.alpha, self.config.most, self.quiet, shortest)
 
     def _validate(
         self,
         problem: DiagnosisProblem,
-        found: Found,
+        found: Selection,
         fitted: Evaluation,
         rows: list[int],
         laws: list[Law],
@@ -365,7 +313,7 @@ class Diagnoser:
                 white_share=white,
             )
         contenders["black_box"] = Contender(
-            still, train(found.base.predictions, problem.data, self.rng)
+            still, train(found.base.predictions, problem.data, found.generator())
         )
         judged, estimated = {}, fitted.noise.estimated
         for number, (name, contender) in enumerate(contenders.items()):

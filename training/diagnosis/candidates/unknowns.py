@@ -13,7 +13,7 @@ from ..filter.sensitivities import whitened_sensitivities
 from ..findings import result
 from ..selection.hypotheses import Design, Fit
 from ..selection.model_selection import Choice, admissible, parameters_of
-from ..selection.search import Found
+from ..selection.state import Fits, Selection
 from .groups import described, groups, refined
 from .structures import Matched, Screen
 
@@ -78,7 +78,7 @@ def screened(
     return screen, best, best.gain * share
 
 
-def _best_name(problem: DiagnosisProblem, evaluation: Evaluation, fits: dict) -> float:
+def _best_name(problem: DiagnosisProblem, evaluation: Evaluation, fits: Fits) -> float:
     gains = [
         f.heldout_gain for f in fits.values() if admissible(problem.library, evaluation.theta, f)
     ]
@@ -86,85 +86,68 @@ def _best_name(problem: DiagnosisProblem, evaluation: Evaluation, fits: dict) ->
 
 
 def find_structure(
-    problem: DiagnosisProblem,
-    nuisance: list[int],
-    found: Found,
-    alpha: float,
-    rng: np.random.Generator,
-    quiet: Sequence[str] = (),
-) -> FoundStructure | None:
+    state: Selection, nuisance: Sequence[int], alpha: float, quiet: Sequence[str] = ()
+) -> tuple[Selection, FoundStructure | None]:
     """Structure in the residual of the causes; where it wins more than they do, in place of them.
 
-    In the second case `found` is reset to the model without causes. None is sought in estimated
-    states, as their estimator adds structure of its own, nor in how `quiet` axes move.
+    In the second case the selection is back at the model without causes. None is sought in
+    estimated states, as their estimator adds structure of its own, nor in how `quiet` axes move.
     """
-    if found.current.noise.estimated:
-        return None
-    rows = [*parameters_of(problem.library, found.hypotheses), *nuisance]
-    left = screened(problem, found.current, rows, alpha, rng, quiet)
+    if state.current.noise.estimated:
+        return state, None
+    problem, rng = state.problem, state.generator()
+    rows = [*parameters_of(problem.library, state.hypotheses), *nuisance]
+    left = screened(problem, state.current, rows, alpha, rng, quiet)
     if left is None:
-        return None
+        return state.drawn(rng), None
     screen, best, gain = left
-    name = _best_name(problem, found.current, found.left)
-    law = best_law(problem, found.current)
+    name = _best_name(problem, state.current, state.left)
+    law = best_law(problem, state.current)
     if gain < BEATS * name or gain < _OF_A_LAW * law:
-        return None
-    known = [h for h in found.hypotheses if h[0] != Unknown.name]
-    if known and len(known) == len(found.hypotheses):
-        at_first = screened(problem, found.first, nuisance, alpha, rng, quiet)
-        evidence = found.first.evidence
+        return state.drawn(rng), None
+    known = [h for h in state.hypotheses if h[0] != Unknown.name]
+    if known and len(known) == len(state.hypotheses):
+        at_first = screened(problem, state.first, list(nuisance), alpha, rng, quiet)
+        evidence = state.first.evidence
         owned = set(evidence.design.owner.tolist())
         own = [i for i in parameters_of(problem.library, known) if i in owned]
         together = evidence.fit(own, nuisance).heldout_gain if own else np.inf
-        alone = _best_name(problem, found.first, found.fits)
+        alone = _best_name(problem, state.first, state.fits)
         if at_first is not None and at_first[2] > max(BEATS * alone, _TOGETHER * together):
-            found.accepted, found.current = [], found.first
-            return FoundStructure(*at_first, alone)
-    return FoundStructure(screen, best, gain, name)
+            bare = state.drawn(rng).at(state.first, accepted=())
+            return bare, FoundStructure(*at_first, alone)
+    return state.drawn(rng), FoundStructure(screen, best, gain, name)
 
 
 def add_structure(
-    problem: DiagnosisProblem,
-    nuisance: list[int],
-    found: Found,
-    found_structure: FoundStructure,
-    rng: np.random.Generator,
-) -> DiagnosisProblem:
-    """Add the structure to the model, refit it with all that was accepted; the new problem."""
-    effect = refined(found_structure.screen, found_structure.matched, rng)
-    rivals = sorted(found.left.items(), key=lambda item: -item[1].heldout_gain)[:5]
+    state: Selection, nuisance: Sequence[int], structure: FoundStructure
+) -> Selection:
+    """Add the structure to the model's effects and refit it with all that was accepted."""
+    problem, rng, matched = state.problem, state.generator(), structure.matched
+    effect = refined(structure.screen, matched, rng)
+    rivals = sorted(state.left.items(), key=lambda item: -item[1].heldout_gain)[:5]
     wider = problem.with_effect(effect)
-    theta = wider.moved(found.current.theta, problem.library)
+    theta = wider.moved(state.current.theta, problem.library)
     hypothesis = (Unknown.name, effect.acts_on)
     own = wider.library.at(*hypothesis)
     free = [wider.library.index(*_key(problem.library.entries[i])) for i in nuisance]
-    rows = [*own, *parameters_of(wider.library, found.hypotheses), *free]
+    rows = [*own, *parameters_of(wider.library, state.hypotheses), *free]
     theta, _, joint = wider.polish(theta, rows, rounds=6)
-    heldout = (
-        found_structure.matched.heldout
-        * found_structure.gain
-        / max(found_structure.matched.gain, 1e-300)
-    )
-    p = found_structure.matched.p_value
-    fit = Fit(
-        tuple(own), theta[own], {}, joint.errors[: len(own)], found_structure.gain, heldout, p
-    )
+    heldout = matched.heldout * structure.gain / max(matched.gain, 1e-300)
+    p, errors = matched.p_value, joint.errors[: len(own)]
+    fit = Fit(tuple(own), theta[own], {}, errors, structure.gain, heldout, p)
     ranked = tuple((h, f.heldout_gain) for h, f in rivals)
-    found.accepted.append(Choice(hypothesis, fit, (), ranked, p))
-    found.current = wider.evaluate(theta)
-    return wider
+    accepted = (*state.accepted, Choice(hypothesis, fit, (), ranked, p))
+    return state.drawn(rng).at(wider.evaluate(theta), problem=wider, accepted=accepted)
 
 
-def structure(
-    problem: DiagnosisProblem, where: str, theta: np.ndarray, found_structure: FoundStructure
-) -> result.Structure:
-    """The structure that was found, in words."""
-    effect = next(
-        e for e in problem.library.effects if e.name == Unknown.name and e.places == (where,)
-    )
-    words = described(effect, theta[problem.library.at(Unknown.name, where)], problem)  # pyright: ignore[reportArgumentType]
+def described_structure(state: Selection, structure: FoundStructure) -> result.Structure:
+    """The structure added last, in words."""
+    library, (name, where) = state.problem.library, state.hypotheses[-1]
+    effect = next(e for e in library.effects if isinstance(e, Unknown) and e.places == (where,))
+    words = described(effect, state.current.theta[library.at(name, where)], state.problem)
     return result.Structure(
-        **words, heldout_gain=found_structure.gain, best_name_gain=found_structure.name_gain
+        **words, heldout_gain=structure.gain, best_name_gain=structure.name_gain
     )
 
 

@@ -20,7 +20,7 @@ from ..disturbance.laws import Law, estimated, run_constants
 from ..filter.problem import DiagnosisProblem, Evaluation
 from ..selection.hypotheses import Fit
 from ..selection.model_selection import Choice, parameters_of
-from ..selection.search import Found
+from ..selection.state import Selection
 from . import result
 from .experiments import Experiment, of_law
 
@@ -362,7 +362,7 @@ def noise_levels(problem: DiagnosisProblem, evaluation: Evaluation) -> dict[str,
     }
 
 
-def joint_rows(found: Found, nuisance: Sequence[int], problem: DiagnosisProblem) -> list[int]:
+def joint_rows(state: Selection, nuisance: Sequence[int], problem: DiagnosisProblem) -> list[int]:
     """All parameters of the final joint fit."""
-    rows = [*parameters_of(problem.library, found.hypotheses), *nuisance]
+    rows = [*parameters_of(problem.library, state.hypotheses), *nuisance]
     return list(dict.fromkeys(rows))

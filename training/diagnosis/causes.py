@@ -1,0 +1,95 @@
+"""Causes and unmodelled structure, in the order in which they are sought."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from ...models.effects.unknown import Unknown
+from .candidates.unknowns import (
+    FoundStructure,
+    add_structure,
+    described_structure,
+    find_structure,
+)
+from .disturbance.found import best_law
+from .filter.problem import DiagnosisProblem
+from .findings import result
+from .selection.model_selection import Hypothesis
+from .selection.search import Refit, Search, refitted
+from .selection.state import Selection
+
+Progress = Callable[[float, str], None]
+_MOST_UNKNOWN, _NAMES_FIRST = 2, 2
+"""Most unmodelled structures, and number of causes after which the first is sought where more
+causes pass: unmodelled structure can mimic several named causes."""
+_RIVALS = 0.25
+"""Share of the best law's gain below which unmodelled structure is sought before causes."""
+LAW_MARGIN = 5.0
+"""Extra nats that a law must win: margin for the grid search's multiple comparisons."""
+
+
+def within(progress: Progress, low: float, high: float) -> Progress:
+    """Progress of a part, from `low` to `high` of the whole."""
+    return lambda fraction, remark: progress(low + (high - low) * fraction, remark)
+
+
+def find_causes(
+    state: Selection,
+    nuisance: list[int],
+    refit: Refit,
+    search_for: Callable[[DiagnosisProblem, list[int]], Search],
+    progress: Progress,
+) -> tuple[Selection, list[int], dict[Hypothesis, result.Structure]]:
+    """Causes, unmodelled structure (a new effect in the library), and further causes.
+
+    Where a disturbance law wins far more than any cause, structure is sought first; where more
+    than two causes are needed, it is sought before the third. Also returned are the nuisance
+    parameters in the library that came about, and the structures by hypothesis.
+    """
+    structures: dict[Hypothesis, result.Structure] = {}
+    search, part = search_for(state.problem, nuisance), within(progress, 0.1, 0.5)
+    state, problem, seen = _first_causes(state, search, part)
+    for number in range(_MOST_UNKNOWN):
+        progress(0.52 + 0.1 * number, "structure without a name")
+        if seen is None:
+            state, seen = find_structure(state, nuisance, search.alpha, search.quiet)
+        taken = {e.places[0] for e in problem.library.effects if e.name == Unknown.name}
+        if seen is None or seen.matched.group.effect.acts_on in taken:
+            if number == 0 and not state.accepted:
+                state = search.run(state, progress=part)
+            break
+        state = add_structure(replace(state, problem=problem), nuisance, seen)
+        nuisance = refitted(state.problem, refit)
+        structures[state.hypotheses[-1]] = described_structure(state, seen)
+        search = search_for(state.problem, nuisance)
+        part = within(progress, 0.55 + 0.1 * number, 0.6 + 0.1 * number)
+        state, seen = search.run(state, progress=part), None
+        problem = state.problem
+    return state, nuisance, structures
+
+
+def _first_causes(
+    state: Selection, search: Search, progress: Progress
+) -> tuple[Selection, DiagnosisProblem, FoundStructure | None]:
+    """Causes before any structure, or the structure that replaces them.
+
+    The problem returned has the noise of the causes found, and not of one that was proposed only:
+    structure is added in that noise.
+    """
+    problem, state = state.problem, search.propose(state)
+    choice, fits = state.proposed
+    state = replace(state, fits=fits, left=fits)
+    best = 0.0 if choice is None else choice.fit.heldout_gain
+    if _RIVALS * best_law(problem, state.first) >= max(best, state.threshold + LAW_MARGIN):
+        return state, problem, None
+    state, seen = search.run(state, _NAMES_FIRST, progress), None
+    problem = state.problem
+    if len(state.accepted) == _NAMES_FIRST:
+        state = search.propose(state)
+        choice, fits = state.proposed
+        if choice is not None:
+            state = replace(state, left=fits)
+            state, seen = find_structure(state, search.nuisance, search.alpha, search.quiet)
+    if seen is not None and not state.accepted:
+        return state, problem, seen
+    state = search.run(state, progress=progress)
+    return state, state.problem, None

@@ -243,7 +243,7 @@ def test_a_lag_is_named_measured_and_extended(tmp_path):
     check(json.loads(d.as_json()), schema())
     assert min(d.causes[0].experiments.values()) >= 0
     html = diagnosis_page(finding, "A lag").html()
-    for title in ("Simulations beside the records", "Where the error lives", "Error or noise"):
+    for title in ("Simulations and records", "Where the error lives", "Error or noise"):
         assert title in html
     assert html.count("data:image") == 13
     # simulated windows end as far from the records as the simulated noise is wide

@@ -66,7 +66,7 @@ def test_a_chirp_tells_a_lag_from_a_delay_and_drifting_tells_nothing(lagging):
     found = experiments(problem, evaluation, [choice], [])[LAG]
     assert max(found.nats, key=lambda name: found.nats[name]) == "chirp"
     assert found.nats["drift"] == pytest.approx(0, abs=0.1)
-    assert found.text.startswith("to tell it from actuation_delay: chirp one axis")
+    assert found.text.startswith("to distinguish it from actuation_delay: chirp one axis")
     # what has the cause as a part of itself can't be told from it by any maneuver
     nothing = Choice(LAG, fit, (), ())
     alone = experiments(problem, evaluation, [nothing], [])[LAG]

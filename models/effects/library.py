@@ -107,7 +107,7 @@ def register(kind: type[Effect]) -> type[Effect]:
 
 
 def kind(name: str) -> type[Effect]:
-    """The class of a cause; `unknown` stands for structure without a name.
+    """The class of a cause; `unknown` stands for unmodelled structure.
 
     Raises:
         UserError: there is no such cause.

@@ -30,10 +30,10 @@ _UNITS = (
     "own, which hold some of its errors, a wrong belief would look like noise."
 )
 _VERDICTS = {
-    "adequate": "no difference that data tell",
-    "explained": "all that data tell has a name, or is a matter of coefficients",
-    "partly_explained": "names, and structure or errors that no name explains",
-    "unexplained": "structure or errors that no name explains",
+    "adequate": "the data show no difference",
+    "explained": "named causes or coefficients explain every difference that the data show",
+    "partly_explained": "named causes, and structure or errors that no cause explains",
+    "unexplained": "structure or errors that no cause explains",
 }
 _NOISE = {
     "position_m": "of positions / m",
@@ -53,7 +53,7 @@ _WORDS = {
     "others are asked for) and no cause named: what tuning alone wins.",
     "with the causes": "The belief with the causes in it: the extended model.",
     "black box": "The belief and a regression of its errors on random features, that names "
-    "nothing: what data tell to those who do not know the physics.",
+    "nothing: shows what could be predicted without physics.",
     "energy score": "Mean distance of simulations with noise from the record, less half their "
     "mean distance from each other, over position, rotation, velocity and turning rate with m, "
     "rad, m/s and rad/s counted alike. Smaller is better.",
@@ -108,37 +108,37 @@ def _add_causes(page: Page, d: Diagnosis) -> None:
                 for c in d.causes
             ],
             (
-                "cause", "where", "parameters (95 %)", "nats won", "p", "could as well be",
+                "cause", "where", "parameters (95 %)", "nats won", "p", "not distinguishable from",
                 "next experiment",
             ),
         )  # fmt: skip
-        page.text("What other names would have won in its place:")
+        page.text("What other causes would have won in its place:")
         page.table([(f"{c.name} ({c.where})", _rivals(c)) for c in d.causes],
                    ("cause", "rivals, with nats"))  # fmt: skip
     else:
         page.text(
-            f"None of {d.tested} names wins more than noise alone can win ({d.threshold:.1f} nats "
+            f"None of {d.tested} causes wins more than noise alone can win ({d.threshold:.1f} nats "
             f"at a false-alarm rate of {d.alpha:g})."
         )
     for c in d.causes:
         if c.structure is not None:
             s = c.structure
             page.text(
-                f"**Unknown:** {s.description} wins {s.heldout_gain:.0f} nats; the best name would "
-                f"win {s.best_name_gain:.0f} of them."
+                f"**Unmodelled structure:** {s.description} wins {s.heldout_gain:.0f} nats; the "
+                f"best cause would win {s.best_name_gain:.0f} of them."
             )
 
 
 def _add_coefficients(page: Page, d: Diagnosis) -> None:
     if d.ratios:
-        page.text("What the motion tells whatever the mass, over the inertia of the axis:")
+        page.text("Coefficients over inertia, which motion determines without the mass:")
         page.table(
             [(r.name, r.where, f"{r.believed:.4g}", _valued(r.found))
              for r in d.ratios],
             ("ratio", "where", "believed", "found (95 %)"),
         )  # fmt: skip
     if d.refitted:
-        page.text("Coefficients that were fitted before any cause was named:")
+        page.text("Coefficients that were fitted before causes were sought:")
         page.table(
             [(r.name, r.where, f"{r.believed:.4g}", _with_value(r.parameter, r.fitted))
              for r in d.refitted],
@@ -148,13 +148,13 @@ def _add_coefficients(page: Page, d: Diagnosis) -> None:
 
 def _add_experiments(page: Page, finding: Finding) -> None:
     d = finding.diagnosis
-    page.figure(names_figure(finding), "Each name alone, fitted on the other scenarios.")
+    page.figure(names_figure(finding), "Gain of each cause alone, fitted to the other scenarios.")
     following = experiments_figure(d)
     if following is not None:
         page.figure(
             following,
-            "What each maneuver of a set is expected to tell about a cause, beside its closest "
-            "rivals: simulated by the model with the causes, looked at as these data were.",
+            "Expected information of each maneuver about a cause against its closest rivals, from "
+            "simulations of the model with the causes, evaluated as these data were.",
         )
         maneuvers = dict.fromkeys(t for c in d.causes for t in c.experiments)
         page.table(
@@ -164,7 +164,7 @@ def _add_experiments(page: Page, finding: Finding) -> None:
 
 
 def _add_simulations(page: Page, finding: Finding, shared: Finding) -> None:
-    page.section("Simulations beside the records")
+    page.section("Simulations and records")
     page.figure(
         bands_figure(finding),
         "The run with the median error in the scenario that the belief forecasts worst. Bands hold "
@@ -188,7 +188,7 @@ def _add_error_maps(page: Page, shared: Finding) -> None:
     )
     page.figure(
         map_figure(shared),
-        "How much of each axis' innovations depends on each state and input, on time in the run "
+        "Share of each axis' innovations that depends on each state and input, on time in the run "
         "and on the run. Pale is noise; grey did not vary.",
     )
     page.figure(
@@ -198,7 +198,7 @@ def _add_error_maps(page: Page, shared: Finding) -> None:
     )
     page.figure(
         state_space_figure(shared),
-        "Where in state space: the axes with most structure, over what tells most of each.",
+        "Errors in state space: axes with most structure, over the inputs that explain most of it.",
     )
 
 
@@ -206,16 +206,19 @@ def _add_memory(page: Page, shared: Finding) -> None:
     page.section("Error or noise")
     page.figure(
         repeats_figure(shared),
-        "What repeats is error, what doesn't is noise. Dashed: as much as noise alone makes.",
+        "Errors that repeat are the model's; those that do not are noise. Dashed: noise alone.",
     )
-    page.figure(innovations_figure(shared), "Repeated runs average the noise, errors stay.")
+    page.figure(
+        innovations_figure(shared),
+        "The mean over repeated runs: noise averages out, errors of the model remain.",
+    )
     page.figure(
         memory_figure(shared),
-        "What innovations remember, and at which frequencies they are. Grey and dashed: noise.",
+        "Autocorrelation and spectrum of the innovations. Grey and dashed: white noise.",
     )
     page.figure(
         residual_figure(shared),
-        "What is left by channel: errors of pose (seen from the vehicle) and twist.",
+        "Residual by channel: errors of pose (in the body frame) and twist.",
     )
 
 

@@ -49,7 +49,7 @@ def find_causes(
     search, part = search_for(state.problem, nuisance), within(progress, 0.1, 0.5)
     state, problem, seen = _first_causes(state, search, part)
     for number in range(_MOST_UNKNOWN):
-        progress(0.52 + 0.1 * number, "structure without a name")
+        progress(0.52 + 0.1 * number, "unmodelled structure")
         if seen is None:
             state, seen = find_structure(state, nuisance, search.alpha, search.quiet)
         taken = {e.places[0] for e in problem.library.effects if e.name == Unknown.name}

@@ -125,8 +125,8 @@ class Diagnoser:
         self.driven = len(self.quiet) < len(AXES)
         if not self.driven:
             self.faults.append(
-                f"{recording.commands[0]} never changes: what follows the commands can't be told; "
-                "check that the outputs of the runs were logged"
+                f"{recording.commands[0]} never changes: effects of the commands are not "
+                "identifiable; check that the outputs of the runs were logged"
             )
 
     def progress(self, fraction: float, remark: str) -> None:
@@ -187,7 +187,7 @@ class Diagnoser:
         residual = reported.residual(problem, final)
         left = reported.left_over(residual, causes, problem, final, least)
         if not self.driven:
-            left.insert(0, "commands never change, so what follows them can't be told")
+            left.insert(0, "commands never change, so their effects are not identifiable")
         d = problem.data
         diagnosis = result.Diagnosis(
             version=result.VERSION,
@@ -286,7 +286,7 @@ class Diagnoser:
         `fitted` is the evaluation of the final fit, with sensitivities to the parameters of `rows`.
         """
         horizon, seed = self.config.horizon, self.config.seed
-        self.progress(0.82, "gain: the belief")
+        self.progress(0.82, "validation: the believed model")
         R = len(problem.data.fold)
         still = np.repeat(problem.believed[:, None], R, axis=1)
         contenders = {"base": Contender(still)}
@@ -317,7 +317,7 @@ class Diagnoser:
         )
         judged, estimated = {}, fitted.noise.estimated
         for number, (name, contender) in enumerate(contenders.items()):
-            self.progress(0.84 + 0.04 * number, f"gain: {name.replace('_', ' ')}")
+            self.progress(0.84 + 0.04 * number, f"validation: {name.replace('_', ' ')}")
             in_use = [] if contender.black_box is not None else [*belief, *rows]
             judged[name] = judge(problem, contender, horizon, seed, in_use, estimated)
         gain = {

@@ -239,22 +239,22 @@ def limits(
     if height > _ABOVE:
         found.append(
             f"positions lie {height:.1f} m above the surface (z is up, 0 there): what depends on "
-            "depth can't be told; if z is down in the files, give frames: NED/FRD"
+            "depth is not identifiable; if z is down in the files, give frames: NED/FRD"
         )
     if data.command == "F_Bo_B":
-        found.append("commands are wrenches: single thrusters can't be told apart")
+        found.append("commands are wrenches: single thrusters are not identifiable")
     if data.unmeasured:
         found.append(
             f"{', '.join(data.unmeasured)} of the position were not measured (dead-reckoned from "
-            "the velocities): what velocities and positions tell together can't be told: the "
-            "scale and direction of the DVL, errors of the heading"
+            "the velocities): scale and direction of the DVL and errors of the heading, which need "
+            "both, are not identifiable"
         )
     if not data.has_voltage:
-        found.append("no voltage was recorded: voltage_sag can't be told")
+        found.append("no voltage was recorded: voltage_sag is not identifiable")
     if resampled:
         found.append(
-            "time steps were uneven: effects of a tenth of a step in time, and rare blows, can't "
-            "be told from the resampling"
+            "time steps were uneven: effects of a tenth of a step in time, and rare impacts, "
+            "are not distinguishable from the resampling"
         )
     if command_period > SPARSE * data.dt:
         found.append(
@@ -265,8 +265,8 @@ def limits(
     if estimated:
         found.append(
             "the states are a filter's estimate, with slow errors of its own: laws of the "
-            "disturbance and structure without a name can't be told from them, and samples count "
-            "for fewer than there are"
+            "disturbance and unmodelled structure are not distinguishable from them, and samples "
+            "count for fewer than there are"
         )
     if data.left_out == "run":
         found.append(

@@ -169,7 +169,7 @@ def _advice(a: Hypothesis, opponents: Sequence[Hypothesis], value: Mapping[str, 
     best = max(value, key=lambda maneuver: value[maneuver])
     family = kind(a[0]).family
     names = list(dict.fromkeys(name for name, _ in opponents))
-    apart = f"to tell it from {', '.join(names)}" if names else "to measure it better"
+    apart = f"to distinguish it from {', '.join(names)}" if names else "to measure it better"
     if value[best] < _NOTHING:
         return f"{apart}: {_BY_ITSELF[family]}; no maneuver of the set does"
     return f"{apart}: {MANEUVERS[best].text} (expected: {value[best]:.0f} nats a minute)"
@@ -186,7 +186,7 @@ def of_law(
     """
     slow = [r.name for r in rivals if kind(r.name).slow]
     if kind(law.name).slow and slow:
-        return Experiment(f"to tell it from {slow[0]}: {_DEPTHS}", {})
+        return Experiment(f"to distinguish it from {slow[0]}: {_DEPTHS}", {})
     if law.name == DisturbanceStateDependence.name:
         k = law.parameters["growth"]
         value = {

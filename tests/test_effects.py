@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from spinndrift.models import se3
+from spinndrift.models import disturbances, se3
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects import KINDS, Extended, Library
 from spinndrift.models.effects.deterministic_step import advance
 from spinndrift.models.effects.drag import COUPLINGS
 from spinndrift.models.effects.following import FOLLOWERS, ramped, taken_up
+from spinndrift.models.effects.library import COEFFICIENTS
 from spinndrift.models.effects.recent import Recent
 from spinndrift.models.effects.thrust import REFERENCE
 from spinndrift.models.effects.unknown import Unknown
@@ -600,3 +601,9 @@ def test_a_late_twist_that_differs_from_the_prediction_keeps_what_drag_leaves():
     # a cubic over the step leaves |S|⁴ δ³ (h - δ) / 4! of what decays fastest, 1.5 m/s or less
     np.testing.assert_allclose(kept, now, atol=1.5 * 9**4 * 0.04**3 * 0.01 / 24)
     assert np.abs(without - now).max() > 0.03
+
+
+def test_no_effect_has_the_class_name_of_a_disturbance():
+    """Where both model one thing, the effect's class ends in `Effect`."""
+    own = {cls.__name__ for cls in (*KINDS.values(), *COEFFICIENTS.values())}
+    assert not own & set(vars(disturbances))

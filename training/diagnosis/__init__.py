@@ -13,15 +13,15 @@ The steps of a diagnosis, a folder each:
 `candidates`  unmodelled structure: groups of further regressors for the wrench
 `disturbance` laws of the residual: level, colour, heavy tails, waves, varying currents
 `selection`   fits, held-out gains and tests of sets of causes (`hypotheses`); forward selection of
-              causes (`search`) by the rules of `model_selection`; multi-step fits for states that
-              were smoothed or resampled (`multi_step_fit`); joint fit of all coefficients
-              (`refit_all`)
+              causes in pure steps (`search`, `state`) by the rules of `model_selection`; multi-step
+              fits for states that were smoothed or resampled (`multi_step_fit`); joint fit of all
+              coefficients (`refit_all`)
 `validation`  scores on held-out data: log scores, simulations, coverage of bands, and a black-box
               model to compare with (`blackbox`)
 `findings`    causes with intervals, in words; `diagnosis.json` (`result`); the next experiment
 
-`pipeline` runs all of these, from a recording and a believed model to a `result.Diagnosis`
-(`result.schema()` is its JSON Schema).
+`causes` has the order in which causes and structure are sought. `pipeline` runs all of these, from
+a recording and a believed model to a `result.Diagnosis` (`result.schema()` is its JSON Schema).
 
 The filter. A record y_n = h(x_n) + e_n is predicted from the record before it,
 r_n = y_(n+1) ⊖ h(f(h⁻¹(y_n), u_n)), with f a fourth-order step under the held command. To first

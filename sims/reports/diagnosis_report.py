@@ -251,7 +251,7 @@ def _add_data(page: Page, d: Diagnosis) -> None:
         "disturbance, as estimated from these data with the causes.",
     )
     for limit in d.data.limits:
-        page.text(f"Not told: {limit}.")
+        page.text(f"Not identifiable: {limit}.")
 
 
 def _noise(key: str) -> str:

@@ -79,7 +79,7 @@ def test_expected_nats_are_those_of_least_squares(lagging):
     problem, evaluation, _ = lagging
     own, rival = problem.library.at(*LAG), problem.library.at("linear_drag", "surge")
     there = problem.evaluate(
-        evaluation.theta, sorted([*own, *rival]), evaluation.kalman, again=evaluation
+        evaluation.theta, sorted([*own, *rival]), evaluation.kalman, previous=evaluation
     ).plain
     rng = np.random.default_rng(0)
     J = rng.standard_normal((40, 2)) * [300.0, 1.0]  # responses of a maneuver: lag, drag

@@ -124,6 +124,6 @@ def test_rivals_stand_beside_judgements(tmp_path, monkeypatch):
     rows, _ = running.run_cases(cases, **go, rivals=True)
     assert running.run_cases(cases, **go)[0] == rows
     assert asked == ["lift", "tether"]
-    table = next(t for t in tables(rows) if "Rivals" in t.caption)
+    table = next(t for t in tables(rows) if "Rival methods" in t.caption)
     assert table.header[3:] == ("stlsq", "features")
     assert table.rows[0] == ("lift", "lift", "0.99", "0.50 (3)", "0.40")

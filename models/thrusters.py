@@ -1,9 +1,7 @@
-"""The eight thrusters: geometry, conversion of PWM and force, allocation of a wrench, and lag.
+"""The thrusters: geometry, conversion of PWM and force, allocation of a wrench, and lag.
 
-Order and signs are ArduSub's (frame VECTORED_6DOF): thrusters 1–4 horizontal, front right, front
-left, rear right, rear left; 5–8 vertical in the same order. `directions` is the force in B
-(forward, left, up) for one newton at PWM above 1500, so the front horizontals push back and the
-verticals push down. Arrays are component first: forces (8, *batch).
+Their number and order are those of the vehicle's file. `directions` is the force in B (forward,
+left, up) for one newton at PWM above 1500. Arrays are component first: forces (n, *batch).
 """
 
 from typing import Literal
@@ -14,10 +12,16 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from .se3 import AXES
 from .thruster_curves import NEUTRAL, ThrusterCurve
 
 REST = 0.1
 """Below this force (N) a thruster counts as stopped for the start delay."""
+MOST = 64
+"""More thrusters than this in a file are taken for an error of the file."""
+_PRIORITY = (0, 1, 2, 5, 3, 4)
+"""Axes in the order in which they are actuated: of two that depend on each other the later one is
+not; roll and pitch are last because buoyancy restores them."""
 
 
 def allocation_matrix(
@@ -29,6 +33,10 @@ def allocation_matrix(
 
 class Thrusters(eqx.Module):
     """Thrusters fixed to the body, all of one kind.
+
+    `unactuated` names the axes along or about which they can't act independently of the others.
+    `allocate` meets the other axes exactly and disregards these: it is the least-squares solution
+    in the limit of no weight on them.
 
     `motor_directions` are ArduSub's MOT_n_DIRECTION: -1 where PWM above 1500 turns the propeller
     backwards, so that the thruster gives its reverse thrust; there the autopilot's mixer mirrors
@@ -47,6 +55,7 @@ class Thrusters(eqx.Module):
     inverse: Float[Array, "n 6"]
     bias: Float[Array, "n"]
     groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    unactuated: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -67,8 +76,8 @@ class Thrusters(eqx.Module):
         `effort` (positive) weights the squared forces that `allocate` minimises.
 
         Raises:
-            ValueError: an array has the wrong size, the rank of the allocation is not 6, or a value
-                is out of range.
+            ValueError: an array has the wrong size, the thrusters actuate no axis, or a value is
+                out of range.
         """
         p, d = np.asarray(positions, float), np.asarray(directions, float)
         n = p.shape[-1]
@@ -93,18 +102,15 @@ class Thrusters(eqx.Module):
                 "positive"
             )
         B = allocation_matrix(p, d)
-        if np.linalg.matrix_rank(B, tol=1e-6 * float(np.abs(B).max(initial=0.0))) < 6:
-            raise ValueError(
-                "the thrusters can't push along and turn about every axis (allocation has no rank "
-                "6); check thruster positions and directions"
-            )
+        actuated = _independent(B)
+        if not actuated:
+            raise ValueError("the thrusters give no wrench; check their positions and directions")
+        self.unactuated = tuple(AXES[i] for i in range(6) if i not in actuated)
         upright = np.abs(d[2]) > np.hypot(d[0], d[1])
         groups = [np.flatnonzero(~upright), np.flatnonzero(upright)]
-        if min(len(group) for group in groups) == 0:
-            raise ValueError("give horizontal thrusters and vertical ones; check directions")
         self.groups = tuple(tuple(int(i) for i in group) for group in groups)
         bias = np.zeros(n)
-        for group in self.groups:
+        for group in filter(None, self.groups):
             bias[list(group)] = _null_vector(B[:, list(group)])
         self.positions, self.directions = jnp.asarray(p, dtype), jnp.asarray(d, dtype)
         self.motor_directions = jnp.asarray(s, dtype)
@@ -114,7 +120,9 @@ class Thrusters(eqx.Module):
         self.nominal_voltage = jnp.asarray(nominal_voltage, dtype)
         self.resistance = jnp.asarray(resistance, dtype)
         self.allocation = jnp.asarray(B, dtype)
-        self.inverse = jnp.asarray((B / w).T @ np.linalg.inv((B / w) @ B.T), dtype)
+        A, inverse = B[actuated], np.zeros((n, 6))
+        inverse[:, actuated] = (A / w).T @ np.linalg.inv((A / w) @ A.T)
+        self.inverse = jnp.asarray(inverse, dtype)
         self.bias = jnp.asarray(bias, dtype)
 
     # ------------------------------------------------------------------------------ PWM and force
@@ -197,7 +205,7 @@ class Thrusters(eqx.Module):
             factor = self._fitting_scale(force, low, high, upright)[None]
             vertical = np.isin(np.arange(len(force)), upright)
             force = force * jnp.where(_column(vertical, force), factor, 1)
-        for group in self.groups:
+        for group in filter(None, self.groups):
             index = np.array(group)
             n = _column(self.bias[index], force)
             some = n != 0
@@ -217,6 +225,8 @@ class Thrusters(eqx.Module):
         With g = f/n and limits l, h divided likewise, s g_i + c ≤ h_i and s g_j + c ≥ l_j for all
         pairs: s (g_i - g_j) ≤ h_i - l_j. A thruster without bias (n = 0) bounds s by itself.
         """
+        if not group:
+            return jnp.ones(force.shape[1:], force.dtype)
         index = np.array(group)
         n = _column(self.bias[index], force)
         some = n != 0
@@ -271,6 +281,16 @@ class Thrusters(eqx.Module):
 def _column(values: Array | np.ndarray, x: Array) -> Array:
     """One value for each entry of the first axis of `x`."""
     return jnp.asarray(values).reshape((-1,) + (1,) * (x.ndim - 1))
+
+
+def _independent(B: Float[np.ndarray, "6 n"]) -> list[int]:
+    """Rows of B, by `_PRIORITY`, that do not depend linearly on those before; sorted."""
+    kept: list[int] = []
+    for i in _PRIORITY:
+        tried, least = B[[*kept, i]], 1e-6 * float(np.abs(B).max(initial=0.0))
+        if np.linalg.matrix_rank(tried, tol=least) > len(kept) and least > 0:
+            kept.append(i)
+    return sorted(kept)
 
 
 def _null_vector(B: Float[np.ndarray, "6 k"]) -> Float[np.ndarray, "k"]:

@@ -33,7 +33,7 @@ from spinndrift.training.diagnosis.findings import result
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(scenarios=2, runs=1, seconds=2.0, h=0.01)
 LIBRARY = Library(
-    [k.neutral() for k in KINDS.values() if not k.absorber and k.family != "disturbance"]
+    [k.neutral(thrusters=8) for k in KINDS.values() if not k.absorber and k.family != "disturbance"]
 )
 MEANS = [
     name

@@ -20,6 +20,7 @@ from spinndrift.models.effects.thrust import REFERENCE
 from spinndrift.models.effects.unknown import Unknown
 from spinndrift.models.files.checkpoint import load_model, save_model
 from spinndrift.models.integrate import rollout
+from spinndrift.models.thrusters import Thrusters
 from spinndrift.models.vehicles.vehicle import load_vehicle
 
 VEHICLE = load_vehicle("bluerov2_heavy")
@@ -49,7 +50,7 @@ def cross(a, b):
 
 @pytest.fixture(scope="module")
 def everything():
-    return Library([kind.neutral() for kind in KINDS.values()])
+    return Library([kind.neutral(thrusters=8) for kind in KINDS.values()])
 
 
 def test_all_effects_at_zero_change_nothing(everything):
@@ -101,7 +102,7 @@ def test_prediction_is_of_fourth_order_and_agrees_with_the_integrator():
 
 def thrust(effect, voltage=None):
     relative = jnp.ones((1, N)) if voltage is None else voltage
-    return np.asarray(effect.thrust(U, V, relative, PLANT))
+    return np.asarray(effect.for_thrusters(8).thrust(U, V, relative, PLANT))
 
 
 def test_static_thrust_effects():
@@ -414,6 +415,41 @@ def test_effects_by_hand_refuse_what_they_do_not_know():
         KINDS["thruster_lag"].of(time_constant=-1.0)
     with pytest.raises(UserError, match="has no 'lag'"):
         KINDS["thruster_lag"].of(lag=1.0)
+    with pytest.raises(UserError, match="say where: the number of a thruster"):
+        KINDS["thruster_gain"].of(gain=-0.5)
+    with pytest.raises(UserError, match="take all, or the number of a thruster"):
+        KINDS["thruster_lag"].of("0", time_constant=0.1)
+    with pytest.raises(UserError, match=r"thruster_gain\.where is 9: the vehicle has 8 thrusters"):
+        PLAIN.with_effects((KINDS["thruster_gain"].of("9", gain=-0.5),))
+
+
+@pytest.mark.parametrize("count", [1, 5, 6])
+def test_effects_take_the_number_of_thrusters_from_the_vehicle(tmp_path, count):
+    """Every effect on thrusters is that of the same thrusters of a larger vehicle."""
+    few = Thrusters(
+        np.asarray(THRUSTERS.positions)[:, -count:],
+        np.asarray(THRUSTERS.directions)[:, -count:],
+        THRUSTERS.curve,
+    )
+    effects = (
+        KINDS["thruster_lag"].of(time_constant=0.1),
+        KINDS["actuation_delay"].of("1", delay=0.03),
+        KINDS["thruster_gain"].of(str(count), gain=-0.5),
+        KINDS["load_droop"].of(loss=0.5),
+    )
+    save_model(tmp_path / "m.spinn", Extended.create(BASE, effects, few))
+    model = load_model(tmp_path / "m.spinn", float)[0]
+    assert isinstance(model, Extended)
+    assert [e.places[-1] for e in model.effects] == [str(count)] * 3 + ["all"]
+    memory = model.remember(jnp.zeros((count, 1)))
+    _, level = model.actuate(memory, jnp.full((count, 1), 40.0), 0.05, 1)
+    arrived = np.where(np.arange(count) == 0, 0.4 * 40, 40)  # the first one's share of the step
+    wanted = arrived * (1 - 0.1 / 0.05 * (1 - np.exp(-0.5)))
+    np.testing.assert_allclose(level[:, 0, 0], wanted, rtol=1e-5)
+    force = model.thrust(jnp.full((count, 1), 40.0), jnp.zeros((6, 1)))
+    full = np.where(np.arange(count) == count - 1, 20.0, 40.0)
+    droop = 0.5 * np.mean((full / 40) ** 1.5)
+    np.testing.assert_allclose(force[:, 0], full * (1 - droop), rtol=1e-6)
 
 
 def test_further_fields_are_stored(tmp_path):

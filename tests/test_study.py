@@ -150,7 +150,7 @@ def test_tasks_begin_with_one_seed_of_everything():
 )
 def test_bad_input_is_refused_in_one_sentence(arguments, words, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "wrong.yaml").write_text("beleif: bluerov2_wu\n")
+    (tmp_path / "wrong.yaml").write_text("beleif: bluerov2_heavy_ng\n")
     (tmp_path / "same.yaml").write_text("belief: bluerov2_heavy\n")
     (tmp_path / "loop.yaml").write_text("sparse: {maneuvers: [loop]}\n")
     assert called("study", "ablation", *arguments) == 2

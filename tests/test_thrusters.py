@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from spinndrift.models.se3 import AXES
 from spinndrift.models.thruster_curves import QuadraticCurve, T200Curve
 from spinndrift.models.thrusters import Thrusters
 from spinndrift.models.vehicles.vehicle import load_vehicle, vehicle_names
 
-# ArduPilot, AP_Motors6DOF.cpp, VECTORED_6DOF: roll, pitch, yaw, throttle, forward, lateral
+# ArduPilot, AP_Motors6DOF.cpp: roll, pitch, yaw, throttle, forward, lateral
 FACTORS = np.array(
     [
         [0, 0, 1, 0, -1, 1],
@@ -24,9 +25,9 @@ FACTORS = np.array(
         [-1, 1, 0, -1, 0, 0],
     ]
 )
+VECTORED = np.concatenate([FACTORS[:4], [[1, 0, 0, -1, 0, 0], [-1, 0, 0, -1, 0, 0]]])
 FLU_TO_FRD = np.array([1, -1, -1, 1, -1, -1])[:, None]
 S = np.sqrt(0.5)
-STEEP = np.vstack([np.random.default_rng(0).uniform(-1, 1, (2, 8)), np.full(8, 2.0)])
 # Heavy with von Benzon's positions, forward-starboard-down, rows Fx Fy Fz Mx My Mz
 HEAVY_FRD = np.array(
     [
@@ -63,13 +64,15 @@ def test_every_row_has_the_signs_of_ardusubs_mixer(name):
     thrusters = load_vehicle(name).thrusters()
     # per positive PWM, forward-starboard-down: forward, lateral, down, roll, pitch, yaw
     signs = np.sign(np.round(np.asarray(thrusters.allocation) * FLU_TO_FRD, 9))
-    roll, pitch, yaw, throttle, forward, lateral = FACTORS.T
+    count = len(thrusters.motor_directions)
+    roll, pitch, yaw, throttle, forward, lateral = {8: FACTORS, 6: VECTORED}[count].T
     mixer = np.array([forward, lateral, -throttle, roll, pitch, yaw])
     own = mixer != 0
     np.testing.assert_array_equal(signs[own], mixer[own])
     np.testing.assert_array_equal(signs[:3][~own[:3]], 0)  # no thruster pushes where it shouldn't
     np.testing.assert_array_equal(signs[5], yaw)
-    assert np.linalg.matrix_rank(thrusters.allocation) == 6
+    assert np.linalg.matrix_rank(thrusters.allocation) == {8: 6, 6: 5}[count]
+    assert thrusters.unactuated == {8: (), 6: ("pitch",)}[count]
 
 
 def test_allocation_of_the_heavy(heavy):
@@ -94,8 +97,7 @@ def test_wrench_is_the_sum_of_forces_and_moments(heavy):
         ({"effort": np.zeros(8)}, "effort"),
         ({"time_constant": -1.0}, "time_constant"),
         ({"resistance": -1.0}, "battery"),
-        ({"positions": np.zeros((3, 8))}, "rank 6"),
-        ({"directions": STEEP}, "horizontal"),
+        ({"directions": np.zeros((3, 8))}, "no wrench"),
     ],
 )
 def test_impossible_thrusters_are_refused(heavy, change, message):
@@ -167,6 +169,53 @@ def test_wrench_is_met_by_the_least_forces_when_limits_allow(name, scale, alloca
 
 
 @pytest.mark.parametrize("name", ["bluerov2_heavy", "bluerov2_heavy_ignition", "ardusub_sitl"])
+def five(heavy):
+    """Two thrusters forward, three vertical: nothing pushes sideways."""
+    positions = [[0, 0.1, 0], [0, -0.1, 0], [0.2, 0.1, 0], [0.2, -0.1, 0], [-0.2, 0, 0]]
+    directions = [[1, 0, 0]] * 2 + [[0, 0, 1]] * 3
+    return Thrusters(np.array(positions, float).T, np.array(directions, float).T, heavy.curve)
+
+
+def low(heavy):
+    """The standard BlueROV2 with its horizontals below Bo: surge pitches, sway rolls."""
+    base = load_vehicle("bluerov2").thrusters()
+    shift = np.array([0, 0, -0.085])[:, None] * (np.arange(6) < 4)
+    return Thrusters(np.asarray(base.positions) + shift, np.asarray(base.directions), heavy.curve)
+
+
+def lateral(heavy):
+    """One thruster athwart at the bow: sway and yaw go together, heave alone is free of them."""
+    positions, directions = np.array([[0.3, 0, 0], [0, 0, 0]]), np.array([[0, 1, 0], [0, 0, 1]])
+    return Thrusters(positions.T.astype(float), directions.T.astype(float), heavy.curve)
+
+
+@pytest.mark.parametrize(
+    ("make", "axes"),
+    [
+        (five, ("sway",)),
+        (low, ("pitch",)),
+        (lateral, ("surge", "roll", "pitch", "yaw")),
+    ],
+)
+@pytest.mark.parametrize("scale", ["common", "groups"])
+def test_an_axis_that_is_not_actuated_is_named_and_the_others_are_met(heavy, make, axes, scale):
+    """The limit of weighted least squares with less and less weight on the named axes."""
+    thrusters = make(heavy)
+    assert thrusters.unactuated == axes
+    weight = np.where(np.isin(AXES, axes), 1e-6, 1.0)[:, None]
+    B, F = np.asarray(thrusters.allocation), wrenches(20, 0.05, seed=7)
+    forces = thrusters.allocate(F, scale=scale)
+    np.testing.assert_allclose(forces, np.linalg.pinv(weight * B) @ (weight * F), atol=1e-6)
+    met = ~np.isin(AXES, axes)
+    np.testing.assert_allclose(thrusters.wrench(forces)[met], F[met], atol=1e-9)
+    # beyond the limits: within them, and as much as they give
+    far = thrusters.allocate(1e4 * F, scale=scale)
+    least, most = (np.asarray(limit)[:, None] for limit in thrusters.force_limits())
+    assert np.all((far > least - 1e-9) & (far < most + 1e-9))
+    room = np.minimum(far - least, most - far)
+    assert np.all(room.min(axis=0) < 1e-9)
+
+
 def test_common_scale_keeps_the_direction_and_gives_the_most_possible(name, allocate):
     thrusters = load_vehicle(name).thrusters()
     B = np.asarray(thrusters.allocation)

@@ -41,7 +41,7 @@ def terminal(vehicle, axis, push):
 
 def test_presets_are_there():
     wanted = ["_von_benzon", "_ng", "_eiva", "_ignition"]
-    assert {"bluerov2_heavy", "bluerov2_wu", "ardusub_sitl"} <= set(VEHICLES)
+    assert {"bluerov2_heavy", "bluerov2", "ardusub_sitl"} <= set(VEHICLES)
     assert {f"bluerov2_heavy{end}" for end in wanted} <= set(VEHICLES)
 
 
@@ -121,7 +121,7 @@ def test_simulated_terminal_speeds_balance_drag_and_thrust(name):
     ("name", "surge"),
     [
         ("bluerov2_heavy_von_benzon", (0.91, 0.84, 0.76)),
-        ("bluerov2_wu", (2.56, 2.37, 2.14)),
+        ("bluerov2", (2.56, 2.37, 2.14)),
         ("bluerov2_heavy_ng", (1.51, 1.37, 1.20)),
         ("bluerov2_heavy_ignition", (1.49, 1.38, 1.25)),
         ("bluerov2_heavy_eiva", (1.92, 1.78, 1.62)),
@@ -229,7 +229,7 @@ def test_own_file(tmp_path):
         ({"inertia": (0.1, 0.1, 0.9)}, r"inertia.*moment"),
         ({"size": (0.4, 0.5, 0.0)}, r"size"),
         (
-            {"propulsion": dataclasses.replace(VEHICLES["bluerov2_wu"].propulsion, mounts=())},
+            {"propulsion": dataclasses.replace(VEHICLES["bluerov2"].propulsion, mounts=())},
             "mounts has 0",
         ),
     ],

@@ -16,8 +16,9 @@ broadcast against the state's (one column per hypothesis), so that one compiled 
 hypothesis. A parameter of zero means absent; `neutral` values change nothing.
 """
 
+import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -28,13 +29,11 @@ from jaxtyping import Array, Float
 
 from ..config.errors import UserError
 from ..networks import expand
+from ..thrusters import MOST
 from .recent import Recent
 from .traits import Traits
 
 Family = Literal["actuation", "body", "environment", "disturbance", "measurement"]
-THRUSTERS = ("1", "2", "3", "4", "5", "6", "7", "8")
-ALL_OR_ONE = ("all", *THRUSTERS)
-"""Places of an effect that acts on all thrusters alike or on a single one."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ class Effect(eqx.Module, Traits):
         values: parameters by place: index = place × number of parameters + parameter.
         name: the cause's name in reports.
         parameters: those of one place.
-        places: where it can act (axis, thruster number, frame).
+        places: where it can act (axis, frame); see `ByThruster` for single thrusters.
         order: actuation and measurement effects apply from small to large.
         source: where the admissible range comes from.
     """
@@ -103,14 +102,16 @@ class Effect(eqx.Module, Traits):
     # --------------------------------------------------------------------------------- making
 
     @classmethod
-    def size(cls) -> int:
-        """Number of values."""
-        return len(cls.places) * len(cls.parameters)
+    def places_with(cls, thrusters: int) -> tuple[str, ...]:
+        """Where it can act on a vehicle with so many thrusters."""
+        del thrusters
+        return cls.places
 
     @classmethod
-    def neutral(cls, dtype: Any = float, **options: Any) -> "Effect":
-        """The effect that changes nothing."""
-        return cls(jnp.zeros(cls.size(), dtype), **options)
+    def neutral(cls, dtype: Any = float, thrusters: int = 0, **options: Any) -> "Effect":
+        """The effect that changes nothing, with its places on so many thrusters."""
+        size = len(cls.places_with(thrusters)) * len(cls.parameters)
+        return cls(jnp.zeros(size, dtype), **options)
 
     @classmethod
     def index(cls, place: str, parameter: str) -> int:
@@ -120,11 +121,27 @@ class Effect(eqx.Module, Traits):
             UserError: the effect has no such place or parameter.
         """
         names = [p.name for p in cls.parameters]
-        if place not in cls.places:
-            raise UserError(f"{cls.name}.where is {place!r}: take one of {', '.join(cls.places)}")
+        places = cls.places_with(MOST)
+        if place not in places:
+            raise UserError(f"{cls.name}.where is {place!r}: take {_listed(places)}")
         if parameter not in names:
             raise UserError(f"{cls.name} has no {parameter!r}: it has {', '.join(names)}")
-        return cls.places.index(place) * len(names) + names.index(parameter)
+        return places.index(place) * len(names) + names.index(parameter)
+
+    @classmethod
+    def single(cls, place: str) -> bool:
+        """Whether a place is one thruster of an effect that may act on all alike."""
+        del place
+        return False
+
+    def for_thrusters(self, count: int) -> "Effect":
+        """The same effect on a vehicle with so many thrusters.
+
+        Raises:
+            UserError: it acts on a thruster that the vehicle doesn't have.
+        """
+        del count
+        return self
 
     @classmethod
     def of(
@@ -133,17 +150,20 @@ class Effect(eqx.Module, Traits):
         """The effect with parameters by name at one place: `ThrusterLag.of(time_constant=0.1)`.
 
         `where` may be left out for an effect with a single place, or with `all` among them;
-        `options` are its further fields.
+        `options` are its further fields. A thruster's number stands for itself: `for_thrusters`
+        fits the effect to a vehicle.
 
         Raises:
             UserError: a place or parameter is unknown, or a value is not admissible.
         """
-        places = list(cls.places)
+        places = list(cls.places_with(MOST))
         if where is None and len(places) > 1 and "all" not in places:
-            raise UserError(f"{cls.name}: say where: one of {', '.join(places)}")
-        values = np.zeros(cls.size())
+            raise UserError(f"{cls.name}: say where: {_listed(places)}")
+        where = where or places[0]
+        number = int(where) if where in places and where.isdecimal() else 0
+        values = np.array(cls.neutral(thrusters=number).values)
         for name, value in parameters.items():
-            i = cls.index(where or places[0], name)
+            i = cls.index(where, name)
             p = cls.parameters[i % len(cls.parameters)]
             low, high = p.low + p.usual, p.high + p.usual
             if not low <= value <= high:
@@ -166,16 +186,6 @@ class Effect(eqx.Module, Traits):
     def part(self, i: int, like: Array) -> Array:
         """Value i, expanded to the rank of one component of `like`."""
         return expand(self.values[i], like.ndim - 1)
-
-    def each(self, k: int, like: Array) -> Array:
-        """Parameter k of every thruster, for places `ALL_OR_ONE`: common plus individual part."""
-        own = expand(self.values[k :: len(self.parameters)], like.ndim)
-        return own[:1] + own[1:]
-
-    def longest(self, k: int) -> float:
-        """The largest parameter k of any thruster, for places `ALL_OR_ONE`."""
-        own = np.asarray(self.values, float)[k :: len(self.parameters)]
-        return float(np.max(own[0] + np.maximum(own[1:], 0.0)))
 
     def column(self, like: Array) -> Array:
         """All values as components, expanded to the rank of `like`."""
@@ -319,6 +329,59 @@ class Effect(eqx.Module, Traits):
         """True pose and twist from the recorded ones: the inverse of `measure`."""
         del recent
         return X_WB, V_WB_B
+
+
+def _listed(places: Sequence[str]) -> str:
+    if len(places) < MOST:
+        return f"one of {', '.join(places)}"
+    return "all, or the number of a thruster" if "all" in places else "the number of a thruster"
+
+
+class ByThruster(Effect):
+    """Base of effects on single thrusters, and unless `common` is empty on all alike as well.
+
+    The places are `common` and the numbers of the thrusters, as many as there are values for.
+    """
+
+    common: ClassVar[tuple[str, ...]] = ("all",)
+
+    @property
+    def places(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.places_with(self.thrusters)
+
+    @classmethod
+    def places_with(cls, thrusters: int) -> tuple[str, ...]:
+        return (*cls.common, *(str(k + 1) for k in range(thrusters)))
+
+    @classmethod
+    def single(cls, place: str) -> bool:
+        return bool(cls.common) and place not in cls.common
+
+    @property
+    def thrusters(self) -> int:
+        """Number of thrusters with values of their own."""
+        return self.values.shape[0] // len(self.parameters) - len(self.common)
+
+    def for_thrusters(self, count: int) -> "Effect":
+        more = (count - self.thrusters) * len(self.parameters)
+        if more == 0:
+            return self
+        if more < 0:
+            raise UserError(
+                f"{self.name}.where is {self.thrusters}: the vehicle has {count} thrusters"
+            )
+        padding = [(0, more), *((0, 0) for _ in self.values.shape[1:])]
+        return dataclasses.replace(self, values=jnp.pad(self.values, padding))
+
+    def each(self, k: int, like: Array) -> Array:
+        """Parameter k of every thruster: common plus individual part."""
+        own = expand(self.values[k :: len(self.parameters)], like.ndim)
+        return own[:1] + own[1:] if self.thrusters else own
+
+    def longest(self, k: int) -> float:
+        """The largest parameter k of any thruster."""
+        own = np.asarray(self.values, float)[k :: len(self.parameters)]
+        return float(own[0] + np.max(own[1:], initial=0.0))
 
 
 def force_only(f: Float[Array, "3 *batch"]) -> Float[Array, "6 *batch"]:

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .base import ALL_OR_ONE, Effect, Parameter
+from .base import ByThruster, Parameter
 from .traits import Region
 
 _LATEST, _STEPS = 0.25, (6, 16)
 """Longest delay (s) that a diagnosis resolves, and fewest and most steps of the memory for it."""
 
 
-class ActuationDelay(Effect):
+class ActuationDelay(ByThruster):
     """f(t) = u(t - δ): transport and processing time between the recorded command and the thrust.
 
     The memory holds the last `steps` commands and how long each was held, so it represents delays
@@ -27,14 +27,12 @@ class ActuationDelay(Effect):
     name: ClassVar[str] = "actuation_delay"
     family: ClassVar = "actuation"
     parameters: ClassVar = (Parameter("delay", "s", (0.01, 0.03, 0.08, 0.2), 0.0, 1.0, refit=0.01),)
-    places: ClassVar = ALL_OR_ONE
     echoes: ClassVar = ("thruster_lag", "clock_offset")
     order: ClassVar[int] = 0
     timing: ClassVar[bool] = True
     refits: ClassVar = ("all",)
     refit_needs: ClassVar = frozenset({"thrust"})
     source: ClassVar[str] = "a motor drive starts 110 ± 10 ms late (Blue Robotics forum, 11112)"
-    thrusters: int = eqx.field(static=True, default=8)
     steps: int = eqx.field(static=True, default=6)
 
     @classmethod

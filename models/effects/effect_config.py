@@ -46,7 +46,7 @@ class EffectConfig:
             raise UserError(f"effects.name is {self.name!r}: take one of {known}")
         kind = KINDS[self.name]
         for parameter in self.parameters:
-            kind.index(self.where or kind.places[0], parameter)
+            kind.index(self.place, parameter)
         effect = kind.of(self.where, options=self._options(kind), **self.parameters)
         if not self.parameters:
             names = ", ".join(p.name for p in kind.parameters)
@@ -54,6 +54,11 @@ class EffectConfig:
                 f"{self.name} has no parameters, so it changes nothing: give one of {names}"
             )
         return effect
+
+    @property
+    def place(self) -> str:
+        """Where it acts."""
+        return self.where or KINDS[self.name].places_with(1)[0]
 
     def _options(self, kind: type[Effect]) -> dict[str, Any]:
         known = {f.name: f.default for f in fields(kind) if f.name != "values"}
@@ -83,7 +88,7 @@ def check_distinct(effects: Iterable[EffectConfig]) -> None:
     """
     seen: set[tuple[str, str]] = set()
     for effect in effects:
-        here = effect.name, effect.where or KINDS[effect.name].places[0]
+        here = effect.name, effect.place
         if here in seen:
             raise UserError(
                 f"effects: {here[0]} ({here[1]}) is there twice; give all its parameters in one"

@@ -40,14 +40,19 @@ class Extended(EffectsOnMotion):
     def create(
         cls, base: Dynamics, effects: tuple[Effect, ...], thrusters: Thrusters
     ) -> "Extended":
-        """Effects in any order; they apply in the order of their kinds."""
-        ordered = tuple(sorted(effects, key=lambda effect: effect.order))
+        """Effects in any order; they apply in the order of their kinds.
+
+        Raises:
+            UserError: one acts on a thruster that the vehicle doesn't have.
+        """
         t = thrusters
-        return cls(base, ordered, t.positions, t.directions, t.inverse)  # pyright: ignore[reportCallIssue]
+        bare = cls(base, (), t.positions, t.directions, t.inverse)  # pyright: ignore[reportCallIssue]
+        return bare.with_effects(effects)
 
     def with_effects(self, effects: tuple[Effect, ...]) -> "Extended":
         """The same base and thrusters with other effects."""
-        ordered = tuple(sorted(effects, key=lambda effect: effect.order))
+        fitted = [effect.for_thrusters(self.positions.shape[1]) for effect in effects]
+        ordered = tuple(sorted(fitted, key=lambda effect: effect.order))
         return dataclasses.replace(self, effects=ordered)
 
     def with_base(self, base: Dynamics) -> "Extended":

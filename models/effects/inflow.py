@@ -5,10 +5,10 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .base import ALL_OR_ONE, Effect, Parameter, Plant
+from .base import ByThruster, Parameter, Plant
 
 
-class InflowThrustLoss(Effect):
+class InflowThrustLoss(ByThruster):
     """f = u - k √|u| v_a, with v_a the thruster's velocity through the water along its axis.
 
     First order of the thrust coefficient in the advance ratio: T = T_0 - k √T_0 v_a (Fossen 2011,
@@ -18,7 +18,6 @@ class InflowThrustLoss(Effect):
     name: ClassVar[str] = "inflow_thrust_loss"
     family: ClassVar = "actuation"
     parameters: ClassVar = (Parameter("loss", "√N/(m/s)", (0.1,), 0.0, 3.0),)
-    places: ClassVar = ALL_OR_ONE
     order: ClassVar[int] = 17
     source: ClassVar[str] = "1 to 12 % at 0.5 m/s"
 

@@ -2,14 +2,13 @@
 
 from typing import ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .base import ALL_OR_ONE, Effect, Parameter
+from .base import ByThruster, Parameter
 
 
-class ThrusterLag(Effect):
+class ThrusterLag(ByThruster):
     """τ df/dt = u - f for each thruster; exact means and ends over substeps of a held command.
 
     A step response of about 0.1 to 0.2 s is usual for a T200 with its drive (Wu 2018; public
@@ -19,12 +18,10 @@ class ThrusterLag(Effect):
     name: ClassVar[str] = "thruster_lag"
     family: ClassVar = "actuation"
     parameters: ClassVar = (Parameter("time_constant", "s", (0.02, 0.06, 0.15, 0.35), 0.0, 1.5),)
-    places: ClassVar = ALL_OR_ONE
     echoes: ClassVar = ("actuation_delay", "clock_offset")
     order: ClassVar[int] = 1
     timing: ClassVar[bool] = True
     source: ClassVar[str] = "0.05 to 0.2 s: Blue Robotics forum measurements, public simulators"
-    thrusters: int = eqx.field(static=True, default=8)
 
     @property
     def memory_size(self) -> int:

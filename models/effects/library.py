@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from ..config.errors import UserError
 from .added_mass import AddedMass, AddedMassCoupling
 from .attitude import ClockOffset, GyroBias, HeadingError
-from .base import ALL_OR_ONE, Effect, Parameter
+from .base import Effect, Parameter
 from .delay import ActuationDelay
 from .drag import CubicDrag, DragAsymmetry, DragCoupling, LinearDrag, QuadraticDrag
 from .dvl import DvlLeverArm, DvlMisalignment, DvlScale
@@ -135,7 +135,7 @@ class Library:
     def __init__(self, effects: Iterable[Effect]):
         self.effects = tuple(sorted(effects, key=lambda effect: effect.order))
         self.entries = tuple(_entries(self.effects))
-        sizes = [effect.size() for effect in self.effects]
+        sizes = [effect.values.shape[0] for effect in self.effects]
         self._starts = list(itertools.accumulate(sizes, initial=0))
         self._leaves, self._structure = jax.tree.flatten(self.effects)
         values = {id(effect.values) for effect in self.effects}
@@ -167,7 +167,7 @@ class Library:
         every = list(dict.fromkeys((e.cause, e.where) for e in self.entries))
         if single is None:
             return every
-        return [h for h in every if (kind(h[0]).places == ALL_OR_ONE and h[1] != "all") == single]
+        return [h for h in every if kind(h[0]).single(h[1]) == single]
 
     def filled(self, theta: Float[Array | np.ndarray, "p *batch"]) -> tuple[Effect, ...]:
         """The effects with values from θ, whose batch axes they take."""

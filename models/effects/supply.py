@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 
 from .base import Effect, Parameter, Plant
 
-FULL_LOAD = 8 * 40.0**1.5
-"""Σ|f|^1.5 of eight thrusters at 40 N each: the reference load of `LoadDroop`."""
+FULL_LOAD = 40.0**1.5
+"""|f|^1.5 of a thruster at 40 N: its share of the reference load of `LoadDroop`."""
 
 
 class VoltageSag(Effect):
@@ -42,7 +42,7 @@ class VoltageExponent(VoltageSag):
 
 
 class LoadDroop(Effect):
-    """f = u (1 - c Σ|u|^1.5 / L): thrust lost to the common load; L is 8 thrusters at 40 N.
+    """f = u (1 - c Σ|u|^1.5 / L): thrust lost to the common load; L is that of all at 40 N.
 
     Current grows as |u|^1.5 (momentum theory), and the pack's voltage falls in proportion to it.
     """
@@ -61,5 +61,5 @@ class LoadDroop(Effect):
         plant: Plant,
     ) -> Float[Array, "n *#batch"]:
         size = jnp.abs(force)
-        load = jnp.sum(size * jnp.sqrt(size), axis=0, keepdims=True) / FULL_LOAD
+        load = jnp.sum(size * jnp.sqrt(size), axis=0, keepdims=True) / (len(force) * FULL_LOAD)
         return force * (1 - self.part(0, force)[None] * load)

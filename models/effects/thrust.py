@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from ..se3 import AXES
 from ..thruster_curves import RESTING
-from .base import ALL_OR_ONE, THRUSTERS, Effect, Parameter, Plant
+from .base import ByThruster, Effect, Parameter, Plant
 
 REFERENCE = 10.0
 """Reference force F_0 (N), at which the exponent has no influence."""
@@ -16,7 +16,7 @@ START = 0.3
 one-sided."""
 
 
-class ThrusterDeadZone(Effect):
+class ThrusterDeadZone(ByThruster):
     """f = sign(u) max(|u| - w, 0): the first w newtons commanded of a thruster are lost."""
 
     name: ClassVar[str] = "thruster_dead_zone"
@@ -24,7 +24,6 @@ class ThrusterDeadZone(Effect):
     parameters: ClassVar = (
         Parameter("width", "N", (0.2, 0.6, 1.5, 3.0), 0.0, 15.0, refit=3.0, start=START),
     )
-    places: ClassVar = ALL_OR_ONE
     order: ClassVar[int] = 10
     refits: ClassVar = ("all",)
     refit_needs: ClassVar = frozenset({"thrust"})
@@ -41,7 +40,7 @@ class ThrusterDeadZone(Effect):
         return force - jnp.clip(force, -width, width)
 
 
-class ThrustCurve(Effect):
+class ThrustCurve(ByThruster):
     """f = (1 + g) F_0 sign(u) |u / F_0|^(1 + e) with F_0 = 10 N: another exponent of the curve.
 
     The gain g is estimated with the exponent because the force at which the two curves cross is
@@ -54,7 +53,6 @@ class ThrustCurve(Effect):
         Parameter("exponent", "1", (0.04, -0.04, 0.12, -0.12), -0.5, 1.0, refit=0.3),
         Parameter("gain", "1", (0.05,), -0.7, 0.7),
     )
-    places: ClassVar = ALL_OR_ONE
     simpler: ClassVar = ("thrust_scale", "thruster_gain")
     essential: ClassVar = ("exponent",)
     order: ClassVar[int] = 11
@@ -74,13 +72,12 @@ class ThrustCurve(Effect):
         return force * (1 + gain) * jnp.exp(exponent * jnp.log(size))
 
 
-class ThrustAsymmetry(Effect):
+class ThrustAsymmetry(ByThruster):
     """f = (1 + a) u for u < 0: reverse thrust differs from the modelled."""
 
     name: ClassVar[str] = "thrust_asymmetry"
     family: ClassVar = "actuation"
     parameters: ClassVar = (Parameter("reverse_gain", "1", (-0.05,), -0.6, 1.5, refit=0.5),)
-    places: ClassVar = ALL_OR_ONE
     order: ClassVar[int] = 12
     refits: ClassVar = ("all",)
     refit_needs: ClassVar = frozenset({"thrust"})
@@ -96,13 +93,13 @@ class ThrustAsymmetry(Effect):
         return force + self.each(0, force) * jnp.minimum(force, 0)
 
 
-class ThrusterGain(Effect):
+class ThrusterGain(ByThruster):
     """f_i = (1 + g_i) u_i: one thruster is weak (g < 0), dead (-1) or reversed (-2)."""
 
     name: ClassVar[str] = "thruster_gain"
     family: ClassVar = "actuation"
     parameters: ClassVar = (Parameter("gain", "1", (-0.05,), -2.3, 3.0),)
-    places: ClassVar = THRUSTERS
+    common: ClassVar = ()
     order: ClassVar[int] = 13
     source: ClassVar[str] = "5 to 100 %: worn, fouled or wrongly wired propellers"
 

@@ -1,5 +1,6 @@
 """Unnamed structure: a sparse residual of a few weighted terms in stated inputs."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -58,7 +59,7 @@ class Unknown(Effect):
     kind: str = eqx.field(static=True, default="motion")
     acts_on: str = eqx.field(static=True, default="surge")
     numbers: tuple[float, ...] = eqx.field(static=True, default=(0.0,))
-    thrusters: int = eqx.field(static=True, default=8)
+    thrusters: int = eqx.field(static=True, default=0)
 
     @classmethod
     def neutral(cls, dtype: Any = float, **options: Any) -> "Unknown":
@@ -98,8 +99,8 @@ class Unknown(Effect):
         unit = units.get(self.kind, "N a unit or N·m a unit")
         return tuple(Parameter(t, unit, (_SIZES.get(self.kind, 1.0),)) for t in self.terms)
 
-    def size(self) -> int:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return len(self.terms)
+    def for_thrusters(self, count: int) -> "Unknown":
+        return dataclasses.replace(self, thrusters=count)
 
     def acts(self, hook: str) -> bool:  # pyright: ignore[reportIncompatibleMethodOverride]
         acting = {"flow": "flow", "memory": "feel", "thruster": "thrust", "exchange": "thrust"}

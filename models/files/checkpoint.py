@@ -25,12 +25,12 @@ from ..euclidean import EuclideanSpinn, create_spinn
 from ..integrate import cast
 from ..rigid_body import FossenDynamics
 from ..spinn import Spinn, SpinnConfig
+from ..thrusters import MOST
 from .archive import read_archive
 from .atomic import atomic_path
 
 FORMAT = "spinndrift model"
 VERSION = 1
-_MOST_THRUSTERS = 64
 _LARGEST = 1e6
 """Upper bound of an effect's options, which are counts, times, lengths and numbers of terms."""
 
@@ -206,19 +206,20 @@ def _describe_extended(model: Extended) -> dict[str, Any]:
         options = {
             field.name: getattr(effect, field.name)
             for field in dataclasses.fields(effect)
-            if field.metadata.get("static", False)
+            if field.metadata.get("static", False) and field.name != "thrusters"
         }
         effects.append({"name": effect.name, "options": options})
     n = model.positions.shape[1]
     return {"base": describe(model.base), "effects": effects, "thrusters": n}
 
 
-def _neutral(name: str, options: dict[str, Any]) -> Effect:
+def _neutral(name: str, options: dict[str, Any], thrusters: int) -> Effect:
     """An effect by name; its options must have the types of their defaults."""
     cls = kind(name)
     usual = {field.name: field.default for field in dataclasses.fields(cls)}
     if not isinstance(options, dict):
         raise ValueError(f"options of {name}")
+    options = {name: value for name, value in options.items() if name != "thrusters"}
     for option, value in options.items():
         numbers = value if isinstance(value, list) else [value]
         plain = all(isinstance(n, int | float) and abs(n) < _LARGEST for n in numbers)
@@ -226,14 +227,14 @@ def _neutral(name: str, options: dict[str, Any]) -> Effect:
             raise ValueError(f"{option} of {name}")
         if isinstance(usual[option], int) and not (isinstance(value, int) and value >= 1):
             raise ValueError(f"{option} of {name}")
-    return cls.neutral(jnp.float32, **options)
+    return cls.neutral(jnp.float32, thrusters=thrusters, **options)
 
 
 def _extended(config: dict[str, Any]) -> Extended:
-    effects = tuple(_neutral(e["name"], e["options"]) for e in config["effects"])
     n = config["thrusters"]
-    if n not in range(1, _MOST_THRUSTERS + 1):
+    if n not in range(1, MOST + 1):
         raise ValueError(f"{n} thrusters")
+    effects = tuple(_neutral(e["name"], e["options"], n) for e in config["effects"])
     places, inverse = jnp.zeros((3, n), jnp.float32), jnp.zeros((n, 6), jnp.float32)
     base = template(config["base"])
     return Extended(base, effects, places, places, inverse)  # pyright: ignore[reportCallIssue]

@@ -31,7 +31,7 @@ class Trajectory:
         scenario: name; trajectories of equal name are repetitions of one scenario.
         X_WB: poses; quaternion w x y z, position (m).
         V_WB_B: body twists (m/s, rad/s).
-        commands: one or more of `F_Bo_B` (N, 6), `thruster_force` (N, 8), `pwm` (N, 8).
+        commands: one or more of `F_Bo_B` (N, 6), `thruster_force` (N, n), `pwm` (N, n).
         sensors: optional further variables of the schema, `voltage` (N,) and the like.
         start: time of index 0 on the source's clock (s).
 

@@ -55,7 +55,7 @@ def _groups(table: Table, ignore: Sequence[str]) -> dict[str, list[str]]:
             groups[variable] = [f"{stem}{i}" for i in range(1, count + 1)]
     if not groups:
         raise UserError(
-            f"{table.path}: no command; add X,Y,Z,K,M,N or f1..f8 or pwm1..pwm8 after the state"
+            f"{table.path}: no command; add X,Y,Z,K,M,N or f1..fn or pwm1..pwmn after the state"
         )
     if "voltage" in rest:
         groups["voltage"] = ["voltage"]

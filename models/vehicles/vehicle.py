@@ -19,7 +19,7 @@ from ..config.errors import UserError
 from ..config.typed_yaml import load
 from ..rigid_body import FossenDynamics, spatial_inertia
 from ..thruster_curves import QuadraticCurve, T200Curve
-from ..thrusters import Thrusters
+from ..thrusters import MOST, Thrusters
 
 _FOLDER = Path(__file__).parent
 
@@ -57,7 +57,7 @@ class Mount:
 
 @dataclass(frozen=True)
 class Propulsion:
-    """Eight thrusters in ArduSub's order; lag (s); open-circuit voltage (V), resistance (Ω)."""
+    """Thrusters in the autopilot's order; lag (s); open-circuit voltage (V), resistance (Ω)."""
 
     mounts: tuple[Mount, ...]
     curve: T200 | Quadratic = field(default_factory=T200)
@@ -111,12 +111,22 @@ class Vehicle:
             )
         a, b, c = sorted(self.inertia)
         require(a + b >= c, self, "inertia", "no body has one moment above the other two together")
-        if len(self.propulsion.mounts) != 8:
+        if not 1 <= len(self.propulsion.mounts) <= MOST:
             raise UserError(
-                f"Vehicle.propulsion.mounts has {len(self.propulsion.mounts)} thrusters: give 8, "
-                "in ArduSub's order."
+                f"Vehicle.propulsion.mounts has {len(self.propulsion.mounts)} thrusters: give 1 to "
+                f"{MOST}, in the autopilot's order."
             )
         self.thrusters()
+
+    @property
+    def unactuated(self) -> tuple[str, ...]:
+        """Axes that its thrusters can't act on independently of the others."""
+        return self.thrusters().unactuated
+
+    def limitation(self) -> str:
+        """A sentence on the axes that its thrusters can't actuate; empty if there is none."""
+        axes = " and ".join(self.unactuated)
+        return f"The thrusters of {self.name} can't actuate {axes}." if axes else ""
 
     def dynamics(
         self, diffusion: Float[np.ndarray, "6"] | None = None, dtype: jnp.dtype | type = float
@@ -138,7 +148,7 @@ class Vehicle:
         )
 
     def thrusters(self, dtype: jnp.dtype | type = float) -> Thrusters:
-        """The eight thrusters with their curve, lag and battery."""
+        """The thrusters with their curve, lag and battery."""
         p = self.propulsion
         return Thrusters(
             np.array([mount.position for mount in p.mounts]).T,

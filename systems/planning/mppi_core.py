@@ -244,7 +244,8 @@ class MppiPlanner(eqx.Module):
         """Cost of sequences over all their realisations, and their collision probability."""
         c, dt, axes = self.config, self.config.dt, self.sampler.axes
         total = combine_risk(rolled.cost, c.risk, c.cvar_part)
-        used = (F_Bo_B - hold[:, :, None]) / axes[None, :, None]
+        full = jnp.where(axes > 0, axes, jnp.inf)  # infinite where nothing can be given
+        used = (F_Bo_B - hold[:, :, None]) / full[None, :, None]
         total = total + c.effort_weight * dt * jnp.sum(used * used, axis=(0, 1))
         change = jnp.diff(used, axis=0) / dt
         total = total + c.rate_weight * dt * jnp.sum(change * change, axis=(0, 1))

@@ -1,4 +1,4 @@
-"""From a wrench to eight pulse widths."""
+"""From a wrench to pulse widths."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -5,7 +5,6 @@ import abc
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ...models.thrusters import Thrusters
@@ -63,19 +62,17 @@ class ThrusterLimits(WrenchLimits):
         """Limits at a battery voltage (V), the thrusters' nominal one unless given."""
         dtype = thrusters.nominal_voltage.dtype
         volts = thrusters.nominal_voltage if voltage is None else jnp.asarray(voltage, dtype)
-        inverse = np.linalg.pinv(np.asarray(thrusters.allocation, np.float64))
-        return cls(thrusters, volts, jnp.asarray(fraction, dtype), jnp.asarray(inverse, dtype))
-
-    inverse: Float[Array, "n 6"]
+        return cls(thrusters, volts, jnp.asarray(fraction, dtype))
 
     def clip(self, F_Bo_B: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
         if F_Bo_B.ndim > 1:
             return self._scaled(F_Bo_B)
         # A single feasible wrench, the usual case, needs no search for the factors.
-        forces = self.inverse @ F_Bo_B / self.fraction
+        forces = self.thrusters.inverse @ F_Bo_B / self.fraction
         low, high = self.thrusters.force_limits(self.voltage)
         feasible = jnp.all((forces >= low) & (forces <= high))
-        return jax.lax.cond(feasible, lambda F: F, lambda F: self._scaled(F), F_Bo_B)
+        F = self.thrusters.wrench(forces) * self.fraction if self.thrusters.unactuated else F_Bo_B
+        return jax.lax.cond(feasible, lambda F: F, lambda F: self._scaled(F), F)
 
     def _scaled(self, F_Bo_B: Float[Array, "6 *batch"]) -> Float[Array, "6 *batch"]:
         forces = self.thrusters.allocate(F_Bo_B / self.fraction, self.voltage, "groups")

@@ -32,14 +32,15 @@ diffusion are identifiable."""
 
 def maneuver_wrench(
     name: str, thrusters: Thrusters, effort: float
-) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "8"]]:
+) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, " n"]]:
     """Wrench (N, N·m) and thruster forces (N) of a maneuver at a fraction of full effort.
 
     The direction is scaled to the largest wrench that respects every thruster's limits, then by
     `effort`; the allocated forces are returned with the wrench that they produce.
 
     Raises:
-        UserError: the name is unknown or `effort` is not in (0, 1].
+        UserError: the name is unknown, the thrusters actuate none of its axes, or `effort` is not
+            in (0, 1].
     """
     if name not in MANEUVERS:
         raise UserError(f"maneuver '{name}' is unknown; take one of {', '.join(MANEUVERS)}")
@@ -54,6 +55,9 @@ def maneuver_wrench(
         ]
     )
     wrench = np.abs(wrench) * np.sign(direction)
+    if not wrench.any():
+        axes = " and ".join(thrusters.unactuated)
+        raise UserError(f"maneuver '{name}': the thrusters can't actuate {axes}; leave it out")
     most = largest(thrusters, wrench)
     forces = thrusters.allocate(jnp.asarray(effort * most * wrench, thrusters.allocation.dtype))
     return np.asarray(thrusters.wrench(forces), float), np.asarray(forces, float)

@@ -75,7 +75,7 @@ _VARIABLES = {
 
 
 def _of_state(problem: DiagnosisProblem, effect: Unknown) -> Group:
-    d, k = problem.data, effect.size()
+    d, k = problem.data, len(effect.values)
 
     def columns(kept: np.ndarray) -> np.ndarray:
         X, V = (jnp.asarray(a[:-1][..., kept].swapaxes(0, 1)) for a in (d.X, d.V))
@@ -102,7 +102,7 @@ def _of_thruster(problem: DiagnosisProblem, k: int) -> Group:
             :, None
         ]
 
-    return Group(effect, "thruster", (f"f{k + 1}",), columns, (tuple(range(effect.size())),))
+    return Group(effect, "thruster", (f"f{k + 1}",), columns, (tuple(range(len(effect.values))),))
 
 
 def _of_exchange(problem: DiagnosisProblem) -> Group:

@@ -43,8 +43,8 @@ class Data:
     Attributes:
         X: recorded poses (N + 1, 7, R).
         V: recorded twists (N + 1, 6, R).
-        u: commanded thruster forces (N), held from n to n + 1 (N, 8, R).
-        past: those of the steps before (N), oldest first (P, 8, R): they set actuator states.
+        u: commanded thruster forces (N), held from n to n + 1 (N, n, R).
+        past: those of the steps before (N), oldest first (P, n, R): they set actuator states.
         past_step: how long each of these was held (s) (P, R).
         voltage: relative to the vehicle's nominal one (N, R).
         step: from sample n to n + 1 (s) (N, R).

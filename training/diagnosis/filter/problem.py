@@ -353,7 +353,8 @@ def _key(entry: tuple) -> tuple[str, str, str]:
 def _library(data: Data, effects: Sequence[Effect]) -> tuple[Library, np.ndarray]:
     kinds = [k for k in KINDS.values() if not k.random and k.needs <= data.offers]
     own = [e for e in effects if e.name not in {k.name for k in kinds}]
-    library = Library([*(k.neutral(**k.options_for(data.region)) for k in kinds), *own])
+    n, region = data.u.shape[1], data.region
+    library = Library([*(k.neutral(thrusters=n, **k.options_for(region)) for k in kinds), *own])
     theta = np.zeros(library.size)
     for effect in effects:
         rows = [i for where in effect.places for i in library.at(effect.name, where)]

@@ -205,7 +205,7 @@ def law_cause(
     experiment = of_law(top, rivals, problem, evaluation)
     parameters: dict[str, result.Value] = {}
     cls = kind(top.name)
-    values = np.zeros(cls.size())
+    values = np.zeros(len(cls.neutral().values))
     for number, law in enumerate(same):
         for name, value in _law_values(law, problem, evaluation).items():
             parameters[name if number == 0 else f"{name}_{law.where}"] = value

@@ -217,6 +217,61 @@ def test_reversed_thrusters_are_mirrored_unless_the_vehicle_has_them_so(tmp_path
     assert any("Thrusters 3 run the other way" in line for line in report.done)
 
 
+SIX = {f"SERVO{n}_FUNCTION": 32.0 + n for n in range(1, 7)}
+LIGHTS = {"SERVO7_FUNCTION": 0.0, "SERVO8_FUNCTION": 7.0}  # nothing, camera tilt
+
+
+@pytest.mark.parametrize(
+    ("parameters", "vehicle", "count"),
+    [
+        (PARAMETERS | {"FRAME_CONFIG": 1.0}, "bluerov2", 6),
+        (SIX | LIGHTS, "bluerov2", 6),
+        (SIX | LIGHTS | {"FRAME_CONFIG": 2.0}, "bluerov2_heavy", 8),
+        (SIX, "bluerov2_heavy", 8),  # what 7 and 8 do is not in the log
+        ({"FRAME_CONFIG": 1.0}, "bluerov2", 6),
+        ({}, "bluerov2_heavy", 8),
+    ],
+)
+def test_thrusters_are_those_of_the_frame_and_of_the_outputs(tmp_path, parameters, vehicle, count):
+    recording, report = imported(tmp_path, dive(parameters=parameters).bytes(), vehicle=None)
+    assert recording.vehicle == vehicle
+    (run,) = recording.trajectories()
+    t = run.start + recording.dt * (np.arange(len(run)) + 0.5)
+    expected = outputs(t)[:count]
+    stopped = [7] if parameters.get("SERVO8_FUNCTION") and count == 8 else []
+    expected[stopped] = 1500
+    assert np.abs(run.commands["pwm"].T - expected).max() < 2.0
+    told = [line for line in report.done if "thrusters, read as those of bluerov2" in line]
+    assert len(told) == (count == 6)
+    assert any("thrusters 8; they are taken as stopped" in line for line in report.done) == (
+        stopped != []
+    )
+
+
+def test_a_frame_that_contradicts_the_vehicle_is_refused(tmp_path, capsys):
+    (tmp_path / "dive.tlog").write_bytes(dive(parameters={"FRAME_CONFIG": 1.0}).bytes())
+    given = ["import", str(tmp_path / "dive.tlog"), "--vehicle", "bluerov2_heavy"]
+    with pytest.raises(SystemExit) as stop:
+        main([*given, "--out", str(tmp_path / "dive.nc")])
+    assert stop.value.code == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert "FRAME_CONFIG 1 is that of a vehicle with 6 thrusters, and bluerov2_heavy has 8" in told
+    assert "--vehicle bluerov2" in told
+    assert not (tmp_path / "dive.nc").exists()
+
+
+@pytest.mark.parametrize("name", ["dive.tlog.xz", "dive.BIN.xz"])
+def test_the_six_thruster_dive_has_six(name):
+    """Motors 1 … 6 of a frame VECTORED; output 8 is a camera's."""
+    recording, report = import_log(shared_data("data", "sitl_six_plain", name))
+    assert recording.vehicle == "bluerov2"
+    assert {run.commands["pwm"].shape[1] for run in recording.trajectories()} == {6}
+    assert any("FRAME_CONFIG 1: 6 thrusters" in line for line in report.done)
+    assert not any("No output is assigned" in line for line in report.done)
+    spread = np.concatenate([run.commands["pwm"] for run in recording.trajectories()]).std(axis=0)
+    assert spread.min() > 10  # µs: each was driven
+
+
 def test_without_a_horizontal_estimate_only_the_vertical_is_kept(tmp_path):
     recording, report = imported(tmp_path, dive(horizontal=False).bytes())
     assert recording.missing == {"X_WB": ("x", "y"), "V_WB_B": ("u", "v")}
@@ -457,8 +512,8 @@ def test_load_data_takes_everything(tmp_path):
     log.write_bytes(dive().bytes())
     recording = load_data(log)
     recording.save(tmp_path / "dive.nc")
-    again = load_data(tmp_path / "dive.nc", vehicle="bluerov2_wu")
-    assert again.vehicle == "bluerov2_wu"
+    again = load_data(tmp_path / "dive.nc", vehicle="bluerov2_heavy_ng")
+    assert again.vehicle == "bluerov2_heavy_ng"
     assert again.scenarios == recording.scenarios
     with pytest.raises(UserError, match="recorded at 20 Hz, not 50"):
         load_data(tmp_path / "dive.nc", rate=50.0)

@@ -34,7 +34,8 @@ class Import:
     rate: Annotated[float, Within(1, 400)] = 20.0
     """Samples per second."""
     vehicle: str | None = None
-    """Preset name or YAML file of the vehicle; by default what the data name, or bluerov2_heavy."""
+    """Preset name or YAML file of the vehicle; by default what the data name, or for a log bluerov2
+    if its frame has six thrusters, else bluerov2_heavy."""
 
     minimum: Annotated[float, Within(0.5, 3600)] = 5.0
     """Shortest stretch of a log that is kept (s)."""

@@ -1,7 +1,6 @@
 """A vehicle's log to a recording: telemetry (.tlog) and DataFlash (.BIN), plain or .xz/.gz."""
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -50,7 +49,7 @@ def import_log(
     path: str | os.PathLike[str],
     *,
     rate: float | None = RATES[-1],
-    vehicle: str = "bluerov2_heavy",
+    vehicle: str | None = None,
     options: LogOptions | None = None,
     progress: Progress = no_progress,
 ) -> tuple[Recording, ImportReport]:
@@ -60,20 +59,23 @@ def import_log(
         path: the log; its kind is determined from its content.
         rate: of the recording (Hz); None takes that of the slowest stream of state and outputs,
             within 20 to 50 Hz.
-        vehicle: preset or file whose thruster directions the PWM is to have; named in the result.
+        vehicle: preset or file whose thruster directions the PWM is to have; None takes the preset
+            with the thrusters of the log's frame (`wiring`). It is named in the result.
         options: what is taken from the log.
         progress: called with the fraction done, 0 to 1.
 
     Raises:
-        UserError: if there is no such log, it can't be read, or nothing usable is in it.
+        UserError: if there is no such log, it can't be read, nothing usable is in it, or its frame
+            has another number of thrusters than the vehicle.
     """
     path = Path(path)
     options = options or LogOptions()
     _check_options(RATES[-1] if rate is None else rate, options)
-    motors = [mount.motor for mount in load_vehicle(vehicle).propulsion.mounts]
+    if vehicle is not None:
+        load_vehicle(vehicle)
     raw = read_log_bytes(path, progress)
     try:
-        signals = _signals(raw, motors, options, progress)
+        signals = _signals(raw, vehicle, options, progress)
         rate = own_rate(signals) if rate is None else rate
         trajectories, lines, dropped = fuse(
             signals,
@@ -94,7 +96,11 @@ def import_log(
     report = tell(signals, path.name, trajectories, lines, [*raw.notes, *dropped], 1.0 / rate)
     try:
         recording = Recording.from_trajectories(
-            trajectories, 1.0 / rate, vehicle=vehicle, source=path.name, notes=report.notes()
+            trajectories,
+            1.0 / rate,
+            vehicle=signals.vehicle,
+            source=path.name,
+            notes=report.notes(),
         )
         check_plausible(recording.dataset)
     except ValueError as error:
@@ -126,7 +132,7 @@ def load_data(
         path: file, or folder with a `recording.yaml`.
         rate: Hz; None keeps that of the data (20 for logs, or that of `own_rate` if `resample` is
             False).
-        vehicle: preset or file; None keeps the one that the data name (bluerov2_heavy for logs).
+        vehicle: preset or file; None keeps the one that the data name, or that of a log's frame.
         options: what is taken from a log.
         resample: False keeps the unevenly spaced samples of CSV files.
         progress: called with the fraction done, 0 to 1.
@@ -157,7 +163,7 @@ def load_data(
         logged, _ = import_log(
             path,
             rate=RATES[-1] if rate is None and resample else rate,
-            vehicle=vehicle or "bluerov2_heavy",
+            vehicle=vehicle,
             options=options,
             progress=progress,
         )
@@ -173,15 +179,15 @@ def load_data(
 
 def _signals(
     raw: LogBytes,
-    motors: Sequence[float],
+    vehicle: str | None,
     options: LogOptions,
     progress: Progress,
 ) -> Signals:
     if raw.kind == "bin":
         read = read_bin(raw.data, BIN_WANTED, progress)
-        return signals_from_bin(read, motors, options.water_density)
+        return signals_from_bin(read, vehicle, options.water_density)
     log = read_tlog(raw.data, TLOG_WANTED, options.system, progress)
-    return signals_from_tlog(log, motors, options.water_density)
+    return signals_from_tlog(log, vehicle, options.water_density)
 
 
 def _check_options(rate: float, options: LogOptions) -> None:

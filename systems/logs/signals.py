@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ...models.recordings.schema import LIMITS
-from ..mavlink.codec import MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS, filter_delay, thruster_pwm
+from ..mavlink.codec import filter_delay
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ class Signals:
         rates: ω of B in W, in B (rad/s).
         specific_force: in B (m/s²).
         pressure_depth: m, positive down.
-        outputs: PWM (µs) of thrusters 1 … 8, direction normalised.
+        outputs: PWM (µs) of the vehicle's thrusters, direction normalised.
+        vehicle: preset or file whose thrusters these are.
         spans: armed, mode, aiding, wiring: the states that are constant within a segment.
         cuts: times at which a segment must end: resets, reboots.
     """
@@ -59,6 +60,7 @@ class Signals:
     attitude: Series
     rates: Series
     outputs: Series
+    vehicle: str = ""
     position: Series | None = None
     velocity: Series | None = None
     specific_force: Series | None = None
@@ -125,7 +127,7 @@ def undelayed(one: Series, known: Mapping[str, float], parameter: str) -> tuple[
     ]
 
 
-# which output drives which thruster
+# parameters
 
 
 @dataclass(frozen=True)
@@ -139,6 +141,7 @@ class Parameter:
 
 _RANGES = (
     (r"SERVO\d+_FUNCTION", -1.0, 255.0),
+    (r"FRAME_CONFIG", 0.0, 20.0),
     (r"MOT_\d+_DIRECTION", -1.0, 1.0),
     (r"INS_(GYRO|ACCEL)_FILTER", 0.0, 1000.0),
     (r"BARO_SPEC_GRAV", 0.9, 1.2),
@@ -166,114 +169,3 @@ def parameters_of(
             strange.append(f"{name} {value:g}")
     said = [f"Parameters that can't be were left out: {', '.join(strange)}."] if strange else []
     return found, said
-
-
-@dataclass(frozen=True)
-class Wiring:
-    """Output channels (1-based) and directions of thrusters 1 … 8; spans of reassigned outputs."""
-
-    channels: tuple[int, ...]
-    directions: tuple[int, ...]
-    spans: Spans
-    notes: tuple[str, ...]
-
-
-_SETTLING_S = 1.3  # an output's new function is in force by then
-
-
-def wiring(parameters: Sequence[Parameter], first: float, last: float) -> Wiring:
-    """Read thruster wiring from SERVOn_FUNCTION and MOT_n_DIRECTION as they were during the log.
-
-    A channel that ever had motor function 33 … 40 drives that thruster, even while it is set to
-    pass-through (1, 51 … 66) or off.
-    """
-    functions: dict[int, list[tuple[float, int]]] = {}
-    directions: dict[int, int] = {}
-    notes = []
-    for p in parameters:
-        servo = re.fullmatch(r"SERVO([1-9]|1[0-6])_FUNCTION", p.name)
-        motor = re.fullmatch(r"MOT_([1-8])_DIRECTION", p.name)
-        if servo:
-            functions.setdefault(int(servo[1]), []).append((p.t, round(p.value)))
-        elif motor:
-            directions[int(motor[1])] = -1 if p.value < 0 else 1
-    motor_of = {
-        channel: next((f - 32 for _, f in history if f in MOTOR_FUNCTIONS), None)
-        for channel, history in sorted(functions.items())
-    }
-    channel_of = {motor: channel for channel, motor in motor_of.items() if motor is not None}
-    if not channel_of:
-        notes.append("No SERVOn_FUNCTION in the log: outputs 1–8 are taken as thrusters 1–8.")
-    else:
-        absent = [motor for motor in range(1, 9) if motor not in channel_of]
-        if absent:
-            notes.append(
-                f"No output is assigned to thrusters {', '.join(map(str, absent))}; outputs of "
-                "these numbers are taken."
-            )
-    if not directions:
-        notes.append("No MOT_n_DIRECTION in the log: all directions are taken as +1.")
-    channels = tuple(channel_of.get(motor, motor) for motor in range(1, 9))
-    changes = _label_changes({c: functions[c] for c in channel_of.values()})
-    return Wiring(
-        channels,
-        tuple(directions.get(motor, 1) for motor in range(1, 9)),
-        _settled(changes, first, last),
-        tuple(notes),
-    )
-
-
-def _label_changes(functions: Mapping[int, Sequence[tuple[float, int]]]) -> list[tuple[float, str]]:
-    events = sorted((t, c, f) for c, history in functions.items() for t, f in history[1:])
-    now = {c: history[0][1] for c, history in functions.items()}
-    changes = [(-np.inf, _label(now))]
-    for t, c, f in events:
-        if now[c] != f:
-            now[c] = f
-            changes.append((t, _label(now)))
-    return changes
-
-
-def _label(functions: Mapping[int, int]) -> str:
-    if all(f in MOTOR_FUNCTIONS for f in functions.values()):
-        return ""
-    if any(f in PASS_THROUGH_FUNCTIONS for f in functions.values()):
-        return "pass-through"
-    return "outputs off"
-
-
-def _settled(changes: Sequence[tuple[float, str]], first: float, last: float) -> Spans:
-    start, stop, labels = [], [], []
-    times = [t for t, _ in changes[1:]] + [last]
-    for (t, label), until in zip(changes, times, strict=True):
-        begin = first if np.isinf(t) else t + _SETTLING_S
-        if until > begin:
-            start.append(begin)
-            stop.append(until)
-            labels.append(label)
-    return Spans(np.array(start), np.array(stop), tuple(labels))
-
-
-def thruster_outputs(
-    t: np.ndarray, channels_us: np.ndarray, wired: Wiring, motors: Sequence[float], source: str
-) -> tuple[Series | None, list[str]]:
-    """PWM of thrusters 1 … 8 from output channels (16, n), with the signs of the vehicle's file.
-
-    `motors` are the directions in the vehicle's description; where the log's MOT_n_DIRECTION
-    differs, the value is mirrored about 1500.
-    """
-    notes = []
-    index = np.array(wired.channels) - 1
-    raw = channels_us[index]
-    mirror = np.array(wired.directions) * np.asarray(motors)
-    if (mirror < 0).any():
-        which = ", ".join(str(i + 1) for i in np.flatnonzero(mirror < 0))
-        notes.append(
-            f"Thrusters {which} run the other way than in the vehicle's description "
-            "(MOT_n_DIRECTION); their PWM is mirrored about 1500."
-        )
-    dead = (raw == 0).all(axis=1)
-    if dead.any():
-        which = ", ".join(str(i + 1) for i in np.flatnonzero(dead))
-        notes.append(f"Thrusters {which} never got a pulse; they are taken as stopped.")
-    return series(t, thruster_pwm(raw, mirror[:, None]), source, "pwm"), notes

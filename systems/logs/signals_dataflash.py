@@ -18,12 +18,11 @@ from .signals import (
     parameters_of,
     sampled_spans,
     series,
-    thruster_outputs,
     undelayed,
-    wiring,
 )
 from .signals_tlog import UNAIDED
 from .table import Table, whole
+from .wiring import Wiring, thruster_outputs, wiring
 
 WANTED = (
     "ACC",
@@ -52,12 +51,13 @@ _LATEST_S = 1e9  # of a clock that counts from the boot
 
 
 def signals_from_bin(
-    log: BinLog, motors: Sequence[float] = (1.0,) * 8, density: float | None = None
+    log: BinLog, vehicle: str | None = None, density: float | None = None
 ) -> Signals:
-    """Convert an autopilot's own log; `motors` and `density` as in `import_log`.
+    """Convert an autopilot's own log; `vehicle` and `density` as in `import_log`.
 
     Raises:
-        UserError: if attitude, rates or thruster outputs are not in the log.
+        UserError: if attitude, rates or thruster outputs are not in the log, or the vehicle is
+            another.
     """
     usable = {name: _usable(table) for name, table in log.tables.items()}
     tables = {name: table for name, table in usable.items() if table["t"].size}
@@ -69,8 +69,8 @@ def signals_from_bin(
         ([], []) if table is None else parameters_of(table["t"], table["Name"], table["Value"])
     )
     known = {p.name: p.value for p in parameters}
-    wired = wiring(parameters, first, last)
-    outputs, notes = _outputs(tables, wired, motors)
+    wired = wiring(parameters, first, last, vehicle)
+    outputs, notes = _outputs(tables, wired)
     position, velocity = _motion(tables, core, known, density)
     rates, rate_notes = _rates(tables, core)
     force = _imu(tables, core, "ACC", ("AccX", "AccY", "AccZ"), "specific force")
@@ -85,6 +85,7 @@ def signals_from_bin(
         attitude=attitude,
         rates=rates,
         outputs=outputs,
+        vehicle=wired.vehicle,
         position=position,
         velocity=velocity,
         specific_force=force,
@@ -226,9 +227,7 @@ def _states(tables: Mapping[str, Table], first: float, last: float) -> dict[str,
     return spans
 
 
-def _outputs(
-    tables: Mapping[str, Table], wired: object, motors: Sequence[float]
-) -> tuple[Series, list[str]]:
+def _outputs(tables: Mapping[str, Table], wired: Wiring) -> tuple[Series, list[str]]:
     if "RCOU" not in tables:
         raise UserError(
             "no RCOU in this log, so nothing tells what the thrusters did; "
@@ -242,8 +241,7 @@ def _outputs(
     outputs, notes = thruster_outputs(
         table["t"],
         channels,
-        wired,  # pyright: ignore[reportArgumentType]
-        motors,
+        wired,
         "RCOU",
     )
     if outputs is None:

@@ -1,25 +1,16 @@
 """From telemetry messages to signals."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from ...models.config.errors import UserError
 from ..mavlink import codec
 from .depth import in_water
-from .signals import (
-    Series,
-    Signals,
-    Spans,
-    parameters_of,
-    sampled_spans,
-    series,
-    thruster_outputs,
-    undelayed,
-    wiring,
-)
+from .signals import Series, Signals, Spans, parameters_of, sampled_spans, series, undelayed
 from .table import Table
 from .tlog import TlogLog
+from .wiring import Wiring, thruster_outputs, wiring
 
 WANTED = (
     "ATTITUDE",
@@ -47,12 +38,12 @@ _VELOCITY_HORIZ, _POS_HORIZ, _CONST_POS = 2, 8 | 16, 128
 
 
 def signals_from_tlog(
-    log: TlogLog, motors: Sequence[float] = (1.0,) * 8, density: float | None = None
+    log: TlogLog, vehicle: str | None = None, density: float | None = None
 ) -> Signals:
-    """Convert a vehicle's messages; `motors` and `density` as in `import_log`.
+    """Convert a vehicle's messages; `vehicle` and `density` as in `import_log`.
 
     Raises:
-        UserError: if attitude or thruster outputs are not in the log.
+        UserError: if attitude or thruster outputs are not in the log, or the vehicle is another.
     """
     tables = log.tables
     attitude = _attitude(tables)
@@ -69,9 +60,9 @@ def signals_from_tlog(
         if table is None
         else parameters_of(table["t"], table["param_id"], table["param_value"])
     )
-    wired = wiring(parameters, first, last)
+    wired = wiring(parameters, first, last, vehicle)
     known = {p.name: p.value for p in parameters}
-    outputs, notes = _outputs(outputs_table, wired, motors)
+    outputs, notes = _outputs(outputs_table, wired)
     aiding = _aiding(tables)
     position, velocity = _motion(tables, known, density)
     rates, bias_note = _rates(tables, attitude)
@@ -86,6 +77,7 @@ def signals_from_tlog(
         attitude=attitude,
         rates=rates,
         outputs=outputs,
+        vehicle=wired.vehicle,
         position=position,
         velocity=velocity,
         specific_force=force,
@@ -185,14 +177,13 @@ def _states(tables: Mapping[str, Table]) -> dict[str, Spans]:
     }
 
 
-def _outputs(table: Table, wired: object, motors: Sequence[float]) -> tuple[Series, list[str]]:
+def _outputs(table: Table, wired: Wiring) -> tuple[Series, list[str]]:
     main = table["port"] == 0
     channels = np.stack([table[f"servo{n}_raw"][main] for n in range(1, 17)])
     outputs, notes = thruster_outputs(
         table["t"][main],
         channels,
-        wired,  # pyright: ignore[reportArgumentType]
-        motors,
+        wired,
         "SERVO_OUTPUT_RAW",
     )
     if outputs is None:

@@ -104,15 +104,19 @@ def command_of_felt(
 ) -> Float[np.ndarray, "6 6"] | None:
     """The change of the commanded wrench for a unit change of the one that acts on the body.
 
-    The inverse of the model's mean slope over ± `scale` (N, N·m) about a command of zero, at rest;
-    None where it is the identity, as for every model without effects on its thrusters, and where
-    the slope is nearly singular.
+    The inverse of the model's mean slope over ± `scale` (N, N·m) about a command of zero, at rest,
+    on the axes with a scale; None where it is the identity, as for every model without effects on
+    its thrusters, and where the slope is nearly singular.
     """
+    given = np.ix_(scale > 0, scale > 0)
+    scale = np.where(scale > 0, scale, 1.0)
     X = jnp.asarray(X_WB, dynamics.rigid_inertia.dtype)
     steps = jnp.asarray(np.concatenate([np.diag(scale), -np.diag(scale)], axis=1), X.dtype)
     X = jnp.broadcast_to(X[:, None], (7, 12))
     felt = np.asarray(dynamics.balance(X, jnp.zeros_like(steps), steps)[1], float)
-    slope = (felt[:, :6] - felt[:, 6:]) / (2 * scale)
-    if np.allclose(slope, np.eye(6), atol=1e-3) or np.linalg.cond(slope) > _WORST:
+    slope = ((felt[:, :6] - felt[:, 6:]) / (2 * scale))[given]
+    if np.allclose(slope, np.eye(len(slope)), atol=1e-3) or np.linalg.cond(slope) > _WORST:
         return None
-    return np.linalg.inv(slope)
+    command = np.zeros((6, 6))
+    command[given] = np.linalg.inv(slope)
+    return command

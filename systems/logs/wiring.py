@@ -1,0 +1,191 @@
+"""Which output of the autopilot drives which thruster of which vehicle."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...models.config.errors import UserError
+from ...models.vehicles.vehicle import load_vehicle
+from ..mavlink.codec import MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS, thruster_pwm
+from .signals import Parameter, Series, Spans, series
+
+_FRAMES = {1: 6, 2: 8}
+"""Thrusters of ArduSub's frames VECTORED and VECTORED_6DOF, by FRAME_CONFIG."""
+_PRESETS, _USUAL = {6: "bluerov2", 8: "bluerov2_heavy"}, 8
+_OFF = 0  # SERVOn_FUNCTION of an output that the autopilot leaves to DO_SET_SERVO
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """Thrusters of a vehicle as a log's outputs drive them.
+
+    Attributes:
+        vehicle: preset or file.
+        channels: output of each thruster (1-based), 0 where none drives it.
+        mirrored: those that turn the other way than in the vehicle's file.
+        spans: of reassigned outputs.
+    """
+
+    vehicle: str
+    channels: tuple[int, ...]
+    mirrored: tuple[bool, ...]
+    spans: Spans
+    notes: tuple[str, ...]
+
+
+_SETTLING_S = 1.3  # an output's new function is in force by then
+
+
+def wiring(
+    parameters: Sequence[Parameter], first: float, last: float, vehicle: str | None = None
+) -> Wiring:
+    """Read frame and thruster wiring from the parameters as they were during the log.
+
+    A channel that ever had motor function 33 … 40 drives that thruster, even while it is set to
+    pass-through (1, 51 … 66) or off. Without a named `vehicle` it is the preset with the frame's
+    number of thrusters, with eight if the log doesn't tell.
+
+    Raises:
+        UserError: the log's frame has another number of thrusters than the named vehicle.
+    """
+    functions: dict[int, list[tuple[float, int]]] = {}
+    directions: dict[int, int] = {}
+    frame = None
+    for p in parameters:
+        servo = re.fullmatch(r"SERVO([1-9]|1[0-6])_FUNCTION", p.name)
+        motor = re.fullmatch(r"MOT_([1-8])_DIRECTION", p.name)
+        if servo:
+            functions.setdefault(int(servo[1]), []).append((p.t, round(p.value)))
+        elif motor:
+            directions[int(motor[1])] = -1 if p.value < 0 else 1
+        elif p.name == "FRAME_CONFIG":
+            frame = round(p.value)
+    motor_of = {
+        channel: next((f - 32 for _, f in history if f in MOTOR_FUNCTIONS), None)
+        for channel, history in sorted(functions.items())
+    }
+    channel_of = {motor: channel for channel, motor in motor_of.items() if motor is not None}
+    name, notes = _vehicle(vehicle, frame, channel_of, functions)
+    mounts = load_vehicle(name).propulsion.mounts
+    channels, told = _channels(len(mounts), channel_of, functions)
+    if not directions:
+        told.append("No MOT_n_DIRECTION in the log: all directions are taken as +1.")
+    changes = _label_changes({c: functions[c] for c in channel_of.values()})
+    return Wiring(
+        name,
+        tuple(channels),
+        tuple(mount.motor * directions.get(i, 1) < 0 for i, mount in enumerate(mounts, 1)),
+        _settled(changes, first, last),
+        (*notes, *told),
+    )
+
+
+_Functions = Mapping[int, Sequence[tuple[float, int]]]
+
+
+def _vehicle(
+    named: str | None, frame: int | None, channel_of: Mapping[int, int], functions: _Functions
+) -> tuple[str, list[str]]:
+    """The vehicle's name, and a sentence if it is not the usual one."""
+    count, told = _FRAMES.get(-1 if frame is None else frame), f"FRAME_CONFIG {frame}"
+    six = set(channel_of) == set(range(1, 7)) and functions.keys() >= {7, 8}
+    if count is None and six and not _drives(functions[7]) and not _drives(functions[8]):
+        count, told = 6, "SERVOn_FUNCTION"
+    if named is None:
+        name = _PRESETS[count or _USUAL]
+        said = f"{told}: {count} thrusters, read as those of {name} (--vehicle names another)."
+        return name, [] if count in (None, _USUAL) else [said]
+    own = len(load_vehicle(named).propulsion.mounts)
+    if count not in (None, own):
+        raise UserError(
+            f"{told} is that of a vehicle with {count} thrusters, and {named} has {own}; leave the "
+            f"vehicle out, or name one with {count} (--vehicle {_PRESETS[count]})"
+        )
+    return named, []
+
+
+def _drives(history: Sequence[tuple[float, int]]) -> bool:
+    return any(f in (*MOTOR_FUNCTIONS, *PASS_THROUGH_FUNCTIONS) for _, f in history)
+
+
+def _used(history: Sequence[tuple[float, int]]) -> bool:
+    return any(f != _OFF for _, f in history)
+
+
+def _channels(
+    count: int, channel_of: Mapping[int, int], functions: _Functions
+) -> tuple[list[int], list[str]]:
+    """The outputs of all thrusters; one without an own output has that of its number if free."""
+    numbers = range(1, count + 1)
+    other = {n for n, history in functions.items() if not _drives(history) and _used(history)}
+    free = set(numbers) - other - set(channel_of.values())
+    channels = [channel_of.get(n, n if n in free else 0) for n in numbers]
+    if not channel_of:
+        return channels, [
+            f"No SERVOn_FUNCTION in the log: outputs 1–{count} are taken as thrusters 1–{count}."
+        ]
+    notes = []
+    words = {True: "outputs of these numbers are taken", False: "they are taken as stopped"}
+    for taken, said in words.items():
+        absent = [str(n) for n in numbers if n not in channel_of and (n in free) == taken]
+        if absent:
+            notes.append(f"No output is assigned to thrusters {', '.join(absent)}; {said}.")
+    return channels, notes
+
+
+def _label_changes(functions: Mapping[int, Sequence[tuple[float, int]]]) -> list[tuple[float, str]]:
+    events = sorted((t, c, f) for c, history in functions.items() for t, f in history[1:])
+    now = {c: history[0][1] for c, history in functions.items()}
+    changes = [(-np.inf, _label(now))]
+    for t, c, f in events:
+        if now[c] != f:
+            now[c] = f
+            changes.append((t, _label(now)))
+    return changes
+
+
+def _label(functions: Mapping[int, int]) -> str:
+    if all(f in MOTOR_FUNCTIONS for f in functions.values()):
+        return ""
+    if any(f in PASS_THROUGH_FUNCTIONS for f in functions.values()):
+        return "pass-through"
+    return "outputs off"
+
+
+def _settled(changes: Sequence[tuple[float, str]], first: float, last: float) -> Spans:
+    start, stop, labels = [], [], []
+    times = [t for t, _ in changes[1:]] + [last]
+    for (t, label), until in zip(changes, times, strict=True):
+        begin = first if np.isinf(t) else t + _SETTLING_S
+        if until > begin:
+            start.append(begin)
+            stop.append(until)
+            labels.append(label)
+    return Spans(np.array(start), np.array(stop), tuple(labels))
+
+
+def thruster_outputs(
+    t: np.ndarray, channels_us: np.ndarray, wired: Wiring, source: str
+) -> tuple[Series | None, list[str]]:
+    """PWM of the thrusters from output channels (16, n), with the signs of the vehicle's file.
+
+    Where the log's MOT_n_DIRECTION differs from it, the value is mirrored about 1500.
+    """
+    notes = []
+    index = np.array(wired.channels)[:, None]
+    raw = np.where(index > 0, channels_us[index[:, 0] - 1], 0)
+    mirrored = np.array(wired.mirrored)
+    if mirrored.any():
+        which = ", ".join(str(i + 1) for i in np.flatnonzero(mirrored))
+        notes.append(
+            f"Thrusters {which} run the other way than in the vehicle's description "
+            "(MOT_n_DIRECTION); their PWM is mirrored about 1500."
+        )
+    dead = (raw == 0).all(axis=1) & (index[:, 0] > 0)
+    if dead.any():
+        which = ", ".join(str(i + 1) for i in np.flatnonzero(dead))
+        notes.append(f"Thrusters {which} never got a pulse; they are taken as stopped.")
+    signs = np.where(mirrored, -1, 1)[:, None]
+    return series(t, thruster_pwm(raw, signs), source, "pwm"), notes

@@ -37,8 +37,8 @@ class Diagnose:
     data: Positional[Path]
     """Recording (.nc), CSV folder or log (.tlog, .BIN)."""
     vehicle: str | None = None
-    """Preset name or YAML file; by default what the data name, else the model's, else
-    bluerov2_heavy."""
+    """Preset name or YAML file; by default what the data name, else the model's, else that of a
+    log's frame, else bluerov2_heavy."""
     model: Path | None = None
     """Model file (.spinn) to believe instead of the preset."""
     diffusion: Annotated[Vector6 | None, Within(0, 1e6)] = None
@@ -125,9 +125,10 @@ class Diagnose:
         """The vehicle given, or that of the data or the model; else the default, with a message."""
         stated = self.vehicle or ("" if self._is_log() else recorded) or named
         if not stated:
-            told = f"{self.data.name} states no vehicle, so {_USUAL} is assumed; name another with "
+            stated = recorded or _USUAL  # that of a log's frame
+            told = f"{self.data.name} states no vehicle, so {stated} is assumed; name another with "
             console().print(told + "--vehicle", soft_wrap=True)
-        return stated or _USUAL
+        return stated
 
     def _is_log(self) -> bool:
         return self.data.is_file() and self.data.suffix.lower() not in _STATE_VEHICLES

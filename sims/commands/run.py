@@ -62,6 +62,8 @@ class Run:
         scenario = load_scenario(self.scenario, self.scenario_text)
         tell_code(self.scenario, scenario.code)
         scenario = scenario.with_changes(self.seed, self.duration, self.model)
+        if told := scenario.station.load_vehicle().limitation():
+            console().print(f"{told} What the controller asks for there has no effect.")
         with new_folder(self.out, scenario) as out:
             if self.quiet:
                 flown = simulate(scenario, engine=self.engine)

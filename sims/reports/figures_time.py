@@ -131,13 +131,15 @@ def wrench_figure(log: RunLog, limits: Float[np.ndarray, "6"] | None = None) -> 
 
 @styled
 def pwm_figure(log: RunLog, dead_band: tuple[float, float] = (1475.0, 1525.0)) -> Figure | None:
-    """Pulse widths of the eight thrusters; the grey band gives no thrust. None without PWM."""
+    """Pulse widths of the thrusters; the grey band gives no thrust. None without PWM."""
     if "pwm" not in log:
         return None
     pwm = log["pwm"]
-    columns = pwm.shape[1] // 2
+    columns = (pwm.shape[1] + 1) // 2
     figure, axes = panels(2, columns, 3.5, sharex=True, sharey=True)
-    for k, ax in enumerate(axes.flat):
+    for ax in axes.flat[pwm.shape[1] :]:
+        ax.set_axis_off()
+    for k, ax in enumerate(axes.flat[: pwm.shape[1]]):
         ax.axhspan(*dead_band, color=OBSTACLE, alpha=0.25, lw=0)
         for end in PWM_RANGE:
             ax.axhline(end, color=LIMIT, lw=1, ls="--")

@@ -58,6 +58,7 @@ def run_page(
     description: str = "",
     scenario_text: str = "",
     limits: Float[np.ndarray, "6"] | None = None,
+    limitation: str = "",
     clearance: Float[np.ndarray, " n"] | None = None,
     replay: str = "",
 ) -> Page:
@@ -71,6 +72,7 @@ def run_page(
         description: a sentence below it.
         scenario_text: the resolved scenario.
         limits: largest wrench along each axis alone.
+        limitation: axes that the thrusters can't actuate, in a sentence.
         clearance: of the hull to the nearest obstacle over the log's time (m).
         replay: address of the 3-D replay.
     """
@@ -83,7 +85,7 @@ def run_page(
     page.figure(
         wrench_figure(log, limits),
         "Commanded wrench in B. Dashed, where it is near: the largest wrench that the thrusters "
-        "can give along that axis alone.",
+        f"can give along that axis alone. {limitation}".rstrip(),
     )
     pwm = pwm_figure(log)
     if pwm is not None:

@@ -102,6 +102,7 @@ def report_page(run: Run, values: dict[str, Any], replay: str = "") -> Page:
         description=run.scenario.description,
         scenario_text=typed_yaml.dump(run.scenario),
         limits=np.asarray(limits),
+        limitation=vehicle.limitation(),
         clearance=clearance(run.log, vehicle, station.obstacles),
         replay=replay,
     )

@@ -26,8 +26,9 @@ class Plant:
         self.rigid, self.added = vehicle.rigid_mass(), vehicle.added_mass
         self.inverse = np.linalg.inv(self.rigid + self.added)
         self.allocation = vehicle.allocation()
-        self.lag = sum((e.lag() for e in self.effects), np.zeros(8))
-        self.delay = sum((e.delay() for e in self.effects), np.zeros(8))
+        none = np.zeros(vehicle.directions.shape[1])
+        self.lag = sum((e.lag() for e in self.effects), none)
+        self.delay = sum((e.delay() for e in self.effects), none)
         self.shifts = {k: s for e in self.effects for k, s in e.shift().items()}
         self.lagged = bool(np.any(self.lag > 0))
         self.own: dict[int, slice] = {}

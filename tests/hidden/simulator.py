@@ -116,10 +116,11 @@ def simulate(
     y[:3], y[3:7], y[7:13] = setup.p0, setup.q0, setup.nu0
     states = np.empty((steps + 1, plant.size, B))
     states[0], past = y, [latents]
-    held = np.zeros((steps + 1, 8, B))  # commands, by inner step
+    n = plant.allocation.shape[1]
+    held = np.zeros((steps + 1, n, B))  # commands, by inner step
     taken = np.zeros_like(held)  # and what drives take them for
-    forces = np.zeros((N, 8, B))
-    current, index, run = np.zeros((8, B)), np.zeros(B, int), np.arange(B)
+    forces = np.zeros((N, n, B))
+    current, index, run = np.zeros((n, B)), np.zeros(B, int), np.arange(B)
     b = np.array(noise.diffusion)[:, None]
     noisy = bool(np.any(b > 0))
 

@@ -96,7 +96,8 @@ def _vehicle(
     if named is None:
         name = _PRESETS[count or _USUAL]
         said = f"{told}: {count} thrusters, read as those of {name} (--vehicle names another)."
-        return name, [] if count in (None, _USUAL) else [said]
+        more = load_vehicle(name).limitation()
+        return name, [] if count in (None, _USUAL) else [said, more]
     own = len(load_vehicle(named).propulsion.mounts)
     if count not in (None, own):
         raise UserError(

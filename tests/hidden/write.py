@@ -29,10 +29,10 @@ def runs(
 ) -> list[Run]:
     """Runs of a simulation in the columns of the CSV form.
 
-    `form` tells what `commands` (N, 8 or 6, B) are: f, pwm or wrench; `volts` (B,) fills the column
+    `form` tells what `commands` (N, n or 6, B) are: f, pwm or wrench; `volts` (B,) fills the column
     `voltage`.
     """
-    stems = WRENCH if form == "wrench" else [f"{form}{i + 1}" for i in range(8)]
+    stems = WRENCH if form == "wrench" else [f"{form}{i + 1}" for i in range(commands.shape[1])]
     out = []
     for b, name in enumerate(names):
         X, V = truth.X[:, :, b], truth.V[:, :, b]

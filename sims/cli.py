@@ -14,7 +14,8 @@ _DESCRIPTION = """Learned stochastic dynamics and control for underwater vehicle
 The usual order: `import` a log (or `generate` one), `train` a model on it, `evaluate` the model on
 data it has not seen, `run` a mission with it. `diagnose` names what a simulation gets wrong,
 `check` measures diagnoses and the estimator where the answer is known, `study` compares the methods
-of training on simulated data, `demo` goes the whole way from a log that comes along to a dive.
+of training on simulated data, `vehicle` serves a simulated vehicle to ground stations, `demo` goes
+the whole way from a log that comes along to a dive.
 `spinndrift COMMAND --help` explains each."""
 
 
@@ -82,6 +83,7 @@ def _parsed(given: list[str]) -> _Command:
     from .commands.run import Run
     from .commands.study import Study
     from .commands.train import Train
+    from .commands.vehicle import Vehicle
     from .options import misread
 
     classes: dict[str, Any] = {
@@ -93,6 +95,7 @@ def _parsed(given: list[str]) -> _Command:
         "diagnose": Diagnose,
         "check": Check,
         "study": Study,
+        "vehicle": Vehicle,
         "demo": Demo,
     }
     if given and not given[0].startswith("-") and given[0] not in classes:

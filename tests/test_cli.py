@@ -41,7 +41,8 @@ TINY = TrainingConfig(
 
 
 COMMANDS = (
-    "import", "generate", "train", "evaluate", "run", "diagnose", "check", "study", "demo",
+    "import", "generate", "train", "evaluate", "run", "diagnose", "check", "study", "vehicle",
+    "demo",
 )  # fmt: skip
 GENERATED = (
     "--maneuvers", "surge-forward", "yaw-left", "--disturbances", "calm", "--trajectories", "3",

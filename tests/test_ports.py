@@ -42,6 +42,7 @@ def arguments() -> dict[str, dict]:
         "LearnedPlant": {"dynamics": dynamics, "thrusters": thrusters},
         "DisturbanceSource": {"disturbance": Combined()},
         "ThrustAllocation": {"thrusters": thrusters},
+        "PulseWidths": {"thrusters": thrusters},
         "Mppi": {"planner": planner},
         "Impedance": {"law": ImpedanceLaw(np.eye(6), np.eye(6), limits), "layout": PlanLayout()},
         "DisturbanceObserver": {"observer": MomentumObserver(dynamics)},

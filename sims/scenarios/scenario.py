@@ -14,6 +14,7 @@ from ...models.config.yaml_text import parse
 from ...systems.controllers.kinds import ControllerKind, MppiImpedance
 from ...systems.own import OwnSystem
 from ...systems.station.config import StationConfig
+from ..vehicle.config import VehicleServer
 from .criteria import FollowPath, ReachGoal, Safety
 
 _FOLDER = Path(__file__).parent
@@ -51,6 +52,7 @@ class Scenario:
         success: the success criterion.
         safety: limits that end any run.
         log: settings of the log.
+        vehicle_server: settings of `spinndrift vehicle`, which serves the station over MAVLink.
 
     Example:
         >>> known = load_scenario("station_keeping_calm")
@@ -66,6 +68,7 @@ class Scenario:
     station: StationConfig = field(default_factory=StationConfig)
     safety: Safety = field(default_factory=Safety)
     log: LogSettings = field(default_factory=LogSettings)
+    vehicle_server: VehicleServer | None = None
 
     def __post_init__(self) -> None:
         """Check fields that depend on each other."""

@@ -78,3 +78,26 @@ class ThrustAllocation(LeafSystem):
 
     def _put_forces(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._both(context)[output.size() :])
+
+
+class PulseWidths(LeafSystem):
+    """Pulse widths (µs) from outside in the place of an allocation, where an autopilot has its own.
+
+    .. pydrake_system::
+
+        name: PulseWidths
+        input_ports:
+        - pwm
+        output_ports:
+        - pwm
+
+    """
+
+    def __init__(self, thrusters: Thrusters):
+        super().__init__()
+        count = thrusters.positions.shape[1]
+        self._pwm = self.DeclareVectorInputPort("pwm", count)
+        self.DeclareVectorOutputPort("pwm", count, self._put, {self._pwm.ticket()})
+
+    def _put(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._pwm.Eval(context))

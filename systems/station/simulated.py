@@ -8,7 +8,7 @@ from pydrake.systems.primitives import ConstantVectorSource, RandomSource
 from ...models.sensors import Sensor
 from ..estimation.ekf import Ekf
 from ..own import check_ports
-from ..plant.allocation import ThrustAllocation
+from ..plant.allocation import PulseWidths, ThrustAllocation
 from ..plant.disturbance_source import DisturbanceSource
 from ..plant.learned_plant import LearnedPlant
 from ..plant.sensor_suite import SensorSuite
@@ -44,6 +44,17 @@ def make_station(
             "this version has no link to a vehicle; build the station with hardware=False"
         )
     return _simulated(config, estimator)
+
+
+def make_driven_station(config: StationConfig) -> Diagram:
+    """The simulated station with pulse widths as its input `pwm` (µs) in place of `F_Bo_B`.
+
+    Its thrusters have another driver: an autopilot.
+
+    Raises:
+        UserError: as `make_station`.
+    """
+    return _simulated(config, None, driven=True)
 
 
 def check_stand_in(system: System, config: StationConfig) -> None:
@@ -114,13 +125,14 @@ class StationBuilder:
         return dict.fromkeys(self.measured, suite) | self.systems
 
 
-def _simulated(config: StationConfig, estimator: System | None) -> Diagram:
+def _simulated(config: StationConfig, estimator: System | None, driven: bool = False) -> Diagram:
     thrusters = config.load_vehicle().thrusters()
     X0, V0 = config.initial_state()
     water_period = _WATER * config.period
     builder = DiagramBuilder()
     station, add = StationBuilder(builder), builder.AddNamedSystem
-    allocation = add("allocation", ThrustAllocation(thrusters, config.voltage))
+    driver = PulseWidths(thrusters) if driven else ThrustAllocation(thrusters, config.voltage)
+    allocation = add("allocation", driver)
     body = LearnedPlant(config.dynamics(), config.period, config.substeps, X0, V0, thrusters)
     plant = add("plant", body)
     water = add("disturbances", DisturbanceSource(config.disturbance(), water_period))
@@ -145,7 +157,8 @@ def _simulated(config: StationConfig, estimator: System | None) -> Diagram:
     builder.Connect(battery.get_output_port(), plant.GetInputPort("voltage"))
     _add_noises(builder, config, sensors, (plant, water, ekf))
 
-    builder.ExportInput(allocation.GetInputPort("F_Bo_B"), "F_Bo_B")
+    command = allocation.get_input_port(0)
+    builder.ExportInput(command, command.get_name())
     for name, source in (dict.fromkeys(needed, ekf) | sensors | {"pwm": allocation}).items():
         builder.ExportOutput(source.GetOutputPort(name), name)
     for name, size in reported.items():

@@ -1,0 +1,1 @@
+"""What the vehicle sends: the messages, and when each is due."""

@@ -1,0 +1,147 @@
+"""The server over sockets on loopback: real clients find a vehicle and command it."""
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from spinndrift.models.recordings.store import Recording
+from spinndrift.sims.scenarios.scenario import load_scenario
+from spinndrift.sims.vehicle.server import Server, open_all
+from spinndrift.sims.vehicle.simulation import Simulation
+from spinndrift.systems.mavlink.dialect import Message, Parser, mavlink
+from spinndrift.systems.mavlink.transport import Connection, Transport
+
+LIMIT = 60.0  # s of wall time for anything here, on a busy machine
+
+
+class Served:
+    """A server in a thread of its own, on free ports."""
+
+    def __init__(self, *connections: str):
+        scenario = load_scenario("station_keeping_calm")
+        self.transports = open_all(connections)
+        self.ports = [transport.port for transport in self.transports]
+        self.simulation = Simulation(scenario, len(self.transports))
+        self.server = Server(self.simulation, self.transports)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self.server.run, args=(self._stop,), daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join(LIMIT)
+        self.server.close()
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served]:
+    served = Served("tcpin:127.0.0.1:0", "udpin:127.0.0.1:0", "tcpin:127.0.0.1:0")
+    yield served
+    served.close()
+
+
+class Client:
+    """A ground station over a transport."""
+
+    def __init__(self, transport: Transport):
+        self.transport = transport
+        self.parser = Parser(255, 190)
+        self._beat = 0.0
+
+    def send(self, message: Message) -> None:
+        self.transport.write(self.parser.packed(message))
+
+    def until(self, wanted: Callable[[Message], bool], say: Message | None = None) -> Message:
+        """The first message that is wanted; heartbeats, and `say`, go out meanwhile."""
+        end = time.monotonic() + LIMIT
+        while time.monotonic() < end:
+            if time.monotonic() - self._beat > 0.2:
+                self._beat = time.monotonic()
+                self.send(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3))
+                if say is not None:
+                    self.send(say)
+            for message in self.parser.messages(self.transport.read(0.05)):
+                if wanted(message):
+                    return message
+        raise TimeoutError(f"nothing wanted within {LIMIT} s")
+
+    def command(self, number: int, *params: float) -> int:
+        filled = [*params, *[0.0] * 7][:7]
+        command = mavlink.MAVLink_command_long_message(1, 1, number, 0, *filled)
+        ack = self.until(lambda m: m.get_type() == "COMMAND_ACK", command)
+        return ack.result  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def armed(message) -> bool:
+    return message.get_type() == "HEARTBEAT" and bool(message.base_mode & 128)
+
+
+def disarmed(message) -> bool:
+    return message.get_type() == "HEARTBEAT" and not message.base_mode & 128
+
+
+@pytest.mark.parametrize("kind", ["tcp", "udp"])
+def test_a_client_arms_drives_and_disarms(served: Served, kind: str):
+    port = served.ports[0 if kind == "tcp" else 1]
+    name = "tcp" if kind == "tcp" else "udpout"
+    transport = Connection.parse(f"{name}:127.0.0.1:{port}").open()
+    client = Client(transport)
+    try:
+        client.until(lambda m: m.get_type() == "HEARTBEAT")
+        assert client.command(511, 36, 50_000) == 0
+        assert client.command(400, 1) == 0
+        forward = mavlink.MAVLink_manual_control_message(1, 1000, 0, 500, 0, 0)
+        client.until(armed, forward)
+
+        def driven(m) -> bool:
+            return m.get_type() == "SERVO_OUTPUT_RAW" and m.servo3_raw == 1700
+
+        client.until(driven, forward)
+        assert client.command(400, 0) == 0
+        client.until(disarmed)
+
+        def still(m) -> bool:
+            return m.get_type() == "SERVO_OUTPUT_RAW" and m.servo3_raw == 1500
+
+        client.until(still)
+    finally:
+        transport.close()
+
+
+def test_a_second_tcp_client_waits_and_takes_over(served: Served):
+    connection = Connection.parse(f"tcp:127.0.0.1:{served.ports[0]}")
+    first, second = connection.open(), connection.open()
+    try:
+        Client(first).until(lambda m: m.get_type() == "HEARTBEAT")
+        assert second.read(1.5) == b""
+        first.close()
+        Client(second).until(lambda m: m.get_type() == "HEARTBEAT")
+    finally:
+        first.close()
+        second.close()
+
+
+def test_the_command_serves_ends_at_a_signal_and_leaves_the_truth(tmp_path):
+    out = tmp_path / "served"
+    command = [sys.executable, "-m", "spinndrift", "vehicle", "station_keeping_calm"]
+    command += ["--connection", "tcpin:127.0.0.1:0", "--out", str(out)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stderr is not None
+        line = process.stderr.readline()
+        assert line.startswith("serving tcpin:127.0.0.1:")
+        transport = Connection.parse(f"tcp:127.0.0.1:{line.rsplit(':', 1)[1].strip()}").open()
+        Client(transport).until(lambda m: m.get_type() == "ATTITUDE")
+        transport.close()
+        process.terminate()
+        assert process.wait(LIMIT) == 0
+        process.stderr.close()
+    finally:
+        process.kill()
+        process.wait()
+    assert Recording.load(out / "truth.nc").dataset.sizes["time"] > 1
+    assert (out / "scenario.yaml").exists()

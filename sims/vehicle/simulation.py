@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..scenarios.scenario import Scenario
+from .autopilot.mixer import frame_for
 from .config import VehicleServer
 from .endpoint import dvl_messages
 from .plant import DvlReading, Plant
@@ -25,7 +26,8 @@ class Simulation:
         """
         self.settings = scenario.vehicle_server or VehicleServer()
         own = dict(self.settings.parameters)
-        Vehicle(own)  # before the plant, whose building takes long
+        Vehicle(own)  # these two before the plant, whose building takes long
+        frame_for(len(scenario.station.load_vehicle().propulsion.mounts))
         self.plant = Plant(scenario.station)
         parameters = self.plant.parameters() | own
         self.vehicle = Vehicle(parameters, self.settings.clock)

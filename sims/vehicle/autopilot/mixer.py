@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+from ....models.config.errors import UserError
 from .parameters import Parameters
 
 NEUTRAL = 1500
@@ -64,8 +65,17 @@ _COUPLED = (-1, -1, 1, 1)  # the sense of forward thrust in which a horizontal i
 
 
 def frame_for(thrusters: int) -> int:
-    """FRAME_CONFIG of a vehicle with six or eight thrusters in ArduSub's order."""
-    return {6: 1, 8: 2}[thrusters]
+    """FRAME_CONFIG of a vehicle with six or eight thrusters in ArduSub's order.
+
+    Raises:
+        UserError: it has another number of thrusters.
+    """
+    if thrusters not in (6, 8):
+        raise UserError(
+            f"the vehicle has {thrusters} thrusters: the simulated autopilot flies six (frame "
+            "VECTORED) or eight (VECTORED_6DOF)"
+        )
+    return 1 if thrusters == 6 else 2
 
 
 def mix(parameters: Parameters, frame: int, demands: Demands, most_throttle: float) -> list[int]:

@@ -2,39 +2,15 @@
 
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 
 import pytest
+from served_vehicle import LIMIT, Served
 
 from spinndrift.models.recordings.store import Recording
-from spinndrift.sims.scenarios.scenario import load_scenario
-from spinndrift.sims.vehicle.server import Server, open_all
-from spinndrift.sims.vehicle.simulation import Simulation
 from spinndrift.systems.mavlink.dialect import Message, Parser, mavlink
 from spinndrift.systems.mavlink.transport import Connection, Transport
-
-LIMIT = 60.0  # s of wall time for anything here, on a busy machine
-
-
-class Served:
-    """A server in a thread of its own, on free ports."""
-
-    def __init__(self, *connections: str):
-        scenario = load_scenario("station_keeping_calm")
-        self.transports = open_all(connections)
-        self.ports = [transport.port for transport in self.transports]
-        self.simulation = Simulation(scenario, len(self.transports))
-        self.server = Server(self.simulation, self.transports)
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self.server.run, args=(self._stop,), daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        self._stop.set()
-        self._thread.join(LIMIT)
-        self.server.close()
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,28 @@
+"""A vehicle served in a thread of the test's own process."""
+
+import threading
+
+from spinndrift.sims.scenarios.scenario import load_scenario
+from spinndrift.sims.vehicle.server import Server, open_all
+from spinndrift.sims.vehicle.simulation import Simulation
+
+LIMIT = 60.0  # s of wall time for anything with a server, on a busy machine
+
+
+class Served:
+    """A server in a thread of its own, on free ports."""
+
+    def __init__(self, *connections: str):
+        scenario = load_scenario("station_keeping_calm")
+        self.transports = open_all(connections)
+        self.ports = [transport.port for transport in self.transports]
+        self.simulation = Simulation(scenario, len(self.transports))
+        self.server = Server(self.simulation, self.transports)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self.server.run, args=(self._stop,), daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join(LIMIT)
+        self.server.close()

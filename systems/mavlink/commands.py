@@ -13,7 +13,8 @@ from .link import Link
 
 RESULTS = {number: entry.name for number, entry in mavlink.enums["MAV_RESULT"].items()}
 _ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
-_FORCED_ARM, _FORCED_DISARM = 2989.0, 21196.0  # ArduPilot's magic numbers in parameter 2
+FORCED_DISARM = 21196.0
+"""Parameter 2 of a disarming that is not refused (ArduPilot's magic number)."""
 _SPOKEN = 0.3  # s to wait for the text that gives the reason of a refusal
 _STATE = 3.0  # s in which a heartbeat shows what was accepted
 _WARNING = mavlink.MAV_SEVERITY_WARNING
@@ -56,6 +57,18 @@ def is_armed(heartbeat: Message) -> bool:
     return bool(heartbeat.base_mode & ARMED_FLAG)
 
 
+def mode_number(name: str) -> int:
+    """The number of a mode.
+
+    Raises:
+        UserError: there is no such mode.
+    """
+    number = next((n for n, known in MODES.items() if known == name), None)
+    if number is None:
+        raise UserError(f"mode `{name}` is unknown; take one of {', '.join(MODES.values())}")
+    return number
+
+
 def set_mode(link: Link, name: str) -> None:
     """Change the flight mode and see it in a heartbeat.
 
@@ -63,9 +76,7 @@ def set_mode(link: Link, name: str) -> None:
         VehicleRefused: it refused, did not answer, or stayed in another mode.
         UserError: there is no such mode, or no vehicle.
     """
-    number = next((n for n, known in MODES.items() if known == name), None)
-    if number is None:
-        raise UserError(f"mode `{name}` is unknown; take one of {', '.join(MODES.values())}")
+    number = mode_number(name)
     enabled = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
     _until_seen(
         link,
@@ -91,7 +102,7 @@ def disarm(link: Link, force: bool = True) -> None:
     Raises:
         VehicleRefused: it refused, did not answer, or stayed armed.
     """
-    number, magic = mavlink.MAV_CMD_COMPONENT_ARM_DISARM, _FORCED_DISARM if force else 0.0
+    number, magic = mavlink.MAV_CMD_COMPONENT_ARM_DISARM, FORCED_DISARM if force else 0.0
     _until_seen(
         link,
         "disarming",

@@ -25,6 +25,7 @@ _COMPONENT = mavlink.MAV_COMP_ID_MISSIONPLANNER
 _HEARTBEAT, _TIMESYNC, _RETRY = 0.5, 0.5, 1.0  # s between heartbeats, TIMESYNC requests, attempts
 _WAIT = 0.05  # s: longest wait for data
 _RECENT = 2.0  # s over which rates are counted
+_BY_FIELD = {"NAMED_VALUE_FLOAT": "name", "BATTERY_STATUS": "id"}  # kept by that field as well
 _BOOT_CLOCKS = {"SERVO_OUTPUT_RAW": MICROSECONDS_32}  # others' time_usec has 64 bits
 
 
@@ -135,7 +136,10 @@ class Link:
     # ------------------------------------------------------------------------------------- reading
 
     def latest(self, name: str) -> Received | None:
-        """The newest message of that name from the vehicle."""
+        """The newest message of that name from the vehicle.
+
+        `NAMED_VALUE_FLOAT/PilotGain` and `BATTERY_STATUS/0` are the newest of that name or number.
+        """
         return self._newest.get(name)
 
     def age(self, name: str) -> float:
@@ -309,6 +313,8 @@ class Link:
         self._times.setdefault(name, deque(maxlen=1000)).append(arrival)
         with self._changed:
             self._newest[name] = found
+            if name in _BY_FIELD:
+                self._newest[f"{name}/{getattr(message, _BY_FIELD[name])}"] = found
             self._changed.notify_all()
         for reader in self._readers:
             reader(found)

@@ -1,0 +1,369 @@
+"""The vehicle's driver: from a connection to an armed vehicle that follows wrenches, and back.
+
+It joins link, parameters, actuation and guards. The order of a dive is `connect`, `preflight`,
+`prepare`, then `sense` and `act` in the loop, and `stop` at its end, whatever the reason.
+"""
+
+import hashlib
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from platformdirs import user_state_path
+
+from ...models.config.checks import check_numbers, require
+from ...models.config.errors import UserError
+from ...models.thrusters import Thrusters
+from . import commands, telemetry
+from .actuation import Command, Way, make_actuation
+from .guard_process import Guard, stop_thrusters
+from .link import GROUND_STATION, Link
+from .parameters import Borrowed, Parameters
+from .preflight import FAILSAFES, Facts, Finding, Requirements, preflight
+from .safety import SafetyConfig, Sight, State, Supervisor
+from .telemetry import Reading
+from .transport import Connection
+
+_SETTLE = 2.5  # s over which rates are counted before the pre-flight check
+_STREAMS = {
+    "HEARTBEAT": 5.0,
+    "ATTITUDE_QUATERNION": 50.0,
+    "SCALED_PRESSURE2": 10.0,
+    "SCALED_PRESSURE": 10.0,
+    "SERVO_OUTPUT_RAW": 20.0,
+    "LOCAL_POSITION_NED": 10.0,
+    "BATTERY_STATUS": 2.0,
+    "SYS_STATUS": 2.0,
+    "EKF_STATUS_REPORT": 2.0,
+    "NAMED_VALUE_FLOAT": 2.0,
+}
+"""Rates that are asked for (Hz)."""
+_HOLD = "ALT_HOLD"
+_FLY = "MANUAL"
+
+
+@dataclass(frozen=True)
+class Mavlink:
+    """A vehicle over MAVLink, in place of the simulated plant.
+
+    Attributes:
+        connection: tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD.
+        actuation: how wrenches are commanded.
+        estimate: `own` filter on the vehicle's sensors, or the `autopilot`'s estimate.
+        imu_rate: inertial samples to ask for (Hz).
+        system: our system id; the vehicle obeys its SYSID_MYGCS.
+        safety: limits and watchdogs.
+    """
+
+    connection: str
+    actuation: Way = "manual_control"
+    estimate: Literal["own", "autopilot"] = "own"
+    imu_rate: float = 100.0
+    system: int = GROUND_STATION
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+
+    def __post_init__(self) -> None:
+        """Check the connection and the numbers."""
+        check_numbers(self)
+        Connection.parse(self.connection, "vehicle_link.connection")
+        require(1 <= self.imu_rate <= 400, self, "imu_rate", "give a rate from 1 to 400 Hz")
+        require(1 <= self.system <= 255, self, "system", "give a system id from 1 to 255")
+
+
+class Sensed(NamedTuple):
+    """The newest readings; None before the first of a kind."""
+
+    imu: Reading | None
+    heading: Reading | None
+    depth: Reading | None
+    attitude: Reading | None
+    position: Reading | None
+    outputs: Reading | None
+    voltage: float
+
+
+class Acted(NamedTuple):
+    """What was done with a wrench."""
+
+    order: str
+    F_Bo_B: Float[np.ndarray, "6"]
+    """The wrench that was sent, within the limits (N, N·m)."""
+    expected: Float[np.ndarray, " n"]
+    """Outputs that the vehicle will show (µs)."""
+    reason: str
+    """Why the dive has ended; empty while it goes on."""
+
+
+class Driver:
+    """A connected vehicle; a context manager that stops it and closes the link.
+
+    Nothing is armed or changed before `prepare`; with `dry_run` nothing is commanded at all.
+    """
+
+    def __init__(
+        self,
+        config: Mavlink,
+        thrusters: Thrusters,
+        *,
+        density: float = 1025.0,
+        dry_run: bool = False,
+        record: Path | None = None,
+    ):
+        """Connect, find the vehicle, read its parameters and ask for its streams.
+
+        `density` is that of the water (kg/m³), `record` a telemetry log (.tlog) to write.
+
+        Raises:
+            UserError: there is no vehicle there, or it has another frame than the thrusters'.
+        """
+        self.config, self._thrusters = config, thrusters
+        self._density, self._dry = density, dry_run
+        connection = Connection.parse(config.connection, "vehicle_link.connection")
+        self.link = Link(connection, system=config.system, record=record)
+        try:
+            self.vehicle = self.link.find_vehicle()
+            self._parameters = Parameters(self.link)
+            self.parameters: Mapping[str, float] = self._parameters.read_all()
+            self._actuation = make_actuation(config.actuation, thrusters, self.parameters)
+            wanted = _STREAMS | {"RAW_IMU": config.imu_rate}
+            self.refused = commands.request_rates(self.link, wanted)
+        except BaseException:
+            self.link.close()
+            raise
+        self._borrowed = Borrowed(self._parameters, _state_file(connection))
+        self._guard: Guard | None = None
+        safety = config.safety
+        if config.actuation == "thruster_passthrough":
+            safety = replace(safety, end="disarm")  # no mode of the autopilot reaches the thrusters
+        self._supervisor = Supervisor(safety)
+        self._state: State | None = None
+        self._ended = ""
+
+    def __enter__(self) -> "Driver":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    @property
+    def thrusters(self) -> int:
+        """Number of thrusters."""
+        return self._thrusters.positions.shape[1]
+
+    # ------------------------------------------------------------------------------ before a dive
+
+    def requirements(self) -> Requirements:
+        """What the dive needs."""
+        rates = {"ATTITUDE_QUATERNION": 20.0, "SERVO_OUTPUT_RAW": 5.0}
+        if self.config.estimate == "own":
+            rates["RAW_IMU"] = 20.0
+        else:
+            rates["LOCAL_POSITION_NED"] = 5.0
+        return Requirements(
+            self.thrusters,
+            self.config.actuation == "thruster_passthrough",
+            rates,
+            self.config.system,
+            self.config.safety.min_voltage,
+        )
+
+    def preflight(self) -> list[Finding]:
+        """The checks before arming; waits until rates can be counted."""
+        self.restore()
+        end = time.monotonic() + _SETTLE
+        while time.monotonic() < end:
+            time.sleep(0.05)
+        heartbeat = self.link.latest("HEARTBEAT")
+        status = telemetry.status(self.link, time.monotonic())
+        assert heartbeat is not None
+        assert status is not None
+        system, estimator = self.link.latest("SYS_STATUS"), self.link.latest("EKF_STATUS_REPORT")
+        facts = Facts(
+            self.link.statistics(),
+            {**self.parameters, **({} if self._dry else FAILSAFES)},  # `prepare` sets them
+            int(heartbeat.message.type),
+            int(heartbeat.message.autopilot),
+            status.armed,
+            status.mode,
+            telemetry.battery(self.link),
+            None if system is None else int(system.message.onboard_control_sensors_health),
+            None if estimator is None else int(estimator.message.flags),
+            status.leak,
+            len(self.link.others()),
+            not self._borrowed.left_over,
+        )
+        return preflight(self.requirements(), facts)
+
+    def restore(self) -> dict[str, float]:
+        """Give back parameters that a former run left changed; what was restored.
+
+        Raises:
+            VehicleRefused: a value can't be restored.
+        """
+        restored = self._borrowed.give_back()
+        self.parameters = {**self.parameters, **restored}
+        return restored
+
+    def prepare(self) -> None:
+        """Set the failsafes, take the mode MANUAL, start the guard process, arm.
+
+        Parameters are saved to disk before the first is changed.
+
+        Raises:
+            VehicleRefused: the vehicle refuses a step, with its reason; what was changed is
+                restored.
+        """
+        if self._dry:
+            return
+        changed = {
+            name: value
+            for name, value in {**FAILSAFES, **self._actuation.borrowed}.items()
+            if self.parameters.get(name) != value
+        }
+        try:
+            commands.set_mode(self.link, _FLY)
+            self._guard = Guard(self.link.connection, self.config.system, self._borrowed.path)
+            self._borrowed.borrow(changed)
+            self._neutral(0.2)  # before arming: an old override may be at work
+            commands.arm(self.link)
+        except BaseException:
+            self.stop()
+            raise
+
+    # ------------------------------------------------------------------------------ in the loop
+
+    def sense(self) -> Sensed:
+        """The newest readings; does not wait."""
+        link = self.link
+        return Sensed(
+            telemetry.imu(link),
+            telemetry.heading(link),
+            telemetry.depth(link, self.parameters, self._density),
+            telemetry.attitude(link),
+            telemetry.position(link),
+            telemetry.outputs(link, self.thrusters),
+            telemetry.battery(link),
+        )
+
+    def act(
+        self,
+        t: float,
+        F_Bo_B: Float[np.ndarray, "6"],
+        p_WBo: Float[np.ndarray, "3"],
+        health: int = 0,
+        ages: Mapping[str, float] | None = None,
+    ) -> Acted:
+        """Send a wrench if the guards allow it, or end the dive; does not wait.
+
+        `t` is the time of the dive (s), `p_WBo` and `health` those of the estimate, `ages` those of
+        `aid`, `plan` and `dead_man` where there is one (s).
+        """
+        if self._state is None:
+            self._state = State(_FLY, np.asarray(p_WBo, float))
+        ruling = self._supervisor.step(
+            self._state, self._sight(t, np.asarray(F_Bo_B, float), p_WBo, health, ages or {})
+        )
+        self._state = ruling.state
+        if self._guard is not None:
+            self._guard.beat()
+        volts = telemetry.battery(self.link)
+        volts = float(self._thrusters.nominal_voltage) if np.isnan(volts) else volts
+        gain = telemetry.pilot_gain(self.link, self.parameters)
+        command = self._actuation.command(self.vehicle, ruling.F_Bo_B, volts, gain)
+        self._carry_out(ruling.order, command)
+        return Acted(ruling.order, ruling.F_Bo_B, command.pwm, ruling.state.reason)
+
+    def _carry_out(self, order: str, command: Command) -> None:
+        if self._dry or order == "yield":
+            return
+        if order == "fly":
+            self.link.send(command.message)
+            return
+        self.link.send(self._actuation.neutral(self.vehicle))
+        if order == "hold_depth" and self._ended != order:
+            self._ask(commands.mavlink.MAV_CMD_DO_SET_MODE, 1.0, float(commands.mode_number(_HOLD)))
+        elif order == "disarm" and self._ended != order:
+            self._ask(commands.mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, commands.FORCED_DISARM)
+        status = telemetry.status(self.link, time.monotonic())
+        if status is not None and (
+            (order == "hold_depth" and status.mode == _HOLD)
+            or (order == "disarm" and not status.armed)
+        ):
+            self._ended = order  # seen; until then it is asked for again with every command
+
+    def _ask(self, command: int, *parameters: float) -> None:
+        values = (*parameters, *(0.0,) * (7 - len(parameters)))
+        self.link.send(
+            commands.mavlink.MAVLink_command_long_message(*self.vehicle, command, 0, *values)
+        )
+
+    def _sight(
+        self,
+        t: float,
+        F: np.ndarray,
+        p: np.ndarray,
+        health: int,
+        ages: Mapping[str, float],
+    ) -> Sight:
+        link, now = self.link, time.monotonic()
+        status = telemetry.status(link, now)
+        infinite = float("inf")
+        depth = min(link.age(name) for name in ("SCALED_PRESSURE2", "SCALED_PRESSURE"))
+        attitude = min(link.age(name) for name in ("ATTITUDE_QUATERNION", "ATTITUDE"))
+        seen = {"vehicle": link.statistics().silence, "attitude": attitude, "depth": depth, **ages}
+        leak = "a leak is reported" if status is not None and status.leak else ""
+        # in a dry run the vehicle stays as it is
+        armed = self._dry or (status is not None and status.armed)
+        mode = _FLY if self._dry or status is None else status.mode
+        return Sight(
+            t,
+            F,
+            np.asarray(p, float),
+            health,
+            {k: v if np.isfinite(v) else infinite for k, v in seen.items()},
+            armed,
+            mode,
+            telemetry.battery(link),
+            leak,
+            len(link.others(2.0)),
+        )
+
+    # ------------------------------------------------------------------------------ after a dive
+
+    def stop(self) -> None:
+        """Neutral thrusters, disarm, give parameters back, close; may be called twice.
+
+        Raises:
+            UserError: the vehicle did not confirm; the guard process then takes over.
+        """
+        failed: list[str] = []
+        if self._guard is not None:
+            failed = stop_thrusters(self.link, self._borrowed.path)
+            if not failed:
+                self._guard.farewell()
+            self._guard = None
+        self.link.close()
+        if failed:
+            raise UserError(f"the vehicle could not be stopped in order: {'; '.join(failed)}")
+
+    def _neutral(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.link.send(self._actuation.neutral(self.vehicle))
+            time.sleep(0.05)
+
+
+def _state_file(connection: Connection) -> Path:
+    """The file of borrowed parameters of the vehicle behind a connection."""
+    name = hashlib.sha256(str(connection).encode()).hexdigest()[:16]
+    return user_state_path("spinndrift") / f"borrowed-{name}.param"

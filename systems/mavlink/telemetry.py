@@ -1,0 +1,155 @@
+"""The vehicle's newest telemetry in SI, in W and B, with its times.
+
+Each function reads the link's newest message of a kind; None before the first. Conversions are
+those of `codec`.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from . import codec
+from .commands import is_armed, mode_of
+from .link import Link, Received
+
+LEAK = "leak"
+_LEAK_SPOKEN = 10.0  # s: the vehicle repeats the warning while it is wet
+_CRITICAL = 5  # MAV_STATE: some failsafe is on, or there has been no pilot input
+_PRESSURES = ("SCALED_PRESSURE2", "SCALED_PRESSURE3", "SCALED_PRESSURE")
+_IMUS = ("RAW_IMU", "SCALED_IMU2", "SCALED_IMU")
+
+
+class Reading(NamedTuple):
+    """A value and when it was taken, on the local monotonic clock (s)."""
+
+    value: Float[np.ndarray, " n"]
+    taken: float
+    arrival: float
+
+
+def _reading(link: Link, found: Received, value: np.ndarray) -> Reading:
+    taken = None if found.boot is None else link.clock.local(found.boot)
+    # the clocks' offset is known to some milliseconds: nothing is taken after it arrived
+    return Reading(
+        value, found.arrival if taken is None else min(taken, found.arrival), found.arrival
+    )
+
+
+def attitude(link: Link) -> Reading | None:
+    """q_WB (w x y z) from ATTITUDE_QUATERNION, else from ATTITUDE."""
+    found = link.latest("ATTITUDE_QUATERNION")
+    if found is not None:
+        m = found.message
+        return _reading(link, found, codec.attitude(m.q1, m.q2, m.q3, m.q4))
+    found = link.latest("ATTITUDE")
+    if found is None:
+        return None
+    m = found.message
+    return _reading(link, found, codec.attitude_from_euler(m.roll, m.pitch, m.yaw))
+
+
+def heading(link: Link) -> Reading | None:
+    """Yaw of B in W (rad), counter-clockwise from the x axis (east)."""
+    found = attitude(link)
+    if found is None:
+        return None
+    yaw = codec.yaw_ned_to_enu(codec.euler_from_attitude(found.value)[2])
+    return found._replace(value=np.array([float(yaw)]))
+
+
+def imu(link: Link, streams: Sequence[str] = _IMUS) -> Reading | None:
+    """Specific force (m/s²) and angular rate (rad/s) in B, from the first stream that comes."""
+    for name in streams:
+        found = link.latest(name)
+        if found is not None:
+            m = found.message
+            force = codec.imu_specific_force(m.xacc, m.yacc, m.zacc)
+            rate = codec.imu_angular_rate(m.xgyro, m.ygyro, m.zgyro)
+            return _reading(link, found, np.concatenate([force, rate]))
+    return None
+
+
+def depth(link: Link, parameters: Mapping[str, float], density: float) -> Reading | None:
+    """Depth of the pressure sensor (m), positive down, in water of `density` (kg/m³).
+
+    The pressure at the surface is the one that the autopilot measured on the ground
+    (BAROn_GND_PRESS). A sensor in the hull (SCALED_PRESSURE) is used if there is no other.
+    """
+    for name in _PRESSURES:
+        found = link.latest(name)
+        if found is not None:
+            number = name.removeprefix("SCALED_PRESSURE") or "1"
+            ground = parameters.get(f"BARO{number}_GND_PRESS", 0.0) / 100
+            surface = ground if ground > 0 else codec.SURFACE_PRESSURE_HPA
+            gradient = codec.pascal_per_metre(density=density)
+            value = codec.depth_from_pressure(found.message.press_abs, surface, gradient)
+            return _reading(link, found, np.array([float(value)]))
+    return None
+
+
+def position(link: Link) -> Reading | None:
+    """p_WBo and its rate in W (m, m/s) from LOCAL_POSITION_NED, about the autopilot's origin."""
+    found = link.latest("LOCAL_POSITION_NED")
+    if found is None:
+        return None
+    m = found.message
+    p, v = codec.world_vector(m.x, m.y, m.z), codec.world_vector(m.vx, m.vy, m.vz)
+    return _reading(link, found, np.concatenate([p, v]))
+
+
+def outputs(link: Link, count: int) -> Reading | None:
+    """Pulse widths (µs) of outputs 1 to `count` from SERVO_OUTPUT_RAW."""
+    found = link.latest("SERVO_OUTPUT_RAW")
+    if found is None:
+        return None
+    values = [float(getattr(found.message, f"servo{n}_raw")) for n in range(1, count + 1)]
+    return _reading(link, found, np.array(values))
+
+
+def battery(link: Link) -> float:
+    """Voltage of the first battery under load (V), NaN if unknown."""
+    found = link.latest("BATTERY_STATUS/0")
+    if found is not None:
+        volts = float(codec.pack_voltage(np.array(found.message.voltages, float)))
+        if np.isfinite(volts):
+            return volts
+    found = link.latest("SYS_STATUS")
+    return float("nan") if found is None else float(codec.volts(found.message.voltage_battery))
+
+
+def pilot_gain(link: Link, parameters: Mapping[str, float]) -> float:
+    """The gain of MANUAL_CONTROL: as the vehicle tells it, else JS_GAIN_DEFAULT."""
+    found = link.latest("NAMED_VALUE_FLOAT/PilotGain")
+    if found is not None and found.message.value > 0:
+        return float(found.message.value)
+    return float(parameters.get("JS_GAIN_DEFAULT", 0.5))
+
+
+class Status(NamedTuple):
+    """What the vehicle's heartbeat and texts say."""
+
+    armed: bool
+    mode: str
+    critical: bool
+    """A failsafe is on; also before the first command of a pilot."""
+    leak: bool
+    age: float
+    """Of the heartbeat (s)."""
+
+
+def status(link: Link, now: float) -> Status | None:
+    """The newest status at a local time (s)."""
+    found = link.latest("HEARTBEAT")
+    if found is None:
+        return None
+    m = found.message
+    spoken = [text.lower() for _, _, text in link.texts(now - _LEAK_SPOKEN)]
+    return Status(
+        is_armed(m),
+        codec.mode_name(mode_of(m)),
+        m.system_status == _CRITICAL,
+        any(LEAK in text for text in spoken),
+        now - found.arrival,
+    )

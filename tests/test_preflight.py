@@ -65,7 +65,7 @@ def test_a_vehicle_in_order_passes():
         (with_parameter("SERVO7_FUNCTION", 57.0), "outputs", "SERVO7_FUNCTION 57 (pass-through"),
         (FINE._replace(given_back=False), "outputs", "former run"),
         (with_parameter("MOT_PWM_MAX", 1800.0), "MOT_PWM_MAX", "1800"),
-        (with_parameter("RC3_TRIM", 1100.0), "RC channels", "RC3_TRIM 1100"),
+        (with_parameter("RC5_TRIM", 1480.0), "RC channels", "RC5_TRIM 1480"),
         (with_parameter("SYSID_MYGCS", 250.0), "ground station id", "system 250"),
         (with_parameter("FS_PILOT_INPUT", 0.0), "FS_PILOT_INPUT", "is 0: set 2"),
         (with_parameter("FS_PILOT_INPUT", 1.0), "FS_PILOT_INPUT", "is 1: set 2"),

@@ -31,6 +31,7 @@ FAULTS = {
     "pilot": {"mode": "STABILIZE"},
     "disarmed": {"armed": False},
     "rival": {"rivals": 1},
+    "outputs": {"outputs": 2.1},
     "failsafe": {"failsafe": "Leak Detected"},
     "silence": {"ages": {"vehicle": 1.1}},
     "attitude": {"ages": {"attitude": float("inf")}},

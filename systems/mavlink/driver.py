@@ -6,7 +6,9 @@ It joins link, parameters, actuation and guards. The order of a dive is `connect
 
 import hashlib
 import time
+from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -43,6 +45,8 @@ _STREAMS = {
     "NAMED_VALUE_FLOAT": 2.0,
 }
 """Rates that are asked for (Hz)."""
+_ALIKE = 12.0  # µs by which outputs may differ from commanded ones: whole numbers on three axes
+_DELAY = 0.5  # s: the longest time in which a command shows in SERVO_OUTPUT_RAW
 _HOLD = "ALT_HOLD"
 _FLY = "MANUAL"
 
@@ -143,6 +147,8 @@ class Driver:
         self._supervisor = Supervisor(safety)
         self._state: State | None = None
         self._ended = ""
+        self._sent: deque[tuple[float, np.ndarray]] = deque()
+        self._unlike_since: float | None = None
 
     def __enter__(self) -> "Driver":
         return self
@@ -233,6 +239,7 @@ class Driver:
         try:
             commands.set_mode(self.link, _FLY)
             self._guard = Guard(self.link.connection, self.config.system, self._borrowed.path)
+            self._guard.busy()
             self._borrowed.borrow(changed)
             self._neutral(0.2)  # before arming: an old override may be at work
             commands.arm(self.link)
@@ -281,6 +288,7 @@ class Driver:
         gain = telemetry.pilot_gain(self.link, self.parameters)
         command = self._actuation.command(self.vehicle, ruling.F_Bo_B, volts, gain)
         self._carry_out(ruling.order, command)
+        self._sent.append((time.monotonic(), command.pwm))
         return Acted(ruling.order, ruling.F_Bo_B, command.pwm, ruling.state.reason)
 
     def _carry_out(self, order: str, command: Command) -> None:
@@ -336,7 +344,22 @@ class Driver:
             telemetry.battery(link),
             leak,
             len(link.others(2.0)),
+            self._unlike(now),
         )
+
+    def _unlike(self, now: float) -> float:
+        """Time for which outputs have not been those commanded within the delay before (s)."""
+        shown = telemetry.outputs(self.link, self.thrusters)
+        while len(self._sent) > 1 and self._sent[1][0] < now - _DELAY:
+            self._sent.popleft()
+        if self._dry or shown is None or not self._sent:
+            return 0.0
+        apart = min(float(np.abs(pwm - shown.value).max()) for _, pwm in self._sent)
+        if apart <= _ALIKE:
+            self._unlike_since = None
+            return 0.0
+        self._unlike_since = now if self._unlike_since is None else self._unlike_since
+        return now - self._unlike_since
 
     # ------------------------------------------------------------------------------ after a dive
 
@@ -348,6 +371,8 @@ class Driver:
         """
         failed: list[str] = []
         if self._guard is not None:
+            with suppress(UserError):  # it is gone: stop all the same
+                self._guard.busy()
             failed = stop_thrusters(self.link, self._borrowed.path)
             if not failed:
                 self._guard.farewell()

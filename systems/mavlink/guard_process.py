@@ -25,8 +25,8 @@ from .link import Link, Peer
 from .parameters import Borrowed, Parameters
 from .transport import Connection
 
-_BEAT, _FAREWELL = b".", b"!"
-_PATIENCE = 1.0  # s without a beat
+_BEAT, _BUSY, _FAREWELL = b".", b"w", b"!"
+_PATIENCE = {_BEAT: 1.0, _BUSY: 30.0}  # s without a word, after the last one
 _NEUTRAL_FOR, _PERIOD = 1.0, 0.05  # s of neutral messages, s between them
 _READY_IN = 30.0  # s: a loaded machine starts an interpreter slowly
 _READY = b"ready\n"
@@ -37,8 +37,9 @@ _CHANNELS = 8
 class Guard:
     """The commanding process' handle of the guard.
 
-    Say `farewell` only when the thrusters have been stopped. A process that ends without it is
-    followed by the guard's rescue.
+    After a `beat` the next word has to come within a second; `busy` allows half a minute, for what
+    comes before and after the loop. Say `farewell` only when the thrusters have been stopped: a
+    process that ends without it is followed by the guard's rescue.
     """
 
     def __init__(self, connection: Connection, system: int, borrowed: Path | None = None):
@@ -66,9 +67,20 @@ class Guard:
         Raises:
             UserError: the guard is gone.
         """
+        self._say(_BEAT)
+
+    def busy(self) -> None:
+        """Say that the loop does not run, and that work goes on: arming, stopping.
+
+        Raises:
+            UserError: the guard is gone.
+        """
+        self._say(_BUSY)
+
+    def _say(self, word: bytes) -> None:
         assert self._process.stdin is not None
         try:
-            self._process.stdin.write(_BEAT)
+            self._process.stdin.write(word)
             self._process.stdin.flush()
         except OSError as error:
             raise UserError("the guard process has ended; the dive can't go on") from error
@@ -115,18 +127,20 @@ def _give_back(link: Link, borrowed: Path | None) -> Mapping[str, float]:
 
 
 def _watch() -> bool:
-    """Wait for the farewell; false if the beat ends without it."""
+    """Wait for the farewell; false if the words end without it."""
+    last = _BUSY
     while True:
-        if not select.select([sys.stdin.buffer], [], [], _PATIENCE)[0]:
+        if not select.select([sys.stdin.buffer], [], [], _PATIENCE[last])[0]:
             return False
         read = os.read(sys.stdin.fileno(), 4096)
         if _FAREWELL in read:
             return True
         if not read:
             return False
+        last = read[-1:]
 
 
-def _say(*sentences: str) -> None:
+def _tell(*sentences: str) -> None:
     sys.stderr.write("".join(f"spinndrift guard: {sentence}\n" for sentence in sentences))
 
 
@@ -146,10 +160,10 @@ def main(arguments: list[str]) -> int:
         try:
             with Link(connection, system=int(system)) as link:
                 failed = stop_thrusters(link, borrowed)
-            _say("the commanding process died: thrusters stopped", *failed)
+            _tell("the commanding process died: thrusters stopped", *failed)
             return 2 if failed else 1
         except UserError as error:
-            _say(str(error))
+            _tell(str(error))
             time.sleep(1.0)
     return 2
 

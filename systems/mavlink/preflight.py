@@ -164,6 +164,7 @@ def _outputs(needs: Requirements, facts: Facts) -> Found:
             for n in range(1, 7)
             for word, value in _PULSES.items()
             if (found := facts.parameters.get(f"RC{n}_{word}", value)) != value
+            and (n, word) != (3, "TRIM")  # 1100 on ArduSub 4.5, whose neutral is 1500
         ]
         yield (
             "RC channels",

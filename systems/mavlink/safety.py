@@ -37,6 +37,8 @@ class SafetyConfig:
         stale_aid: longest age of a velocity or position aid, if the estimate needs one (s).
         plan_age: longest age of the plan that is followed (s).
         lost: longest time for which the estimator may be lost (s).
+        outputs: longest time for which the vehicle's outputs may differ from the commanded ones
+            (s); the verticals' do for half a second after arming.
         min_voltage: least battery voltage under load (V); 0 switches the guard off.
         dead_man: longest time between presses of the dead-man key (s); 0 needs none.
         end: what follows neutral thrusters.
@@ -52,6 +54,7 @@ class SafetyConfig:
     stale_aid: float = 2.0
     plan_age: float = 2.0
     lost: float = 1.0
+    outputs: float = 2.0
     min_voltage: float = 13.2
     dead_man: float = 0.0
     end: Literal["hold_depth", "disarm"] = "hold_depth"
@@ -61,7 +64,7 @@ class SafetyConfig:
         check_numbers(self)
         for name in ("max_wrench", "max_wrench_rate", "fence"):
             require(min(getattr(self, name)) > 0, self, name, "give numbers above zero")
-        for name in ("silence", "stale", "stale_aid", "plan_age", "lost"):
+        for name in ("silence", "stale", "stale_aid", "plan_age", "lost", "outputs"):
             require(getattr(self, name) > 0, self, name, "give a time above zero")
         for name in ("min_voltage", "dead_man"):
             require(getattr(self, name) >= 0, self, name, "give zero or more")
@@ -90,6 +93,8 @@ class Sight(NamedTuple):
     """The vehicle's own failsafe, in its words; empty if none is on."""
     rivals: int = 0
     """Other ground stations with our system id."""
+    outputs: float = 0.0
+    """Time for which the vehicle's outputs have not been those that are commanded (s)."""
 
 
 class State(NamedTuple):
@@ -205,6 +210,16 @@ def _rival(config: SafetyConfig, state: State, sight: Sight) -> str:
     return "another ground station uses our system id" if sight.rivals else ""
 
 
+def _outputs(config: SafetyConfig, state: State, sight: Sight) -> str:
+    del state
+    if sight.outputs <= config.outputs:
+        return ""
+    return (
+        f"the vehicle's outputs have differed from the commanded ones for {sight.outputs:.1f} s: "
+        "somebody else commands, or its parameters are others"
+    )
+
+
 def _battery(config: SafetyConfig, state: State, sight: Sight) -> str:
     del state
     if np.isnan(sight.voltage) or sight.voltage >= config.min_voltage:
@@ -216,6 +231,7 @@ GUARDS: dict[str, Guard] = {
     "pilot": _pilot,
     "disarmed": _disarmed,
     "rival": _rival,
+    "outputs": _outputs,
     "failsafe": _failsafe,
     "silence": _silence,
     "attitude": _attitude,

@@ -26,7 +26,7 @@ class Vehicle:
         self.silent = False
         self._start = time.monotonic()
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run)
+        self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     @property
@@ -156,7 +156,8 @@ def test_it_connects_again_and_ends_its_thread():
         assert not link.send(mavlink.MAVLink_manual_control_message(1, 0, 0, 500, 0, 0))
         vehicle = Vehicle(Connection.parse(f"tcpin:127.0.0.1:{port}").open())
         assert within(10.0, lambda: link.connected and link.age("ATTITUDE") < 0.5)
-        assert link.statistics().reconnections == 1
+        assert link.statistics().reconnections >= 1  # one more if the closing listener answered
+        assert link.statistics().lost == 0
         vehicle.close()
     assert threading.active_count() <= before
 

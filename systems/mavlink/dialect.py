@@ -54,6 +54,10 @@ class Parser:
         if not late:
             self._sequence[sender] = number
 
+    def restart(self) -> None:
+        """Begin a new stream: what was sent in between is not counted as lost."""
+        self._sequence.clear()
+
     def packed(self, message: Message) -> bytes:
         """The packet of a message, with the next sequence number."""
         data = message.pack(self._mav)

@@ -288,6 +288,7 @@ class Link:
             return
         with self._sending:
             self._transport = opened
+        self._parser.restart()
         self._reconnections += 1
 
     def _take_in(self, message: Message, arrival: float) -> None:

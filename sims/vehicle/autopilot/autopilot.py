@@ -146,6 +146,7 @@ class Autopilot:
         for deed in deeds:
             self._do(deed)
         if self.motor_test.step(t):
+            self._collect()
             self.disarm()
         if not self.motor_test.running:
             self.outputs.step(t, self.channels, self._mixed(dt, motion))

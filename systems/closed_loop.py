@@ -80,7 +80,7 @@ def build_diagram(
     truth = _truth(plant, control)
     periods = log_periods
     if periods is None:
-        periods = default_log_periods(station) | CONTROLLER_PERIODS
+        periods = {**default_log_periods(station), **CONTROLLER_PERIODS}
     for system in (plant, control):
         for i in range(system.num_output_ports()):
             port = system.get_output_port(i)

@@ -20,10 +20,10 @@ from spinndrift.models.config.errors import UserError
 from spinndrift.sims.run.loop import simulate
 from spinndrift.sims.scenarios.scenario import load_scenario, scenario_names
 from spinndrift.systems.closed_loop import build_diagram
-from spinndrift.systems.compiled.jit import value_or_zeros
 from spinndrift.systems.compiled.network import NotPureError
 from spinndrift.systems.compiled.pure import Event, Pure, shown
 from spinndrift.systems.compiled.simulator import CompiledSimulator
+from spinndrift.systems.drake import value_or_zeros
 
 
 class Mixer(LeafSystem):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import LeafSystem
 
-from spinndrift.systems.compiled.jit import VectorFunction, compiled, together, value_or_zeros
+from spinndrift.systems.compiled.jit import VectorFunction, compiled, together
+from spinndrift.systems.drake import value_or_zeros
 
 
 def test_arguments_and_results_keep_their_order_and_sizes():

@@ -22,7 +22,7 @@ _SPAN, _LONG = 5.0, 300.0
 """Ratio of values from which an axis is logarithmic (two of 1, 2 and 5 are then on it), and ratio
 of its ends from which only powers of ten are labelled."""
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "axes.edgecolor": "#c4ced6",
     "axes.grid": True,

@@ -23,6 +23,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from ...models.files.atomic import atomic_path
 from ...models.vehicles.vehicle import Vehicle
+from ...systems.drake import drake_array
 from ..run.log import Plans, RunLog
 from .figures_path import Scene
 
@@ -113,7 +114,7 @@ def _surroundings(meshcat: Meshcat, log: RunLog, scene: Scene) -> None:
     ahead = way / norm if norm > 0.5 else np.array([1.0, 0.0])
     left = np.array([-ahead[1], ahead[0]])
     eye = middle[:2] - 0.42 * span * ahead + 0.36 * span * left
-    meshcat.SetCameraPose(np.array([*eye, middle[2] + 0.6 * span]), middle)
+    meshcat.SetCameraPose(drake_array([*eye, middle[2] + 0.6 * span]), middle)
 
 
 def _vehicle(meshcat: Meshcat, vehicle: Vehicle) -> None:
@@ -133,7 +134,7 @@ def _vehicle(meshcat: Meshcat, vehicle: Vehicle) -> None:
     meshcat.SetTransform("vehicle/tube", _pose(np.array([0.02, 0, 0]), along))
     for i, mount in enumerate(vehicle.propulsion.mounts):
         axis = np.array(mount.direction) / np.linalg.norm(mount.direction)
-        R = RotationMatrix.MakeFromOneVector(axis, 2)
+        R = RotationMatrix.MakeFromOneVector(drake_array(axis), 2)
         X = _pose(np.array(mount.position), R)
         meshcat.SetObject(f"vehicle/thruster_{i + 1}", Cylinder(0.048, 0.05), _RING)
         meshcat.SetTransform(f"vehicle/thruster_{i + 1}", X)
@@ -168,6 +169,7 @@ def _planned(meshcat: Meshcat, plans: Plans, end: float) -> None:
         if plans.p_WB is None:
             continue
         first, last = _segments(plans.p_WB[k], plans.X_WB[k][0, 4:])
+        first, last = drake_array(first), drake_array(last)
         meshcat.SetLineSegments(f"samples/{k:05d}", first, last, 1.0, _SAMPLED)
         _visible(meshcat, f"samples/{k:05d}", start, until)
 
@@ -187,7 +189,8 @@ def _tube(meshcat: Meshcat, path: str, p: np.ndarray, radius: float, rgba: Rgba)
     i, j = np.arange(4)[None], (np.arange(4)[None] + 1) % 4
     faces = [np.stack([k + i, k + j, k + 4 + i]), np.stack([k + j, k + 4 + j, k + 4 + i])]
     triangles = np.concatenate([face.reshape(3, -1) for face in faces], axis=1)
-    meshcat.SetTriangleMesh(path, vertices.T, triangles.astype(np.int32), rgba)
+    faces = drake_array(triangles.astype(np.int32))
+    meshcat.SetTriangleMesh(path, drake_array(vertices.T), faces, rgba)
 
 
 def _segments(p: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -157,7 +157,7 @@ class RunLog:
         return Plans(
             data["plan_time"].to_numpy(),
             float(data.attrs["plan_dt"]),
-            arrays["plan_X_WB"],
+            data["plan_X_WB"].to_numpy(),
             arrays["sample_p_WB"],
             arrays["sample_weight"],
             arrays["planner_figures"],

@@ -17,6 +17,7 @@ from ...models.files.interrupts import interrupt_noted
 from ...systems.closed_loop import build_diagram, logged, seeded
 from ...systems.compiled.network import NotPureError
 from ...systems.compiled.simulator import CompiledSimulator
+from ...systems.drake import value
 from ...systems.planning.passage import Passage
 from ..scenarios.criteria import FollowPath, Monitor, Outcome
 from ..scenarios.scenario import Scenario
@@ -254,7 +255,7 @@ def _fly(
 
     try:
         simulator.Initialize()
-        outcome = monitor.check(0.0, *(port.Eval(own) for port in ports))
+        outcome = monitor.check(0.0, *(value(port, own) for port in ports))
         while outcome is None:
             stride = min(stride, steps - k)
             started = time.perf_counter()

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -190,7 +191,7 @@ def curves_figure(curves: Mapping[tuple[str, str], list[tuple[np.ndarray, np.nda
     lines = -(-len(methods) // columns)
     figure = Figure(figsize=(WIDTH, 1.9 * lines + 0.5), layout="constrained")
     axes = figure.subplots(lines, columns, squeeze=False)
-    shades = dict(zip(REGIMES, (PLANNED, FLOWN), strict=True))
+    shades = dict[str, str](zip(REGIMES, (PLANNED, FLOWN), strict=True))
     for ax, method in zip(axes.ravel(), methods, strict=False):
         for regime in REGIMES:
             for step, loss in curves.get((regime, method), []):
@@ -252,7 +253,8 @@ def thinned_curve(path: Path, points: int = 150) -> tuple[np.ndarray, np.ndarray
     """Steps and loss of a metrics.csv, medians of equal pieces; None without steps."""
     if not path.exists():
         return None
-    table = np.genfromtxt(path, delimiter=",", names=True, usecols=("step", "loss"), ndmin=1)
+    columns: Any = ("step", "loss")  # NumPy's stubs know numbers alone
+    table = np.genfromtxt(path, delimiter=",", names=True, usecols=columns, ndmin=1)
     if table.size == 0:
         return None
     table = table[np.isfinite(table["loss"])]

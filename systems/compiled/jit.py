@@ -140,19 +140,3 @@ class VectorFunction:
         """Call with one array for each input and return one array for each output."""
         result = self.flat(*parts)
         return [result[part] for part in self._slices]
-
-
-def value_or_none(port: Any, context: Any) -> Float[np.ndarray, "n"] | None:
-    """Value of a vector input port, None while nothing is connected to it."""
-    try:  # `HasValue` costs half as much as `Eval`, and most ports are connected
-        return port.Eval(context)
-    except RuntimeError:
-        if port.HasValue(context):
-            raise
-        return None
-
-
-def value_or_zeros(port: Any, context: Any) -> Float[np.ndarray, "n"]:
-    """Value of a vector input port, zeros while nothing is connected to it."""
-    value = value_or_none(port, context)
-    return np.zeros(port.size()) if value is None else value

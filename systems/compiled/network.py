@@ -236,7 +236,7 @@ def _noise(
         for name in leaf.pure.noise:
             port = leaf.system, int(leaf.system.GetInputPort(name).get_index())
             source = wires[port][0] if port in wires else None
-            if source in sources:
+            if isinstance(source, RandomSource) and source in sources:
                 period = leaf.pure.events[0].period
                 if found.setdefault(source, period) != period or not _draws(source, period):
                     raise NotPureError(f"{source.get_name()} draws at another period than is used")

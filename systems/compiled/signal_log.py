@@ -20,6 +20,8 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
+from ..drake import value
+
 _ASIDE = 1e-6
 """Offset from an instant at which ports are read (s): more than the rounding difference between
 times of simultaneous events (1e-11 s after a day), far less than any period."""
@@ -77,9 +79,10 @@ class SignalLog(LeafSystem):
         self.period, self.early = period, early
         self.offset = period - _ASIDE if early else _ASIDE
         self._value = self.DeclareVectorInputPort("value", size)
+        nothing: Any = ValueProducer.NoopCalc
         rows = self.DeclareCacheEntry(
             "rows",
-            ValueProducer(lambda: AbstractValue.Make(Rows(size, period)), ValueProducer.NoopCalc),
+            ValueProducer(lambda: AbstractValue.Make(Rows(size, period)), nothing),
             {self.nothing_ticket()},
         )
         self._rows = rows.cache_index()
@@ -104,7 +107,7 @@ class SignalLog(LeafSystem):
         return EventStatus.DidNothing()
 
     def _add(self, context: Context) -> EventStatus:
-        self._own(context).AddData(context.get_time(), self._value.Eval(context))
+        self._own(context).AddData(context.get_time(), value(self._value, context))
         return EventStatus.Succeeded()
 
 

@@ -13,6 +13,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, RandomSource
 
+from ..drake import set_groups
 from .jit import VectorFunction
 from .network import Network, Port, Ports, changed_by, places, simultaneous
 
@@ -114,13 +115,14 @@ class CompiledSimulator:
         self._check(state, boundary_time)
         self._state = state
         self._context.SetTime(boundary_time)
-        for (system, group), part in self._network.groups:
-            system.GetMyMutableContextFromRoot(self._context).SetDiscreteState(group, state[part])
+        for (system, index), part in self._network.groups:
+            own = system.GetMyMutableContextFromRoot(self._context)
+            set_groups(own, [index], [state[part]])
 
     def _log(self, block: "_Block", seen: Float[np.ndarray, "steps size"]) -> None:
         for log, part, steps in zip(self._network.logs, self._columns, block.logged, strict=True):
             if steps:
-                rows = log.system.FindMutableLog(self._context)
+                rows: Any = log.system.FindMutableLog(self._context)
                 for step in steps:
                     rows.AddData(block.times[step], seen[step, part])
 

@@ -5,8 +5,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from ..compiled.jit import value_or_none
 from ..compiled.pure import Inputs, Output, Pure
+from ..drake import put, value, value_or_none
 
 LOST = 2.0
 """State of a filter's health from which on its estimate is unusable."""
@@ -44,9 +44,9 @@ class HealthGate(LeafSystem):
 
             def pass_on(context: Context, output: BasicVector, port=port) -> None:
                 health = value_or_none(self._health, context)
-                value = np.asarray(port.Eval(context))
+                seen = value(port, context)
                 known = health is None or health[0] < LOST
-                output.SetFromVector(value if known else np.full(value.size, np.nan))
+                put(output, seen if known else np.full(seen.size, np.nan))
 
             needs = {port.ticket(), self._health.ticket()}
             self.DeclareVectorOutputPort(name, sizes[name], pass_on, needs)

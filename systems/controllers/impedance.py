@@ -14,6 +14,7 @@ from ...models.dynamics import Dynamics
 from ...models.integrate import cast
 from ..compiled.jit import VectorFunction
 from ..compiled.pure import Event, Inputs, Pure, State, shown
+from ..drake import set_groups, value
 from ..planning.plan import PlanLayout
 from ..plant.wrench_limits import WrenchLimits
 
@@ -151,8 +152,6 @@ class Impedance(LeafSystem):
     def _update(self, context: Context, state: DiscreteValues) -> None:
         F = self._step.flat(
             np.array([context.get_time()]),
-            self._plan.Eval(context),
-            self._X.Eval(context),
-            self._V.Eval(context),
+            *(value(port, context) for port in (self._plan, self._X, self._V)),
         )
-        state.set_value(self._F, F)
+        set_groups(state, [self._F], [F])

@@ -13,6 +13,7 @@ from ...models.dynamics import Dynamics
 from ...models.integrate import cast
 from ..compiled.jit import VectorFunction
 from ..compiled.pure import Event, Inputs, Pure, State, shown
+from ..drake import group, set_groups, value
 
 
 class ObserverState(eqx.Module):
@@ -140,12 +141,7 @@ class DisturbanceObserver(LeafSystem):
         return Pure((Event(self.period, update),), {"F_bias_Bo_W": shown(0)})
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
-        bias, memory = self._step(
-            context.get_discrete_state(self._bias).value(),
-            context.get_discrete_state(self._memory).value(),
-            self._X.Eval(context),
-            self._V.Eval(context),
-            self._F.Eval(context),
-        )
-        state.set_value(self._bias, bias)
-        state.set_value(self._memory, memory)
+        groups = (self._bias, self._memory)
+        held = [group(context, index) for index in groups]
+        seen = [value(port, context) for port in (self._X, self._V, self._F)]
+        set_groups(state, groups, self._step(*held, *seen))

@@ -14,8 +14,9 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from ...models import se3
 from ...models.config.errors import UserError
 from ...models.sensors import SHIPPED, Imu, Sensor
-from ..compiled.jit import VectorFunction, value_or_zeros
+from ..compiled.jit import VectorFunction
 from ..compiled.pure import Event, Inputs, Pure, State, shown
+from ..drake import group, set_groups, value_or_zeros
 from ..plant.learned_plant import check_state
 from .delayed import DelayedFilter, EkfConfig, FilterState, Readings, health_names, status_names
 
@@ -153,7 +154,7 @@ class Ekf(LeafSystem):
         """The filter's state at its horizon, for inspection."""
         core = self.filter
         like = core.init(jnp.zeros(7), jnp.zeros(6))
-        return ravel_pytree(like)[1](jnp.asarray(context.get_discrete_state(self._filter).value()))
+        return ravel_pytree(like)[1](jnp.asarray(group(context, self._filter)))
 
     def pure(self) -> Pure:
         """The update as a pure function."""
@@ -194,8 +195,7 @@ class Ekf(LeafSystem):
 
     def _initialise(self, context: Context, discrete_state: DiscreteValues) -> None:
         results = self._start(value_or_zeros(self._initial_noise, context))
-        for index, value in zip([self._filter, *self._outputs], results, strict=True):
-            discrete_state.set_value(index, value)
+        set_groups(discrete_state, [self._filter, *self._outputs], results)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         """Buffer the present sample; with the last of several, step over all of them."""
@@ -208,10 +208,9 @@ class Ekf(LeafSystem):
             waiting[6 * phase - 6 : 6 * phase] = imu
             return
         last = tick - 1.0  # the present output was sampled one period ago
-        held = context.get_discrete_state()
         readings = [value_or_zeros(port, context) for port in self._readings[1:]]
         state, at, slots = self._take_in(
-            held.value(0), held.value(_WAITING), imu, *readings, np.array([last])
+            group(context, 0), group(context, _WAITING), imu, *readings, np.array([last])
         )
         n, width, i = self._samples, self.filter.slot, int(at[0])
         while i < n:
@@ -221,7 +220,6 @@ class Ekf(LeafSystem):
                 break
             state, at = self._move(state, slots, np.array([i + 1.0]))
             i = int(at[0])
-        discrete_state.set_value(0, state)
+        set_groups(discrete_state, [0], [state])
         if tick % self._ratio == 0:
-            for index, value in enumerate(self._show(state, np.array([t])), 1):
-                discrete_state.set_value(index, value)
+            set_groups(discrete_state, self._outputs, self._show(state, np.array([t])))

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...models.recordings.schema import LIMITS
 from ..mavlink.codec import filter_delay
@@ -74,7 +75,7 @@ class Signals:
     notes: tuple[str, ...] = ()
 
 
-def series(t: np.ndarray, x: np.ndarray, source: str, quantity: str) -> Series | None:
+def series(t: np.ndarray, x: ArrayLike, source: str, quantity: str) -> Series | None:
     """Make a series: sorted, without repeated times; None if fewer than two samples are left.
 
     Samples are left out if they are beyond the `LIMITS` of the quantity, or if a component that has

@@ -13,8 +13,9 @@ from jaxtyping import Array, Float, UInt32
 from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from ..compiled.jit import Program, compiled, require_double, together, value_or_zeros
+from ..compiled.jit import Program, compiled, require_double, together
 from ..compiled.pure import Event, Inputs, Pure, State, shown
+from ..drake import group, set_groups, value, value_or_zeros
 from .mppi_core import Draw, MppiPlanner, MppiState
 from .plan import Plan
 from .plan_samples import SampleLayout
@@ -161,13 +162,10 @@ class Mppi(LeafSystem):
     def _update(self, context: Context, state: DiscreteValues) -> None:
         values = self.plan(
             context.get_time(),
-            context.get_discrete_state(self._nominal).value(),
-            self._X.Eval(context),
-            self._V.Eval(context),
+            group(context, self._nominal),
+            value(self._X, context),
+            value(self._V, context),
             value_or_zeros(self._bias, context),
-            self._noise.Eval(context),
+            value(self._noise, context),
         )
-        for group, value in zip(
-            (self._nominal, self._plan, self._samples, self._figures), values, strict=True
-        ):
-            state.set_value(group, value)
+        set_groups(state, (self._nominal, self._plan, self._samples, self._figures), values)

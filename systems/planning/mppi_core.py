@@ -124,7 +124,9 @@ class MppiPlanner(eqx.Module):
         check_task(task)
         first = task.wanted(jnp.zeros(())).X_WB
         self.sampler = Sampler.create(self.config, cast(limits, dtype), dynamics, first, dtype)
-        gains = None if tracking is None else tuple(jnp.asarray(K, dtype) for K in tracking)
+        gains = None
+        if tracking is not None:
+            gains = jnp.asarray(tracking[0], dtype), jnp.asarray(tracking[1], dtype)
         self.rollouts = Rollouts(
             cast(dynamics, dtype), cast(limits, dtype), cast(task, dtype), gains, self.config
         )

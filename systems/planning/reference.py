@@ -8,8 +8,9 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from ...models import se3
 from ...models.dynamics import Dynamics
 from ...models.integrate import cast
-from ..compiled.jit import VectorFunction, value_or_zeros
+from ..compiled.jit import VectorFunction
 from ..compiled.pure import Event, Inputs, Pure, State, shown
+from ..drake import set_groups, value_or_zeros
 from .paths import Motion, Path
 from .plan import Plan, PlanLayout
 
@@ -94,5 +95,4 @@ class Reference(LeafSystem):
 
     def _update(self, context: Context, state: DiscreteValues) -> None:
         bias = value_or_zeros(self._bias, context)
-        (plan,) = self._step(np.array([context.get_time()]), bias)
-        state.set_value(self._plan, plan)
+        set_groups(state, [self._plan], self._step(np.array([context.get_time()]), bias))

@@ -9,6 +9,7 @@ from ...models import integrate
 from ...models.thrusters import Thrusters
 from ..compiled.jit import VectorFunction
 from ..compiled.pure import Inputs, Pure, State
+from ..drake import put, value
 
 
 class ThrustAllocation(LeafSystem):
@@ -65,7 +66,7 @@ class ThrustAllocation(LeafSystem):
         return Pure((), {"pwm": output(0), "thruster_force": output(1)})
 
     def _both(self, context: Context) -> np.ndarray:
-        F = np.asarray(self._F.Eval(context))
+        F = value(self._F, context)
         if not np.isfinite(F).all():
             raise FloatingPointError(
                 f"{self.get_name() or 'ThrustAllocation'}: the wanted wrench at "
@@ -74,10 +75,10 @@ class ThrustAllocation(LeafSystem):
         return self._allocate.flat(F)
 
     def _put_pwm(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._both(context)[: output.size()])
+        put(output, self._both(context)[: output.size()])
 
     def _put_forces(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._both(context)[output.size() :])
+        put(output, self._both(context)[output.size() :])
 
 
 class PulseWidths(LeafSystem):
@@ -100,4 +101,4 @@ class PulseWidths(LeafSystem):
         self.DeclareVectorOutputPort("pwm", count, self._put, {self._pwm.ticket()})
 
     def _put(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._pwm.Eval(context))
+        put(output, value(self._pwm, context))

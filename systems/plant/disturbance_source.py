@@ -8,8 +8,9 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from ...models import se3
 from ...models.disturbances import Disturbance
-from ..compiled.jit import VectorFunction, value_or_none, value_or_zeros
+from ..compiled.jit import VectorFunction
 from ..compiled.pure import Event, Inputs, Pure, State, shown
+from ..drake import group, set_groups, value_or_none, value_or_zeros
 
 
 class DisturbanceSource(LeafSystem):
@@ -92,8 +93,7 @@ class DisturbanceSource(LeafSystem):
         self._move(context, discrete_state, state, 0.0)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = context.get_discrete_state().value(0)
-        self._move(context, discrete_state, state, self._period)
+        self._move(context, discrete_state, group(context, 0), self._period)
 
     def _move(
         self, context: Context, discrete_state: DiscreteValues, state: np.ndarray, ahead: float
@@ -105,6 +105,4 @@ class DisturbanceSource(LeafSystem):
         V = value_or_zeros(self._V, context)
         when = np.array([context.get_time(), ahead])
         result = self._advance.flat(X, V, when, value_or_zeros(self._noise, context), state)
-        discrete_state.set_value(0, result[:-12])
-        discrete_state.set_value(1, result[-12:-6])
-        discrete_state.set_value(2, result[-6:])
+        set_groups(discrete_state, range(3), (result[:-12], result[-12:-6], result[-6:]))

@@ -15,8 +15,9 @@ from ...models.effects.extended import Extended
 from ...models.effects.stepping import Stepper
 from ...models.thruster_curves import NEUTRAL
 from ...models.thrusters import Thrusters
-from ..compiled.jit import VectorFunction, value_or_none, value_or_zeros
+from ..compiled.jit import VectorFunction
 from ..compiled.pure import Event, Inputs, Pure, State, shown
+from ..drake import group, put, set_groups, value, value_or_none, value_or_zeros
 
 
 class LearnedPlant(LeafSystem):
@@ -131,8 +132,7 @@ class LearnedPlant(LeafSystem):
         for name, size, part in (("X_WB_seen", 7, slice(0, 7)), ("V_WB_B_seen", 6, slice(7, 13))):
 
             def show(context: Context, output: BasicVector, part: slice = part) -> None:
-                state = context.get_discrete_state()
-                output.SetFromVector(see.flat(*(state.value(i) for i in range(3)))[part])
+                put(output, see.flat(*(group(context, i) for i in range(3)))[part])
 
             self.DeclareVectorOutputPort(name, size, show, {self.xd_ticket()})
 
@@ -148,7 +148,7 @@ class LearnedPlant(LeafSystem):
         for name, part in (("thruster_force", slice(0, n)), ("voltage_loaded", slice(2 * n, None))):
 
             def show(context: Context, output: BasicVector, part: slice = part) -> None:
-                output.SetFromVector(context.get_discrete_state(self._bank).value()[part])
+                put(output, group(context, self._bank)[part])
 
             size = len(start[part])
             self.DeclareVectorOutputPort(name, size, show, {self.xd_ticket()})
@@ -239,26 +239,23 @@ class LearnedPlant(LeafSystem):
             ValueError: not a state.
         """
         X, V = check_state(X_WB, V_WB_B)
-        context.SetDiscreteState(self._X, X)
-        context.SetDiscreteState(self._V, V)
-        context.SetDiscreteState(self._A, np.zeros(6))
+        set_groups(context, (self._X, self._V, self._A), (X, V, np.zeros(6)))
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
-        X, V = context.get_discrete_state(self._X), context.get_discrete_state(self._V)
-        output.SetFromVector(np.concatenate([X.value(), V.value()]))
+        put(output, np.concatenate([group(context, self._X), group(context, self._V)]))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = context.get_discrete_state()
-        parts = [state.value(0), state.value(1)]
+        held = [group(context, i) for i in range(context.num_discrete_state_groups())]
+        parts = held[:2]
         # With thrusters this wrench is seldom connected, and `HasValue` is cheaper than a failure.
-        parts.append(self._F.Eval(context) if self._F.HasValue(context) else np.zeros(6))
+        parts.append(value(self._F, context) if self._F.HasValue(context) else np.zeros(6))
         parts += [value_or_zeros(port, context) for port in (self._F_disturbance, self._noise)]
         if self._thrusters is not None:
             pwm = value_or_none(self._pwm, context)
             voltage = value_or_none(self._voltage, context)
             parts.append(self._neutral if pwm is None else pwm)
             parts.append(self._nominal if voltage is None else voltage)
-        parts += [state.value(i) for i in range(3, state.num_groups())]
+        parts += held[3:]
         flow = value_or_none(self._flow, context)
         if flow is None:
             result = self._still.flat(*parts)
@@ -267,14 +264,10 @@ class LearnedPlant(LeafSystem):
             result = self._flowing.flat(*parts)
         if not result[19]:
             raise FloatingPointError(self._explain(context.get_time(), parts, result[7:13]))
-        discrete_state.set_value(0, result[:7])
-        discrete_state.set_value(1, result[7:13])
-        discrete_state.set_value(2, result[13:19])
-        at = 20
-        for i in range(3, state.num_groups()):
-            size = state.value(i).size
-            discrete_state.set_value(i, result[at : at + size])
-            at += size
+        # the flag that the state is finite stands after the rates, before the other groups
+        rest = np.split(result[20:], np.cumsum([each.size for each in held[3:]]))[:-1]
+        new = (result[:7], result[7:13], result[13:19], *rest)
+        set_groups(discrete_state, range(len(new)), new)
 
     def _explain(self, t: float, parts: list[np.ndarray], V: np.ndarray) -> str:
         names = ["X_WB", "V_WB_B", "F_Bo_B", "F_disturbance_Bo_B", "noise"]

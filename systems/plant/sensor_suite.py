@@ -14,9 +14,10 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from ...models.sensors import SHIPPED, Sensor, SensorFault
 from ...models.sensors.faults import FaultySensor
-from ..compiled.jit import VectorFunction, value_or_none, value_or_zeros
+from ..compiled.jit import VectorFunction
 from ..compiled.pure import Event, Inputs, Pure, State
 from ..compiled.pure import shown as shown_group
+from ..drake import group, set_groups, value_or_none, value_or_zeros
 
 Outputs = tuple[Array, ...]
 Motion = tuple[Array, Array, Array]
@@ -206,20 +207,17 @@ class SensorSuite(LeafSystem):
         def update(context: Context, discrete_state: DiscreteValues) -> None:
             t = context.get_time()
             function, reads, writes = call_at(round(t / period) % cycle)
-            state = context.get_discrete_state()
             parts = [np.array([t])]
             given = [(value_or_none(port, context), still) for port, still in inputs_at_rest]
             parts += [still if value is None else value for value, still in given]
-            parts += [state.value(index) for index in reads]
-            for index, value in zip(writes, function(*parts), strict=True):
-                discrete_state.set_value(index, value)
+            parts += [group(context, index) for index in reads]
+            set_groups(discrete_state, writes, function(*parts))
 
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, update)
 
     def _initialise(self, context: Context, discrete_state: DiscreteValues) -> None:
         w = value_or_zeros(self._initial_noise, context)
-        for index, value in zip(self._states, self._start(w), strict=True):
-            discrete_state.set_value(index, value)
+        set_groups(discrete_state, self._states, self._start(w))
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,10 @@
 import numpy as np
 from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
-from pydrake.systems.primitives import ConstantVectorSource, RandomSource
+from pydrake.systems.primitives import RandomSource
 
 from ...models.sensors import Sensor
+from ..drake import constant
 from ..estimation.ekf import Ekf
 from ..own import check_ports
 from ..plant.allocation import PulseWidths, ThrustAllocation
@@ -153,7 +154,7 @@ def _simulated(config: StationConfig, estimator: System | None, driven: bool = F
             station.connect(source, name, ekf)
     nominal = float(thrusters.nominal_voltage)
     volts = nominal if config.voltage is None else config.voltage
-    battery = add("battery", ConstantVectorSource([volts]))
+    battery = add("battery", constant([volts]))
     builder.Connect(battery.get_output_port(), plant.GetInputPort("voltage"))
     _add_noises(builder, config, sensors, (plant, water, ekf))
 
@@ -166,7 +167,7 @@ def _simulated(config: StationConfig, estimator: System | None, driven: bool = F
             builder.ExportOutput(ekf.GetOutputPort(name), name)
         else:
             value = [0.0, *[1.0] * (size - 1)] if name == "health" else [np.nan] * size
-            unknown = add(f"no_{name}", ConstantVectorSource(value))
+            unknown = add(f"no_{name}", constant(value))
             builder.ExportOutput(unknown.get_output_port(), name)
     truth = ((plant, "X_WB"), (plant, "V_WB_B"), (water, "F_disturbance_Bo_B"), (water, "flow_W"))
     for cheat, (system, name) in zip(CHEATS, truth, strict=True):

@@ -42,7 +42,6 @@ _STREAMS = {
     "BATTERY_STATUS": 2.0,
     "SYS_STATUS": 2.0,
     "EKF_STATUS_REPORT": 2.0,
-    "NAMED_VALUE_FLOAT": 2.0,
 }
 """Rates that are asked for (Hz)."""
 _ALIKE = 12.0  # µs by which outputs may differ from commanded ones: whole numbers on three axes

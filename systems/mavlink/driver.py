@@ -228,6 +228,8 @@ class Driver:
             VehicleRefused: the vehicle refuses a step, with its reason; what was changed is
                 restored.
         """
+        # compile before arming: in the loop a pause of a second counts as hanging
+        self._actuation.command(self.vehicle, np.zeros(6), 15.0, 1.0)
         if self._dry:
             return
         changed = {

@@ -1,0 +1,190 @@
+"""The driver against the simulated vehicle behind its MAVLink server."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from served_vehicle import Served
+
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.systems.mavlink import telemetry
+from spinndrift.systems.mavlink.driver import Acted, Driver, Mavlink
+from spinndrift.systems.mavlink.link import Link
+from spinndrift.systems.mavlink.parameters import Parameters
+from spinndrift.systems.mavlink.transport import Connection
+
+WAYS = ("manual_control", "rc_override", "thruster_passthrough")
+WRENCHES = np.diag([20.0, 20.0, 20.0, 2.0, 2.0, 4.0])
+HERE = np.array([0.0, 0.0, -1.5])
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served]:
+    served = Served("tcpin:127.0.0.1:0")
+    yield served
+    served.close()
+
+
+@pytest.fixture
+def port(served: Served) -> int:
+    return served.ports[0]
+
+
+@pytest.fixture(autouse=True)
+def _state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+
+
+def connect(port: int, **settings) -> Driver:
+    config = Mavlink(f"tcp:127.0.0.1:{port}", **settings)
+    return Driver(config, load_vehicle("bluerov2_heavy").thrusters())
+
+
+def fly(driver: Driver, F: np.ndarray, seconds: float, **more) -> Acted:
+    end, acted, start = time.monotonic() + seconds, None, time.monotonic()
+    while acted is None or time.monotonic() < end:
+        acted = driver.act(time.monotonic() - start, F, HERE, **more)
+        time.sleep(0.02)
+    return acted
+
+
+def until(true: Callable[[], bool], seconds: float = 10.0) -> bool:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if true():
+            return True
+        time.sleep(0.02)
+    return False
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_every_axis_gets_the_outputs_that_are_foreseen(port: int, way):
+    with connect(port, actuation=way) as driver:
+        assert until(lambda: all(found.passed for found in driver.preflight()), 30.0)
+        driver.prepare()
+        fly(driver, np.zeros(6), 1.0)  # the verticals spool up for half a second
+        for F in WRENCHES:
+            acted = fly(driver, F, 0.7)
+            assert (acted.order, acted.reason) == ("fly", "")
+            np.testing.assert_allclose(acted.F_Bo_B, F, atol=1e-9)
+            shown = driver.sense().outputs
+            assert shown is not None
+            np.testing.assert_allclose(shown.value, acted.expected, atol=4.0)
+            assert np.abs(acted.expected - 1500).max() > 50
+    check_at_rest(port)
+
+
+def check_at_rest(port: int) -> None:
+    """Disarmed, neutral, with the motors' functions."""
+    with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
+        link.find_vehicle(15.0)
+        parameters = Parameters(link)
+        for n in range(1, 9):
+            assert parameters.read(f"SERVO{n}_FUNCTION") == 32 + n
+        assert parameters.read("FS_PILOT_TIMEOUT") == 3.0
+        assert link.wait_for("SERVO_OUTPUT_RAW", 5.0) is not None
+        shown = telemetry.outputs(link, 8)
+        assert shown is not None
+        np.testing.assert_array_equal(shown.value, 1500.0)
+        status = telemetry.status(link, time.monotonic())
+        assert status is not None
+        assert not status.armed
+
+
+def test_readings_are_those_of_the_vehicle(served: Served):
+    with connect(served.ports[0]) as driver:
+        assert until(lambda: None not in (s := driver.sense())[:4] and s.outputs is not None)
+        sensed, (X_WB, _) = driver.sense(), served.simulation.plant.truth()
+        assert sensed.imu is not None
+        assert sensed.depth is not None
+        assert sensed.attitude is not None
+        assert sensed.imu.value[2] > 8.0  # specific force at rest points up
+        assert 0 < time.monotonic() - sensed.imu.taken < 2.0
+        assert sensed.depth.value[0] == pytest.approx(-X_WB[6], abs=0.5)
+        assert abs(sensed.attitude.value @ X_WB[:4]) > 0.99
+        assert 12 < sensed.voltage < 17
+
+
+def test_a_dry_run_commands_nothing(port: int):
+    with connect(port, actuation="rc_override") as driver:
+        driver._dry = True
+        driver.prepare()
+        acted = fly(driver, WRENCHES[0], 0.5)
+        assert acted.order == "fly"
+        shown = driver.sense().outputs
+        assert shown is not None
+        np.testing.assert_array_equal(shown.value, 1500.0)
+    check_at_rest(port)
+
+
+def test_a_guard_holds_depth_with_neutral_sticks(port: int):
+    with connect(port) as driver:
+        driver.prepare()
+        fly(driver, WRENCHES[0], 1.0)
+        acted = fly(driver, WRENCHES[0], 2.0, ages={"plan": 9.0})
+        assert acted.order == "hold_depth"
+        assert "planner" in acted.reason
+        status = telemetry.status(driver.link, time.monotonic())
+        assert status is not None
+        assert (status.mode, status.armed) == ("ALT_HOLD", True)
+        shown = driver.sense().outputs
+        assert shown is not None
+        np.testing.assert_allclose(shown.value[:2], 1500.0, atol=60)  # no more surge
+    check_at_rest(port)
+
+
+def test_a_pilot_who_changes_the_mode_is_left_alone(port: int):
+    with connect(port) as driver:
+        driver.prepare()
+        fly(driver, WRENCHES[0], 0.5)
+        driver._ask(176, 1.0, 0.0)  # DO_SET_MODE STABILIZE, as another station would
+        acted = fly(driver, WRENCHES[0], 2.0)
+        assert acted.order == "yield"
+        assert "STABILIZE" in acted.reason
+
+
+KILLED = """
+import sys, time
+import numpy as np
+import jax
+jax.config.update("jax_enable_x64", True)
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.systems.mavlink.driver import Driver, Mavlink
+config = Mavlink(sys.argv[1], actuation="thruster_passthrough")
+with Driver(config, load_vehicle("bluerov2_heavy").thrusters()) as driver:
+    driver.prepare()
+    start = time.monotonic()
+    while True:
+        driver.act(time.monotonic() - start, np.array([20.0, 0, 10, 0, 0, 0]), np.zeros(3))
+        print("flying", flush=True)
+        time.sleep(0.02)
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_killed_or_hung_process_leaves_no_thruster_running(port: int, how: signal.Signals):
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, f"tcp:127.0.0.1:{port}"],
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )
+    assert process.stdout is not None
+    for _ in range(50):
+        assert b"flying" in process.stdout.readline()
+    process.send_signal(how)
+    time.sleep(4.0)  # the guard: a second without a beat, a second of neutral, parameters
+    process.wait(5.0)  # the guard has killed a process that hangs
+    process.stdout.close()
+    check_at_rest(port)
+
+
+def test_a_frame_that_is_not_the_scenarios_is_refused(port: int):
+    with pytest.raises(UserError, match="has 8 thrusters and the scenario's vehicle 6"):
+        Driver(Mavlink(f"tcp:127.0.0.1:{port}"), load_vehicle("bluerov2").thrusters())

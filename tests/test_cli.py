@@ -235,7 +235,9 @@ def test_training_starts_from_a_model_with_effects(generated, tmp_path, capsys):
     model, _ = load_model(out / "model.spinn")
     assert isinstance(model, Extended)
     assert isinstance(model.base, Spinn)
-    np.testing.assert_allclose(model.effects[0].values, lag.values, rtol=1e-7)
+    common, *each = np.asarray(model.effects[0].values)  # then one for each thruster
+    np.testing.assert_allclose(common, lag.values[0], rtol=1e-7)
+    np.testing.assert_array_equal(each, np.zeros(8))
     overall = json.loads((out / "evaluation.json").read_text())
     assert set(overall) == {"preset", "learned", "start"}
     # what was learned is a start too, as it is and with its own architecture alone

@@ -43,13 +43,13 @@ def test_demo_tells_the_whole_story(tmp_path, monkeypatch):
     found = json.loads((out / "summary.json").read_text())
     consistent = nees_words(found["estimate"])
     assert consistent is not None
-    assert f"its covariance is right): {consistent}" in told
+    assert f"(3 on average for a consistent filter): {consistent}" in told
     assert set(found["held_out"]) == {"preset", "learned"}
     assert found["training"]["steps"] == tiny.steps
     report = (out / "report.html").read_text()
     for section in ("The data", "Training", "Held-out error", "The dive"):
         assert section in report
-    assert f"Over this run: {consistent}" in report
+    assert f"Mean over this run: {consistent}" in report
     assert (out / "dive" / "meshcat.html").stat().st_size > 1e6
     for folder, kind in ((out, DEMO), (out / "training", TRAINING), (out / "dive", RUN)):
         assert {p.name for p in folder.iterdir() if p.is_file()} <= {*kind.files, MARKER}

@@ -15,6 +15,7 @@ from spinndrift.sims.estimator_check.run import ESTIMATOR
 from spinndrift.sims.reports.marked_page import BEGIN, END
 from spinndrift.sims.run.folder import RUN
 from spinndrift.sims.study.run import STUDY
+from spinndrift.sims.vehicle.write import VEHICLE
 from spinndrift.training.fitting.run_folder import TRAINING
 
 FOLDERS = {
@@ -26,6 +27,7 @@ FOLDERS = {
     "check": (("check", "diagnosis", "--cases", "missing"), CHECK),
     "estimator": (("check", "estimator", "--model", "missing.spinn"), ESTIMATOR),
     "study": (("study", "ablation", "--config", "missing.yaml"), STUDY),
+    "vehicle": (("vehicle", "station_keeping_calm", "--connection", "missing"), VEHICLE),
 }
 """Commands that write a folder, with input that is missing: what is refused before is refused
 before that is noticed."""

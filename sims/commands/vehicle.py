@@ -11,6 +11,7 @@ from typing import Annotated, ClassVar
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ...models.config.checks import SECONDS, SEED, Within
+from ...models.files.interrupts import interrupts_held
 from ..progress import console, tell_code
 
 _SPEED = Within(0.01, 20.0)
@@ -58,11 +59,12 @@ class Vehicle:
 
     def run(self) -> None:
         """Serve, then write."""
-        from ...models.files.owned import run_folder
-        from ..scenarios.scenario import load_scenario
-        from ..vehicle.server import Server, open_all
-        from ..vehicle.simulation import Simulation
-        from ..vehicle.write import VEHICLE, write_vehicle
+        with interrupts_held():
+            from ...models.files.owned import run_folder
+            from ..scenarios.scenario import load_scenario
+            from ..vehicle.server import Server, open_all
+            from ..vehicle.simulation import Simulation
+            from ..vehicle.write import VEHICLE, write_vehicle
 
         scenario = load_scenario(self.scenario, self.scenario_text)
         tell_code(self.scenario, scenario.code)

@@ -91,8 +91,8 @@ def test_in_our_own_folder_a_foreign_file_keeps_its_place(command, tmp_path, cap
         before = tree(tmp_path)
         assert called(*arguments, "--out", out) == 2
         told = capsys.readouterr().err
-        if command == "run":
-            assert "holds a run already" in told
+        if command in ("run", "vehicle"):  # each time a new folder
+            assert f"holds a {command} already" in told
         else:
             assert (f"{name} in it is not of spinndrift's making" in told) == (name in kind.files)
         assert tree(tmp_path) == before

@@ -216,6 +216,7 @@ def test_an_axis_that_is_not_actuated_is_named_and_the_others_are_met(heavy, mak
     assert np.all(room.min(axis=0) < 1e-9)
 
 
+@pytest.mark.parametrize("name", ["bluerov2_heavy", "bluerov2_heavy_ignition", "ardusub_sitl"])
 def test_common_scale_keeps_the_direction_and_gives_the_most_possible(name, allocate):
     thrusters = load_vehicle(name).thrusters()
     B = np.asarray(thrusters.allocation)

@@ -17,6 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 from jaxtyping import Float
+from multi_step_fit import (
+    MultiStepFit,
+    Windows,
+    fit_forecasts,
+    forecast_errors,
+    rmse,
+    windows,
+)
 from scipy.spatial.transform import Rotation
 
 from spinndrift.models.config.errors import UserError
@@ -31,14 +39,6 @@ from spinndrift.models.recordings.store import Recording
 from spinndrift.models.se3 import AXES
 from spinndrift.models.vehicles.vehicle import Vehicle, load_vehicle
 from spinndrift.training.diagnosis.filter.problem import DiagnosisProblem
-from spinndrift.training.diagnosis.selection.multi_step_fit import (
-    MultiStepFit,
-    Windows,
-    fit_forecasts,
-    forecast_errors,
-    rmse,
-    windows,
-)
 
 RATE = 10.0  # Hz
 POSITION, EULER = ("x_m", "y_m", "z_m"), ("roll_rad", "pitch_rad", "yaw_rad")

@@ -717,7 +717,8 @@ def test_bands_hold_what_a_law_of_the_disturbance_adds(tmp_path):
     """Simulated bands are too narrow without the slow pushes that were hidden, not with them."""
     from spinndrift.training.diagnosis.disturbance.found import laws_of
     from spinndrift.training.diagnosis.findings.reported import law_cause
-    from spinndrift.training.diagnosis.validation.validation import Contender, judge
+    from spinndrift.training.diagnosis.validation.simulation import Contender
+    from spinndrift.training.diagnosis.validation.validation import judge
     from spinndrift.training.evaluation.metrics import BANDS
 
     _, recording = recorded(tmp_path, 5, names=("disturbance_colour",))

@@ -3,21 +3,21 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from multi_step_fit import (
+    fit_forecasts,
+    forecast_errors,
+    rmse,
+    windows,
+)
 
 from spinndrift.models.effects import KINDS, Extended
 from spinndrift.models.effects.thrust import AxisThrust
 from spinndrift.models.recordings.build import Trajectory
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.vehicles.vehicle import load_vehicle
-from spinndrift.training.diagnosis.filter.innovations import substeps
+from spinndrift.training.diagnosis.filter.along_records import substeps
 from spinndrift.training.diagnosis.filter.problem import DiagnosisProblem
 from spinndrift.training.diagnosis.pipeline import DiagnoseConfig, Diagnoser
-from spinndrift.training.diagnosis.selection.multi_step_fit import (
-    fit_forecasts,
-    forecast_errors,
-    rmse,
-    windows,
-)
 from spinndrift.training.diagnosis.selection.search import refitted
 
 VEHICLE = load_vehicle("bluerov2_heavy")

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ...models import se3
 from ...models.se3 import CHANNELS
 from ...training.diagnosis.pipeline import Finding
-from ...training.diagnosis.validation.validation import Simulated
+from ...training.diagnosis.validation.simulation import Simulated
 from .figures import FLOWN, GRID, INK, PLANNED, common_legend, legend, panels, scaled, styled
 from .figures_maps import draw_map, error_map, variables
 

@@ -5,19 +5,20 @@ The steps of a diagnosis, a folder each:
 `data`        runs as arrays with the thrusters' commands and their scenarios (`arrays`); faults of
               the data: stuck sensors, jumps, axes never excited (`checks`); runs that had the same
               commands (`repeats`)
-`filter`      one-step predictions from every sample, their errors r and Jacobians A
-              (`innovations`); diffusion and measurement noise from their covariances, and the
-              Kalman gain (`noise`); sensitivities of the innovations to every effect
+`filter`      motion of a model along the records (`along_records`), which predictions, forecasts
+              and simulations share; one-step predictions from every sample, their errors r and
+              Jacobians A (`innovations`); diffusion and measurement noise from their covariances,
+              and the Kalman gain (`noise`); sensitivities of the innovations to every effect
               (`sensitivities`), inner products of these by run (`gram`); all of these at one θ
               (`problem`)
 `candidates`  unmodelled structure: groups of further regressors for the wrench
 `disturbance` laws of the residual: level, colour, heavy tails, waves, varying currents
 `selection`   fits, held-out gains and tests of sets of causes (`hypotheses`); forward selection of
-              causes in pure steps (`search`, `state`) by the rules of `model_selection`; multi-step
-              fits for states that were smoothed or resampled (`multi_step_fit`); joint fit of all
-              coefficients (`refit_all`)
-`validation`  scores on held-out data: log scores, simulations, coverage of bands, and a black-box
-              model to compare with (`blackbox`)
+              causes in pure steps (`search`, `state`) by the rules of `model_selection`; joint fit
+              of all coefficients (`refit_all`)
+`validation`  scores on held-out data (`validation`): log scores, noise-free forecasts (`forecast`),
+              simulations with noise (`simulation`), coverage of bands, and a black-box model to
+              compare with (`blackbox`)
 `findings`    causes with intervals, in words; `diagnosis.json` (`result`); the next experiment
 
 `causes` has the order in which causes and structure are sought. `pipeline` runs all of these, from

@@ -1,6 +1,5 @@
 """Errors of one-step predictions from every sample, and how they propagate."""
 
-import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,32 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ....models import se3
-from ....models.dynamics import Memory
-from ....models.effects.deterministic_step import advance
 from ....models.effects.extended import Extended
-from ....models.effects.inertia import Inertia
 from ....models.effects.library import Library
 from ....models.effects.recent import Recent
 from ..data.arrays import Data
-
-SUBSTEPS, LONGEST = 2, 0.0125
-"""Fewest substeps of a step, and their greatest length (s): drag is stiff in fast turns."""
-
-
-def substeps(longest: float) -> int:
-    """Substeps of predictions over steps of up to `longest` s."""
-    return max(SUBSTEPS, math.ceil(longest / LONGEST - 1e-6))
-
-
-Arrays = tuple[Array, Array, Array, Array, Array, Array, Array]
-"""Poses, twists, commands, voltages and steps of `Data`, commands and steps before them."""
-
-
-def as_arrays(data: Data) -> Arrays:
-    """The arrays that compiled programs take; equal steps as one column, (N, 1)."""
-    now = (data.X, data.V, data.u, data.voltage, data.own_steps())
-    arrays = (*now, data.past, data.past_steps())
-    return tuple(jnp.asarray(a) for a in arrays)  # pyright: ignore[reportReturnType]
+from .along_records import AlongRecords, Records, State, Step, scan, substeps
 
 
 class Predictions(NamedTuple):
@@ -69,57 +47,27 @@ def difference(
     return jnp.concatenate(jnp.broadcast_arrays(se3.local(X, X2), V2 - V))
 
 
-def settle(model: Extended, past: Float[Array, "P n *batch"], step: Array) -> Memory:
-    """Actuator states after commands, each held for a `step` (s); steady under the first before."""
-    memory = model.remember(past[0])
-    if not memory:
-        return ()
-
-    def after(memory: Memory, given: tuple[Array, Array]) -> tuple[Memory, None]:
-        return model.actuate(memory, *given, 1)[0], None
-
-    shapes = jax.eval_shape(lambda m: after(m, (past[0], step[0]))[0], memory)
-    memory = tuple(jnp.broadcast_to(m, s.shape) for m, s in zip(memory, shapes, strict=True))
-    return jax.lax.scan(after, memory, (past, step))[0]
-
-
-def at_first(
-    model: Extended, inertia: Inertia, memory: Memory, X: Float[Array, "7 *#b"],
-    V: Float[Array, "6 *#b"], before: Float[Array, "n *#b"], voltage: Array, step: Array,
-) -> Recent:  # fmt: skip
-    """History of the twist before the first sample: constant acceleration under `before`."""
-    level = model.actuate(memory, before, step, 1)[1][..., 0]
-    return Recent.steady(model.drift(inertia, X, V, level, voltage), step)
-
-
 @eqx.filter_jit
-def _predict(model: Extended, effects: Any, arrays: Arrays, count: int) -> Predictions:
-    X, V, u, voltage, step, past, past_step = arrays
-    model = model.with_effects(effects)
-    inertia = model.inertia()
+def _predict(model: Extended, effects: Any, records: Records, count: int) -> Predictions:
+    along = AlongRecords.of(model.with_effects(effects), count)
     plain = model.with_effects(())
     rest = plain.inertia()
 
-    def body(carry: tuple[Memory, Recent], given: Any) -> Any:
-        memory, recent = carry
-        X0, V0, X1, V1, command, volts, h = given
-        # what delayed instruments do not show yet happened under earlier commands
-        x, v = model.infer(X0, V0, recent)
-        memory, Xp, Vp, a = advance(
-            model, inertia, memory, x, v, command, h[None], count, volts[None]
-        )
-        latest = Recent.over(v, Vp, a, h[None])
-        jacobian, slope = _jacobian(plain, rest, x, (v + Vp) / 2, command, h)
-        latest = latest.keeping(Vp, slope)
-        recent = recent.after(latest)
-        error = difference(*model.observe(Xp, Vp, recent), X1, V1)
-        return (memory, recent), Predictions(error, Xp, Vp, jacobian, latest, (x, v))
+    def predicted(state: State, given: Step) -> tuple[State, Predictions]:
+        start = along.restart(state, given.X, given.V)
+        end = along.step(start, given)
+        middle = (start.V + end.V) / 2
+        jacobian, slope = _jacobian(plain, rest, start.X, middle, given.command, given.length[0])
+        recent = end.recent.keeping(end.V, slope)
+        end = end._replace(recent=recent)
+        latest = Recent(recent.bends[:1], recent.step[:1], end.V, slope)
+        error = difference(*along.observe(end), given.X_next, given.V_next)
+        return end, Predictions(error, end.X, end.V, jacobian, latest, (start.X, start.V))
 
-    memory = settle(model, past, past_step[:, None])
-    first = at_first(model, inertia, memory, X[0], V[0], past[-1], voltage[:1], step[:1])
-    first = first.keeping(V[0], jnp.zeros((6, *V[0].shape), V.dtype))
-    xs = (X[:-1], V[:-1], X[1:], V[1:], u, voltage, step)
-    return jax.lax.scan(body, (memory, first), xs)[1]._replace(first=first)
+    start, V = along.init(records), records.V[0]
+    first = start.recent.keeping(V, jnp.zeros((6, *V.shape), V.dtype))
+    found = scan(predicted, start._replace(recent=first), records)
+    return found._replace(first=first)
 
 
 def _jacobian(
@@ -155,7 +103,7 @@ def _jacobian(
 def predict(model: Extended, library: Library, theta: np.ndarray, data: Data) -> Predictions:
     """Predictions of all samples with the effects' values `theta`: (p,), or (p, R) by piece."""
     effects = library.filled(theta.reshape(len(theta), -1))
-    found = _predict(model, effects, as_arrays(data), substeps(data.longest))
+    found = _predict(model, effects, Records.of(data), substeps(data.longest))
     found = found._replace(late=sum((e.pose_delay() for e in effects), np.zeros(6)))
     return (
         found._replace(error=found.error * data.measured[None, :, None])

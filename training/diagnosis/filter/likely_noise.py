@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Bool, Float
 
+from ...least_squares import LocalModel, marquardt, minimise
 from .transition import Transition
 
 _BLOCK, _LEAST = 12, 8
@@ -25,8 +26,8 @@ _LONGER = 24
 """Samples of a block where slow disturbances are separated from a white level."""
 _TIMES = (0.3, 1.0, 4.0)
 """Time constants (s) of slow disturbances, as a mixture."""
-_ROUNDS, _TRIES, _ENOUGH = 60, 8, 1e-4
-"""Rounds of scoring; trials of a step; gain of log likelihood a block at which scoring ends."""
+_ROUNDS, _ENOUGH = 60, 1e-4
+"""Rounds of scoring; gain of log likelihood a block at which scoring ends."""
 _STEP = 1.5  # largest step of log θ
 _DEEP = 14.0
 """How far below its start log θ may go where slow disturbances are fitted."""
@@ -67,28 +68,21 @@ class Likelihood(NamedTuple):
     ) -> Float[np.ndarray, " k"]:
         """Fisher scoring from x over the entries `moved`, bounded below by `low`."""
         x = np.where(moved, np.maximum(x, low), x)
-        loss, inverse = self.loss(x)
-        damping = 1e-3
-        for _ in range(_ROUNDS):
+
+        def local(x: np.ndarray) -> LocalModel:
+            loss, inverse = self.loss(x)
             slope, fisher = self.fisher(x, inverse)
             free = moved & ((x > low + 1e-9) | (slope < 0))
-            for _ in range(_TRIES):
-                H = fisher[np.ix_(free, free)]
-                H = H + np.diag(damping * np.diag(H) + 1e-9)
+
+            def stepped(damping: float) -> np.ndarray:
                 step = np.zeros(len(x))
-                step[free] = np.clip(-np.linalg.solve(H, slope[free]), -_STEP, _STEP)
-                tried = np.where(moved, np.maximum(x + step, low), x)
-                less, other = self.loss(tried)
-                if less <= loss:
-                    break
-                damping = 10 * max(damping, 1e-3)
-            else:
-                break
-            gain, x, loss, inverse = loss - less, tried, less, other
-            damping = max(damping / 10, 1e-6)
-            if gain < _ENOUGH:
-                break
-        return x
+                full = marquardt(fisher[np.ix_(free, free)], slope[free], damping)
+                step[free] = np.clip(full, -_STEP, _STEP)
+                return np.where(moved, np.maximum(x + step, low), x)
+
+            return LocalModel(loss, lambda x: self.loss(x)[0], stepped)
+
+        return minimise(x, local, _ROUNDS, _ENOUGH)
 
 
 def most_likely(

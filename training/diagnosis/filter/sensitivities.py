@@ -17,7 +17,8 @@ from ....models.effects.extended import Extended
 from ....models.effects.library import Library, kind
 from ....models.effects.recent import Recent
 from ..data.arrays import Data
-from .innovations import Arrays, Predictions, as_arrays, settle
+from .along_records import Records, settle
+from .innovations import Predictions
 from .noise import Filter
 
 LANES, FEW, INSTRUMENTS = 28, 8, 18
@@ -37,7 +38,7 @@ def _whitened(
     model: Extended,
     effects: Any,
     predictions: Predictions,
-    arrays: Arrays,
+    records: Records,
     filters: tuple[Array, Array, Array],
     lanes: int,
     instruments: bool,
@@ -45,9 +46,9 @@ def _whitened(
     """Whitened innovations of lane 0 (the base) and changes of them in the other lanes."""
     model = model.with_effects(effects)
     if not instruments:
-        model, predictions, arrays, filters = _single((model, predictions, arrays, filters))
+        model, predictions, records, filters = _single((model, predictions, records, filters))
     first, predictions = predictions.first, predictions._replace(first=None, late=None)
-    (X, V, u, voltage, step, past, past_step), (keep, whiten, weight) = arrays, filters
+    (X, V, u, voltage, step, past, past_step), (keep, whiten, weight) = records, filters
     inertia = model.inertia()
 
     def body(carry: Any, given: Any) -> Any:
@@ -117,7 +118,7 @@ def whitened_sensitivities(
     double precision, which poses need, all others one in single precision, `LANES` (or `FEW`) at a
     time. Up to `AHEAD` calls run in parallel.
     """
-    arrays = as_arrays(data)
+    records = Records.of(data)
     filters = (jnp.asarray(kalman.keep), jnp.asarray(kalman.whiten), jnp.asarray(data.weight))
     reads = np.array([kind(e.cause).family == "measurement" for e in library.entries])
     of_instruments = np.any((probes != 0) & reads, axis=1)
@@ -145,7 +146,7 @@ def whitened_sensitivities(
             chunk[1 : 1 + len(some)] = probes[some]
             lanes = library.filled((theta + chunk).T[:, :, None])
             effects = _of_family(lanes, believed, instruments)
-            arguments = predictions, arrays, filters, size + 1, instruments
+            arguments = predictions, records, filters, size + 1, instruments
             call = _threads().submit(run, model, effects, *arguments)
             running.append((some, call))
             if len(running) > AHEAD:

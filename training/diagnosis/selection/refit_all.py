@@ -8,6 +8,7 @@ be weighed and computed; added mass and drag are not negative, and thrust is as 
 one as that allows.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -16,12 +17,15 @@ from jaxtyping import Float
 
 from ....models.effects.library import COEFFICIENTS, Entry, kind
 from ....models.effects.traits import Group
+from ...least_squares import Damping, LocalModel, minimise
 from ..filter.gram import least_within
 from ..filter.noise import Filter
 from ..filter.problem import DiagnosisProblem, Evaluation
 from .hypotheses import known_within
 
-_ROUNDS, _TRIES = 40, 8
+_ROUNDS = 40
+_DAMPING, _FULL_STEP = Damping(start=0.0, after_failure=1.0, least=0.0), 0.1
+"""Damping in units of the prior, and the one below which it is left out."""
 _ENOUGH = 1.0
 """Gain of a round (nats) below which the fit ends."""
 _COMMON = 13
@@ -87,53 +91,59 @@ def identify(
     by piece. That needs no noise levels, which a wrong model makes too large, and an
     estimator's slow errors do less harm where the vehicle rests than where drag multiplies them.
     """
-    chosen = [*coefficients(problem), *_as_coefficients(problem, also)]
-    rows = [c.row for c in chosen]
-    spread = np.array([c.spread for c in chosen])
-    low, high = np.array([c.low for c in chosen]), np.array([c.high for c in chosen])
-    centre = problem.believed[rows]
+    posterior = _Posterior(problem, [*coefficients(problem), *_as_coefficients(problem, also)])
+    rows = posterior.rows
+    theta = (problem.believed if start is None else start).copy()
     if start is None:
-        theta = problem.believed.copy()
-        for c in chosen:
-            theta[c.row] += problem.library.entries[c.row].parameter.start
+        theta[rows] += [problem.library.entries[i].parameter.start for i in rows]
     else:
-        theta = start.copy()
-        theta[rows] = np.clip(theta[rows], low, high)
+        theta[rows] = np.clip(theta[rows], posterior.low, posterior.high)
+    rounds = itertools.count()
 
-    def loss(theta: np.ndarray, common: np.ndarray) -> float:
-        away = (theta[rows] - centre) / spread
-        C, counts = _by_piece(problem, problem.errors(theta), common)
+    def local(theta: np.ndarray) -> LocalModel:
+        progress(next(rounds) / _ROUNDS)
+        return posterior.local(theta)
+
+    return minimise(theta, local, _ROUNDS, _ENOUGH, _DAMPING)
+
+
+class _Posterior:
+    """Posterior of coefficients given one-step errors, weighted as at a θ."""
+
+    def __init__(self, problem: DiagnosisProblem, chosen: Sequence[Coefficient]):
+        self.problem, self.rows = problem, [c.row for c in chosen]
+        self.spread = np.array([c.spread for c in chosen])
+        self.low, self.high = np.array([c.low for c in chosen]), np.array([c.high for c in chosen])
+        self.centre = problem.believed[self.rows]
+
+    def loss(self, theta: np.ndarray, common: np.ndarray) -> float:
+        """Its negative logarithm, with the pooled covariance `common` as the pieces' prior."""
+        away = (theta[self.rows] - self.centre) / self.spread
+        C, counts = _by_piece(self.problem, self.problem.errors(theta), common)
         if not np.isfinite(C).all():
             return np.inf
         return float(counts @ np.linalg.slogdet(C)[1] + away @ away) / 2
 
-    damping = 0.0
-    for n in range(_ROUNDS):
-        progress(n / _ROUNDS)
+    def local(self, theta: np.ndarray) -> LocalModel:
+        """Its quadratic model in units of the prior, with errors weighted as at θ."""
+        problem, rows, spread = self.problem, self.rows, self.spread
         common = problem.covariance(problem.errors(theta), apart=True)
-        best = loss(theta, common)
-        seen = problem.evaluate(theta, rows, one_step(problem, theta))
-        gradient, H = _quadratic(seen, rows)
-        gradient = (gradient + (theta[rows] - centre) / spread**2) * spread
+        now = self.loss(theta, common)
+        gradient, H = _quadratic(problem.evaluate(theta, rows, one_step(problem, theta)), rows)
+        gradient = (gradient + (theta[rows] - self.centre) / spread**2) * spread
         # but for rounding, no eigenvalue is below 1 with the prior
         values, vectors = np.linalg.eigh(H * np.outer(spread, spread) + np.eye(len(rows)))
         values = np.maximum(values, 1.0)
-        for _ in range(_TRIES):
-            within = (low - theta[rows]) / spread, (high - theta[rows]) / spread
-            step = least_within(values + damping, vectors, gradient, *within)
+        within = (self.low - theta[rows]) / spread, (self.high - theta[rows]) / spread
+
+        def stepped(damping: float) -> np.ndarray:
+            damped = values + (damping if damping >= _FULL_STEP else 0.0)
+            step = least_within(damped, vectors, gradient, *within)
             moved = theta.copy()
-            moved[rows] = np.clip(theta[rows] + step * spread, low, high)
-            new = loss(moved, common)
-            if new < best:
-                break
-            damping = max(10 * damping, 1.0)
-        else:
-            break
-        won, theta, best = best - new, moved, new
-        damping = damping / 10 if damping > 0.1 else 0.0
-        if won < _ENOUGH:
-            break
-    return theta
+            moved[rows] = np.clip(theta[rows] + step * spread, self.low, self.high)
+            return moved
+
+        return LocalModel(now, lambda theta: self.loss(theta, common), stepped)
 
 
 def _as_coefficients(problem: DiagnosisProblem, rows: Sequence[int]) -> list[Coefficient]:

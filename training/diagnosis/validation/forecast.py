@@ -1,19 +1,15 @@
 """Noise-free forecasts of recorded runs, window by window."""
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ....models.effects.deterministic_step import advance
 from ....models.effects.extended import Extended
 from ....models.effects.inertia import times
-from ....models.effects.recent import Recent
 from ..data.arrays import Data
-from ..filter.innovations import Arrays, as_arrays, at_first, settle, substeps
+from ..filter.along_records import AlongRecords, Records, State, Step, scan, substeps
 
 
 @runtime_checkable
@@ -27,35 +23,26 @@ class Learned(Protocol):
         ...
 
 
-@eqx.filter_jit
-def _forecast(
-    model: Extended, arrays: Arrays, every: int, count: int, rest: Learned | None
-) -> tuple[Array, Array]:
-    X, V, u, voltage, step, past, past_step = arrays
-    inertia = model.inertia()
+def states(
+    model: Extended, records: Records, every: int, count: int, rest: Learned | None = None
+) -> tuple[Float[Array, "N 7 R"], Float[Array, "N 6 R"]]:
+    """`forecast` of arrays, in `count` substeps, to be compiled or differentiated."""
+    along = AlongRecords.of(model, count)
 
-    def body(carry: Any, given: Any) -> Any:
-        memory, x, v, recent = carry
-        n, X0, V0, command, before, volts, h = given
-        fresh = model.infer(X0, V0, recent)
-        starts = n % every == 0
-        x, v = (jnp.where(starts, a, b) for a, b in zip(fresh, (x, v), strict=True))
+    def forecast_step(state: State, given: Step) -> tuple[State, tuple[Array, Array]]:
+        state = along.restart(state, given.X, given.V, given.number % every == 0)
         push = None
         if rest is not None:
-            lacking = rest.acceleration(*(k[:, None] for k in (x, v, command, before)))
-            push = times(inertia.matrix, lacking[:, 0])
-        memory, x, Vp, a = advance(
-            model, inertia, memory, x, v, command, h[None], count, volts[None], push
-        )
-        recent = recent.after(Recent.over(v, Vp, a, h[None]))
-        return (memory, x, Vp, recent), model.observe(x, Vp, recent)
+            now = state.X, state.V, given.command, given.before
+            lacking = rest.acceleration(*(a[:, None] for a in now))
+            push = times(along.inertia.matrix, lacking[:, 0])
+        state = along.step(state, given, push)
+        return state, along.observe(state)
 
-    memory = settle(model, past, past_step[:, None])
-    first = at_first(model, inertia, memory, X[0], V[0], past[-1], voltage[:1], step[:1])
-    start = (memory, X[0], V[0], first)
-    before = jnp.concatenate([past[-1:], u[:-1]])
-    xs = (jnp.arange(len(u)), X[:-1], V[:-1], u, before, voltage, step)
-    return jax.lax.scan(body, start, xs)[1]
+    return scan(forecast_step, along.init(records), records)
+
+
+_states = eqx.filter_jit(states)
 
 
 def forecast(
@@ -66,5 +53,5 @@ def forecast(
     Windows start at steps 0, `every`, 2 `every`, … from the record there; actuator states continue
     from window to window. `rest` is added to the model's acceleration.
     """
-    X, V = _forecast(model, as_arrays(data), every, substeps(data.longest), rest)
+    X, V = _states(model, Records.of(data), every, substeps(data.longest), rest)
     return np.asarray(X), np.asarray(V)

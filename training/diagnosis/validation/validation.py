@@ -5,68 +5,28 @@ judged on; of a single scenario runs are left out in turn, of a single run block
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float
 
-from ....models import se3
-from ....models.effects.base import Effect
-from ....models.effects.deterministic_step import advance
-from ....models.effects.extended import FOR_EVER, Extended
-from ....models.effects.inertia import times
 from ....models.effects.noise import DisturbanceImpacts, DisturbanceStateDependence
-from ....models.effects.recent import Recent
 from ....models.se3 import AXES
 from ...evaluation.metrics import BANDS, order_statistics
+from ..data.arrays import Data
 from ..disturbance.laws import Law
-from ..filter.innovations import Arrays, as_arrays, at_first, difference, predict, settle, substeps
+from ..filter.innovations import predict
 from ..filter.noise import estimate, score_of
 from ..filter.problem import DiagnosisProblem
 from ..filter.transition import Transition
 from ..findings import result
-from .blackbox import BlackBox, arguments
+from .blackbox import arguments
+from .simulation import SAMPLES, Contender, Simulated, simulate
 
 GROUPS = {"position": slice(0, 3), "rotation": slice(3, 6), "velocity": slice(6, 9)}
-_COARSER = 4
-"""Ratio of the substeps of simulated samples to those of predictions."""
 HORIZONS = (0.5, 1.0, 2.0, 4.0)
-SAMPLES = 39
 _PIECES = 60
 _DRAWS = 400
-
-
-@dataclass(frozen=True)
-class Contender:
-    """A model to judge: θ of each piece (p, R), fitted without it; perhaps a learned correction."""
-
-    theta: Float[np.ndarray, "p R"]
-    black_box: BlackBox | None = None
-    law_gain: Float[np.ndarray, " R"] | float = 0.0
-    """Held-out nats by piece that disturbance laws win in addition."""
-    random_effects: tuple[Effect, ...] = ()
-    """Effects of these laws; simulations start in their stationary state."""
-    white_share: Float[np.ndarray, "6"] = field(default_factory=lambda: np.ones(6))
-    """Share of the estimated diffusion that is not due to them (`white_part`)."""
-
-
-class Simulated(NamedTuple):
-    """Recorded less simulated, window after window.
-
-    Attributes:
-        errors: pose seen from the simulated body, and twist; lane 0 is simulated without noise, the
-            others with that of the disturbance and of the records (N, 12, S, K).
-        pieces: indices of the pieces that are simulated (K,).
-        every: steps of a window, each simulated from the record at its start.
-    """
-
-    errors: Float[np.ndarray, "N 12 S K"]
-    pieces: Int[np.ndarray, " K"]
-    every: int
 
 
 class Judged(NamedTuple):
@@ -143,9 +103,8 @@ def judge(
     levels = record[:, kept], diffusion[:, kept] * contender.white_share[:, None]
     kinds = {problem.library.entries[i][:2] for i in in_use}
     kinds |= {problem.library.entries[i][:2] for i in np.flatnonzero(np.any(theta != 0, axis=1))}
-    return _simulate(
-        problem, contender, levels, kept, horizon, seed, density + contender.law_gain, kinds
-    )
+    simulated = simulate(problem, contender, levels, kept, horizon, seed, kinds)
+    return _judged(simulated, density + contender.law_gain, data, horizon)
 
 
 def white_part(laws: Sequence[Law], problem: DiagnosisProblem) -> Float[np.ndarray, "6"]:
@@ -178,37 +137,8 @@ def _spread(fold: np.ndarray, most: int) -> np.ndarray:
     return np.array(sorted(chosen))
 
 
-def _simulate(
-    problem: DiagnosisProblem,
-    contender: Contender,
-    levels: tuple[np.ndarray, np.ndarray],
-    kept: np.ndarray,
-    horizon: float,
-    seed: int,
-    score: np.ndarray,
-    kinds: set[tuple[str, str]],
-) -> Judged:
-    data = problem.data
-    X, V, u, voltage, _, past, _ = as_arrays(data)
-    step, past_step = jnp.asarray(data.own_steps(kept)), jnp.asarray(data.past_steps(kept))
-    now = X[..., kept], V[..., kept], u[..., kept], voltage[..., kept], step
-    arrays = *now, past[..., kept], past_step
-    theta = contender.theta[:, kept]
-    every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))
-    effects = problem.library.filled(theta[:, None])
-    used = tuple(e for e in effects if any((e.name, where) in kinds for where in e.places))
-    box = contender.black_box
-    if box is not None:
-        box = eqx.tree_at(lambda b: b.weights, box, box.weights[..., kept])
-    e = np.asarray(
-        _errors(
-            problem.model, used, contender.random_effects, arrays, box, jnp.asarray(levels[1]),
-            jnp.asarray(levels[0]), jax.random.key(seed), every,
-            max(1, substeps(data.longest) // _COARSER),
-        ),
-        np.float64,
-    )  # fmt: skip
-    simulated = Simulated(e.astype(np.float32), kept, every)
+def _judged(simulated: Simulated, score: np.ndarray, data: Data, horizon: float) -> Judged:
+    e, every, kept = simulated.errors.astype(np.float64), simulated.every, simulated.pieces
     at = horizons(horizon, every, data.dt)
     fold, labels = data.fold[kept], np.unique(data.fold)
     weight = data.weight[:, kept]
@@ -244,85 +174,6 @@ def horizons(longest: float, every: int, dt: float) -> list[int]:
     return found or [every]
 
 
-@eqx.filter_jit
-def _errors(
-    model: Extended,
-    effects: tuple[Effect, ...],
-    random_effects: tuple[Effect, ...],
-    arrays: Arrays,
-    box: BlackBox | None,
-    diffusion: Float[Array, "6 R"],
-    record: Float[Array, "12 R"],
-    key: Array,
-    every: int,
-    coarse: int,
-) -> Float[Array, "N 12 S R"]:
-    """Recorded less simulated: lane 0 without noise, the others with it and that of the records."""
-    X, V, u, voltage, step, past, past_step = arrays
-    model = model.with_effects(effects)
-    random = model.with_effects(random_effects)
-    inertia = model.inertia()
-    R, S = V.shape[2], 1 + SAMPLES
-    more = random.noise_size - 6
-    noisy = (jnp.arange(S)[None, :, None] > 0).astype(V.dtype)
-    record = record[:, None] * noisy
-    b = diffusion[:, None] * noisy
-
-    move = jax.vmap(random.step_random_state, -1, -1)  # each column has its own step
-
-    def with_noise(V: Array, w: Array) -> Array:
-        M = inertia.inverse
-        M = M.reshape(M.shape + (1,) * (4 - M.ndim))
-        own = random.scaled_diffusion(V, b) if random_effects else b
-        return V + jnp.sum(M * (own * w)[None], axis=1)
-
-    def read(X: Array, V: Array, w: Array) -> tuple[Array, Array]:
-        n = record * w
-        X, n = jnp.broadcast_to(X, (7, *n.shape[1:])), n
-        return se3.retract(X, n[:6]), V + n[6:]
-
-    def body(carry: Any, given: Any) -> Any:
-        memory, pushes, x, v, recent = carry
-        n, X0, V0, X1, V1, command, before, volts, h = given
-        dt = h[None, None]
-        draw = jax.random.normal(jax.random.fold_in(key, n), (30 + 2 * more, S, R), V.dtype)
-        start = read(X0[:, None], V0[:, None], draw[:12])
-        fresh = model.infer(*start, recent)
-        starts = n % every == 0
-        x, v = (jnp.where(starts, a, b) for a, b in zip(fresh, (x, v), strict=True))
-        push = None
-        if box is not None:
-            wide = jnp.broadcast_to(command[:, None], (len(command), S, R))
-            late = jnp.broadcast_to(before[:, None], wide.shape)
-            push = times(inertia.matrix, box.acceleration(x, v, wide, late))
-        if random_effects:
-            w = draw[24:] * noisy  # of which six are left for b dW
-            drawn, _ = random.step_random_state(pushes, x, v, w[: 6 + more], FOR_EVER)
-            pushes = tuple(jnp.where(starts, a, b) for a, b in zip(drawn, pushes, strict=True))
-            pushes, random_wrench = move(pushes, x, v, w[more:], jnp.broadcast_to(h, (R,)))
-            push = random_wrench if push is None else push + random_wrench
-        memory, x, Vp, a = advance(
-            model, inertia, memory, x, v, command[:, None], dt, coarse, volts[None, None], push
-        )
-        recent = recent.after(Recent.over(v, Vp, a, dt))
-        v = with_noise(Vp, jnp.sqrt(dt) * draw[12:18])
-        seen = model.observe(x, v, recent)
-        e = difference(*read(*seen, draw[18:30]), X1[:, None], V1[:, None])
-        return (memory, pushes, x, v, recent), e.astype(jnp.float32)
-
-    zero = jnp.zeros((1, S, R), V.dtype)
-    memory = settle(model, past[:, :, None] + zero[None], past_step[:, None, None])
-    recent = at_first(
-        model, inertia, memory, X[0][:, None] + zero, V[0][:, None] + zero,
-        past[-1][:, None] + zero, voltage[:1, None], step[:1, None],
-    )  # fmt: skip
-    pushes = random.simulation_state(u[0][:, None] + zero)[1]
-    start = (memory, pushes, X[0][:, None] + zero, V[0][:, None] + zero, recent)
-    before = jnp.concatenate([past[-1:], u[:-1]])
-    xs = (jnp.arange(len(u)), X[:-1], V[:-1], X[1:], V[1:], u, before, voltage, step)
-    return jax.lax.scan(body, start, xs)[1]
-
-
 # ----------------------------------------------------------------------------------- summary
 
 
@@ -337,8 +188,8 @@ def model_gain(
     data = problem.data
     labels = np.unique(data.fold)
     drawn = rng.integers(len(labels), size=(_DRAWS, len(labels)))
-    every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))
-    names = [f"{h * data.dt:g}" for h in horizons(horizon, every, data.dt)]
+    at = horizons(horizon, judged.simulated.every, data.dt)
+    names = [f"{h * data.dt:g}" for h in at]
 
     def ratio(top: np.ndarray, bottom: np.ndarray, root: bool = False) -> result.Interval:
         value = top.sum() / max(bottom.sum(), 1e-300)

@@ -1,9 +1,9 @@
 """Multi-step fits, for records whose one-step errors come mostly from their preprocessing.
 
-Innovations (`problem`) are the better statistic where records are raw: white noise, original time
-steps. States that were smoothed, averaged in bins or resampled have correlated one-step errors, and
-drag fitted to them absorbs the smoothing. Here the model forecasts windows from the record at their
-start, without noise, and all errors along the window are minimised,
+`spinndrift diagnose` fits to innovations, the better statistic where records are raw: white noise,
+original time steps. States that were smoothed, averaged in bins or resampled have correlated
+one-step errors, and drag fitted to them absorbs the smoothing. Here the model forecasts windows
+from the record at their start, without noise, and all errors along the window are minimised,
 
     min_θ Σ_windows Σ_k ρ(|e_k(θ)|² / s²),   e_k = (X̂_k, V̂_k) ⊖ (X_k, V_k),
 
@@ -15,7 +15,6 @@ biases drag slightly, and lags and delays below a few steps are less well resolv
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,14 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ....models import se3
-from ....models.effects.deterministic_step import advance
-from ....models.effects.extended import Extended
-from ....models.effects.library import Library
-from ....models.effects.recent import Recent
-from ..data.arrays import Data
-from ..filter.innovations import at_first, settle, substeps
-from ..filter.problem import DiagnosisProblem, mass
+from spinndrift.models.effects.extended import Extended
+from spinndrift.models.effects.library import Library
+from spinndrift.training.diagnosis.data.arrays import Data
+from spinndrift.training.diagnosis.filter.along_records import Records, substeps
+from spinndrift.training.diagnosis.filter.innovations import difference
+from spinndrift.training.diagnosis.filter.problem import DiagnosisProblem, mass
+from spinndrift.training.diagnosis.validation.forecast import states
+from spinndrift.training.least_squares import LocalModel, marquardt, minimise
 
 _ENOUGH = 1e-3
 """Relative gain of a step below which a fit has ended."""
@@ -103,46 +102,33 @@ def windows(data: Data, horizon: float, every: float, block: float = 10.0) -> Wi
     return Windows(**stacked, block=labels.ravel(), scenario=np.array(scenarios))
 
 
-def _errors(model: Extended, arrays: tuple, count: int) -> Float[Array, "M 12 K"]:
-    X, V, u, past, past_step, voltage, step = arrays
-    inertia = model.inertia()
-
-    def body(carry: Any, given: Any) -> Any:
-        memory, x, v, recent = carry
-        X1, V1, command, volts, h = given
-        memory, x, Vp, a = advance(
-            model, inertia, memory, x, v, command, h[None], count, volts[None]
-        )
-        recent = recent.after(Recent.over(v, Vp, a, h[None]))
-        seen_X, seen_V = model.observe(x, Vp, recent)
-        return (memory, x, Vp, recent), jnp.concatenate([se3.local(X1, seen_X), seen_V - V1])
-
-    memory = settle(model, past, past_step[:, None])
-    first = at_first(model, inertia, memory, X[0], V[0], past[-1], voltage[:1], step[:1])
-    start = (memory, *model.infer(X[0], V[0], first), first)
-    return jax.lax.scan(body, start, (X[1:], V[1:], u, voltage, step))[1]
+def _errors(model: Extended, records: Records, count: int) -> Float[Array, "M 12 K"]:
+    X, V = (jnp.moveaxis(a, 1, 0) for a in states(model, records, len(records.u), count))
+    X1, V1 = (jnp.moveaxis(a[1:], 1, 0) for a in (records.X, records.V))
+    return jnp.moveaxis(difference(X1, V1, X, V), 0, 1)
 
 
 @eqx.filter_jit
-def _apart(model: Extended, effects: tuple, arrays: tuple, count: int) -> Float[Array, "M 12 K"]:
-    return _errors(model.with_effects(effects), arrays, count)
+def _apart(model: Extended, effects: tuple, records: Records, count: int) -> Float[Array, "M 12 K"]:
+    return _errors(model.with_effects(effects), records, count)
 
 
 @eqx.filter_jit
 def _slopes(
-    model: Extended, library: Library, theta: Array, rows: Array, arrays: tuple, count: int
+    model: Extended, library: Library, theta: Array, rows: Array, records: Records, count: int
 ) -> tuple[Array, Array]:
     def errors(values: Array) -> Array:
         effects = library.filled(theta.at[rows].set(values))
-        return _errors(model.with_effects(effects), arrays, count)
+        return _errors(model.with_effects(effects), records, count)
 
     values = theta[rows]
     e, push = jax.linearize(errors, values)
     return e, jax.vmap(push)(jnp.eye(len(values), dtype=values.dtype))
 
 
-def _arrays(w: Windows) -> tuple:
-    return tuple(jnp.asarray(a) for a in (w.X, w.V, w.u, w.past, w.past_step, w.voltage, w.step))
+def _records(w: Windows) -> Records:
+    arrays = (w.X, w.V, w.u, w.voltage, w.step, w.past, w.past_step)
+    return Records(*(jnp.asarray(a) for a in arrays))
 
 
 def small(
@@ -162,7 +148,7 @@ def forecast_errors(
     """Forecast minus record: pose in the recorded body frame (m, rad), then twist."""
     library, at = small(problem, (), theta)
     effects = library.filled(theta[at])
-    return np.asarray(_apart(problem.model, effects, _arrays(w), w.count))
+    return np.asarray(_apart(problem.model, effects, _records(w), w.count))
 
 
 def fit_forecasts(
@@ -188,41 +174,42 @@ def fit_forecasts(
     entries = [library.entries[i].parameter for i in own]
     low, high = problem.limits(rows)
     probe = np.array([abs(p.probes[0]) for p in entries])
-    arrays = _arrays(w)
-    best = theta[at]
+    records = _records(w)
     # where a response has no slope at zero (lag, delay), start at the first probe
-    start = best[own]
-    flat = np.array([len(p.probes) > 2 and min(p.probes) > 0 for p in entries]) & (start == 0)
-    best[own] = np.clip(np.where(flat, probe, start), low, high)
+    start = theta[at]
+    flat = np.array([len(p.probes) > 2 and min(p.probes) > 0 for p in entries]) & (start[own] == 0)
+    start[own] = np.clip(np.where(flat, probe, start[own]), low, high)
 
-    def tried(values: np.ndarray) -> float:
-        e = _apart(problem.model, library.filled(values), arrays, w.count)
-        return _loss(np.asarray(e)[..., kept], size)
+    def loss(values: np.ndarray) -> float:
+        if not _is_body(problem, library, values):
+            return np.inf
+        e = _apart(problem.model, library.filled(values), records, w.count)
+        return _log(_loss(np.asarray(e)[..., kept], size))
 
-    def seen(values: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    def errors(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         e, J = _slopes(library=library, model=problem.model, theta=jnp.asarray(values),
-                       rows=jnp.asarray(own), arrays=arrays, count=w.count)  # fmt: skip
-        e, J = np.asarray(e)[..., kept], np.asarray(J)[..., kept]
-        return _loss(e, size), e, J
+                       rows=jnp.asarray(own), records=records, count=w.count)  # fmt: skip
+        return np.asarray(e)[..., kept], np.asarray(J)[..., kept]
 
-    loss, e, J = seen(best)
-    damping = 1e-3
-    for _ in range(rounds):
+    def local(values: np.ndarray) -> LocalModel:
+        e, J = errors(values)
         H, g = _normal(e, J, size, probe)
-        before = loss
-        for _ in range(6):
-            step = -np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-9), g) * probe
-            trial = best.copy()
-            trial[own] = np.clip(best[own] + step, low, high)
-            if _is_body(problem, library, trial) and tried(trial) < loss:
-                best, damping = trial, max(damping / 5, 1e-7)
-                loss, e, J = seen(best)
-                break
-            damping *= 6
-        if before - loss < _ENOUGH * before:
-            break
-    theta[at] = best
-    return MultiStepFit(theta, tuple(rows), _spread(e, J, size, probe, w.block[kept]), loss)
+
+        def stepped(damping: float) -> np.ndarray:
+            trial = values.copy()
+            trial[own] = np.clip(values[own] + marquardt(H, g, damping) * probe, low, high)
+            return trial
+
+        return LocalModel(_log(_loss(e, size)), loss, stepped)
+
+    theta[at] = found = minimise(start, local, rounds, _ENOUGH)
+    e, J = errors(found)
+    spread = _spread(e, J, size, probe, w.block[kept])
+    return MultiStepFit(theta, tuple(rows), spread, _loss(e, size))
+
+
+def _log(loss: float) -> float:
+    return float(np.log(max(loss, 1e-300)))
 
 
 def _is_body(problem: DiagnosisProblem, library: Library, values: np.ndarray) -> bool:

@@ -173,6 +173,41 @@ def make_windows(
         >>> make_windows(recording, length_s=1.0).steps
         20
     """
+    steps, places = _places(recording, length_s, stride_s)
+    data, lengths = recording.dataset, recording.lengths
+    X, V = data["X_WB"].to_numpy(), data["V_WB_B"].to_numpy()
+    F = recording.wrench(vehicle).to_numpy()
+    runs = data["trajectory"].to_numpy() if "trajectory" in data.coords else None
+    clock = data["start_time"].to_numpy() if "start_time" in data else np.zeros(lengths.shape)
+
+    def cut(values: np.ndarray, first: int = 0, last: int = steps) -> np.ndarray:
+        at = np.arange(first, last)
+        return np.stack([values[j, k, np.maximum(n + at, 0)] for j, k, n in places], axis=-1)
+
+    commands = None
+    if remembered is not None:
+        level, voltage = recording.thrust(vehicle)
+        back = -max(1, round(remembered / recording.dt))
+        parts = cut(level), cut(voltage)[:, None], cut(level, back, 0), cut(V, back, 0)
+        commands = Commands(*(part.astype(dtype) for part in parts))
+    return Windows(
+        X=_normalised(cut(X, 0, steps + 1), normalise).astype(dtype),
+        V=cut(V, 0, steps + 1).astype(dtype),
+        F=cut(F).astype(dtype),
+        dt=recording.dt,
+        scenario=np.array([j for j, _, _ in places], int),
+        run=np.array([k if runs is None else runs[k] for _, k, _ in places], int),
+        start=np.array([clock[j, k] + n * recording.dt for j, k, n in places], float),
+        names=recording.scenarios,
+        normalise=normalise,
+        commands=commands,
+    )
+
+
+def _places(
+    recording: Recording, length_s: float, stride_s: float | None
+) -> tuple[int, list[tuple[int, int, int]]]:
+    """Steps of a window, and scenario, run and first sample of each; refused if there are none."""
     if recording.uneven:
         raise UserError(
             "recording: its samples stand at times of their own; windows need one step, so read "
@@ -197,43 +232,11 @@ def make_windows(
             f"recording: {channels} is missing in some trajectory, and training needs pose and "
             "twist; select the trajectories that have them or record with a DVL"
         )
-    data = recording.dataset
-    X_all, V_all = data["X_WB"].to_numpy(), data["V_WB_B"].to_numpy()
-    F_all = recording.wrench(vehicle).to_numpy()
-    runs = data["trajectory"].to_numpy() if "trajectory" in data.coords else None
-    clock = data["start_time"].to_numpy() if "start_time" in data else np.zeros(lengths.shape)
-    X, V, F, scenario, run, start = [], [], [], [], [], []
-    commands: list[Commands] = []
-    thrust = None if remembered is None else recording.thrust(vehicle)
-    earlier = np.arange(-max(1, round((remembered or 0.0) / recording.dt)), 0)
-    for j, k in np.argwhere(lengths > steps):
-        for n in range(0, int(lengths[j, k]) - steps, stride):
-            X.append(X_all[j, k, n : n + steps + 1])
-            V.append(V_all[j, k, n : n + steps + 1])
-            F.append(F_all[j, k, n : n + steps])
-            scenario.append(j)
-            run.append(k if runs is None else runs[k])
-            start.append(clock[j, k] + n * recording.dt)
-            if thrust is not None:
-                level, voltage = (a[j, k] for a in thrust)
-                now, before = slice(n, n + steps), np.maximum(n + earlier, 0)
-                commands.append(
-                    Commands(level[now], voltage[now, None], level[before], V_all[j, k, before])
-                )
-    return Windows(
-        X=_normalised(np.stack(X, axis=-1), normalise).astype(dtype),
-        V=np.stack(V, axis=-1).astype(dtype),
-        F=np.stack(F, axis=-1).astype(dtype),
-        dt=recording.dt,
-        scenario=np.array(scenario, int),
-        run=np.array(run, int),
-        start=np.array(start, float),
-        names=recording.scenarios,
-        normalise=normalise,
-        commands=jax.tree.map(lambda *a: np.stack(a, axis=-1).astype(dtype), *commands)
-        if commands
-        else None,
-    )
+    return steps, [
+        (j, k, n)
+        for j, k in np.argwhere(lengths > steps).tolist()
+        for n in range(0, int(lengths[j, k]) - steps, stride)
+    ]
 
 
 def _normalised(

@@ -1,8 +1,9 @@
-"""Causes and unmodelled structure, in the order in which they are sought."""
+"""Causes and unmodelled structure, in the order in which they are sought and as reported."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+from ...models.effects.base import Effect
 from ...models.effects.unknown import Unknown
 from .candidates.unknowns import (
     FoundStructure,
@@ -10,9 +11,12 @@ from .candidates.unknowns import (
     described_structure,
     find_structure,
 )
-from .disturbance.found import best_law
-from .filter.problem import DiagnosisProblem
-from .findings import result
+from .disturbance.found import best_law, passing
+from .disturbance.laws import Law
+from .filter.problem import DiagnosisProblem, Evaluation
+from .findings import reported, result
+from .findings.experiments import experiments
+from .selection.hypotheses import Fit
 from .selection.model_selection import Hypothesis
 from .selection.search import Refit, Search, refitted
 from .selection.state import Selection
@@ -93,3 +97,42 @@ def _first_causes(
         return state, problem, seen
     state = search.run(state, progress=progress)
     return state, state.problem, None
+
+
+def reported_causes(
+    found: Selection,
+    nuisance: Sequence[int],
+    structures: Mapping[Hypothesis, result.Structure],
+    final: Evaluation,
+    joint: Fit | None,
+    progress: Progress,
+) -> list[result.Cause]:
+    """The causes found, each with the experiment that would confirm it; none without a fit."""
+    if joint is None:
+        return []
+    progress(0.8, "what to do next")
+    problem = found.problem
+    following = experiments(problem, final, found.accepted, nuisance)
+    return [
+        reported.cause(
+            a, problem, final, joint, following[a.hypothesis], structures.get(a.hypothesis)
+        )
+        for a in found.accepted
+    ]
+
+
+def law_causes(
+    groups: Sequence[Sequence[Law]],
+    laws: Sequence[Law],
+    least: float,
+    final: Evaluation,
+    problem: DiagnosisProblem,
+) -> tuple[list[result.Cause], tuple[Effect, ...]]:
+    """Groups of laws as causes and effects, with the other laws that pass as rivals."""
+    causes, effects, passed = [], [], passing(laws, problem, least)
+    for group in groups:
+        rivals = [law for law in passed if law.name != group[0].name]
+        cause, effect = reported.law_cause(group, rivals, problem, final)
+        causes.append(cause)
+        effects.append(effect)
+    return causes, tuple(effects)

@@ -16,15 +16,14 @@ from ...models.effects.library import Library
 from ...models.recordings.store import Recording
 from ...models.se3 import AXES
 from ...models.vehicles.vehicle import Vehicle
-from .causes import LAW_MARGIN, Progress, find_causes
+from .causes import LAW_MARGIN, Progress, find_causes, law_causes, reported_causes
 from .data.arrays import Data
 from .data.checks import SPARSE, limits, problems, require_enough, unexcited
-from .disturbance.found import OF_OTHERS, all_laws, passing, reported_laws
+from .disturbance.found import OF_OTHERS, all_laws, reported_laws
 from .disturbance.laws import Law
 from .disturbance.levels import LEVEL
 from .filter.problem import DiagnosisProblem, Evaluation
 from .findings import reported, result
-from .findings.experiments import experiments
 from .findings.ratios import ratios
 from .selection.hypotheses import Fit
 from .selection.model_selection import parameters_of
@@ -32,7 +31,8 @@ from .selection.refit_all import identify, with_coefficients
 from .selection.search import Refit, Search, refitted
 from .selection.state import Fits, Selection
 from .validation.blackbox import train
-from .validation.validation import Contender, Simulated, judge, model_gain, white_part
+from .validation.simulation import Contender, Simulated
+from .validation.validation import judge, model_gain, white_part
 
 _CLEARLY, _MANY = 0.05, 3
 """Held-out nats a sample by which refitted coefficients must beat all causes together before most
@@ -161,28 +161,11 @@ class Diagnoser:
         least = self._least_gain(found)
         laws = [] if final.noise.estimated else all_laws(problem, final, least)
         groups = reported_laws(laws, problem, final, least)
-        shaped = [law for group in groups for law in group if law.name != LEVEL]
-        causes: list[result.Cause] = []
-        if joint is not None:
-            self.progress(0.8, "what to do next")
-            following = experiments(problem, final, found.accepted, nuisance)
-            causes = [
-                reported.cause(
-                    a, problem, final, joint, following[a.hypothesis], structures.get(a.hypothesis)
-                )
-                for a in found.accepted
-            ]
-        passed = passing(laws, problem, least)
-        made = [
-            reported.law_cause(
-                group, [law for law in passed if law.name != group[0].name], problem, final
-            )
-            for group in groups
-        ]
-        causes += [cause for cause, _ in made]
-        random_effects = tuple(effect for _, effect in made)
+        causes = reported_causes(found, nuisance, structures, final, joint, self.progress)
+        of_laws, random_effects = law_causes(groups, laws, least, final, problem)
+        causes += of_laws
         gain, simulated = self._validate(
-            problem, found, fitted, rows, shaped, random_effects, bool(causes)
+            problem, found, fitted, rows, groups, random_effects, bool(causes)
         )
         residual = reported.residual(problem, final)
         left = reported.left_over(residual, causes, problem, final, least)
@@ -277,7 +260,7 @@ class Diagnoser:
         found: Selection,
         fitted: Evaluation,
         rows: list[int],
-        laws: list[Law],
+        groups: list[list[Law]],
         random_effects: tuple[Effect, ...],
         extended: bool,
     ) -> tuple[dict[str, result.ModelGain], dict[str, Simulated]]:
@@ -300,6 +283,7 @@ class Diagnoser:
             )
         contenders["refitted"] = Contender(problem.without_each(evaluation, belief))
         if extended:
+            laws = [law for group in groups for law in group if law.name != LEVEL]
             won = np.zeros(R)
             for law in laws:
                 won += law.heldout if len(law.heldout) == R else 0.0

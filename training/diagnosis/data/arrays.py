@@ -1,9 +1,9 @@
 """Recordings as the arrays that a diagnosis works on."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -171,69 +171,39 @@ def make_data(
     Raises:
         UserError: attitude or a channel of the twist is missing, or no run has two samples.
     """
-    lacking = recording.missing
-    of_pose = lacking.get("X_WB", ())
-    unmeasured = tuple(c for c in of_pose if c in XYZ)
-    if "V_WB_B" in lacking or unmeasured != of_pose:
-        channels = ", ".join(f"{name} {'/'.join(which)}" for name, which in lacking.items())
-        raise UserError(
-            f"recording: {channels} is missing; a diagnosis needs attitude and all of the twist. "
-            "Without a DVL give u, v, w from measured positions (differences, turned into B)"
-        )
-    data = recording.dataset
+    unmeasured = _unmeasured(recording)
+    data, lengths = recording.dataset, recording.lengths
     thrust, volts = recording.thrust(vehicle)
-    lengths = recording.lengths
-    names = ("X", "V", "u", "past", "past_step", "voltage", "step")
-    pieces: dict[str, list[Any]] = {name: [] for name in names}
-    scenario, run, sizes = [], [], []
     has_voltage = "voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any())
-    kept = lengths >= 3
-    for number, at in enumerate(np.argwhere(lengths > 0)):
-        kept[tuple(at)] &= number not in without
-    kept = kept if kept.any() else lengths >= 3
+    kept = _kept(lengths, without)
     behind = max(1, round(remembered / recording.dt))
     if kept.sum() == 1:
         segment = min(segment, max(int(lengths.max()) // _BLOCKS, _LEAST))
+    pieces: list[dict[str, np.ndarray]] = []
+    scenario, run = [], []
     for number, (j, k) in enumerate(np.argwhere(kept).tolist()):
         length = int(lengths[j, k])
         times = recording.elapsed(j, k)
         V = data["V_WB_B"].to_numpy()[j, k, :length]
-        values = {
-            "X": dead_reckoned(times, data["X_WB"].to_numpy()[j, k, :length], V),
-            "V": V,
-        }
-        u = thrust[j, k, :length]
-        held = np.diff(times)
+        X = dead_reckoned(times, data["X_WB"].to_numpy()[j, k, :length], V)
+        of_run = X, V, thrust[j, k, :length], volts[j, k, :length], np.diff(times)
         first = min(behind, int(_OF_A_RUN * (length - 1))) if remembered else 0
-        count = -(-(length - 1 - first) // segment)
-        edges = np.linspace(first, length - 1, count + 1).round().astype(int)
-        for a, b in itertools.pairwise(edges):
-            before = np.maximum(np.arange(a - behind, a), 0)
-            pieces["past"].append(u[before])
-            pieces["past_step"].append(held[before])
-            pieces["X"].append(values["X"][a : b + 1])
-            pieces["V"].append(values["V"][a : b + 1])
-            pieces["u"].append(u[a:b])
-            pieces["voltage"].append(volts[j, k, a:b])
-            pieces["step"].append(held[a:b])
-            sizes.append(b - a)
-            scenario.append(j)
-            run.append(number)
-    if not sizes:
+        pieces += _cut(*of_run, first, segment, behind)
+        scenario += [j] * (len(pieces) - len(run))
+        run += [number] * (len(pieces) - len(run))
+    if not run:
         raise UserError("recording: no run is long enough for a diagnosis")
     _refuse_units(recording, vehicle, thrust)
-    N = int(max(sizes))
-    weight = (np.arange(N)[:, None] < np.array(sizes)).astype(float)
-    step = _stack(pieces["step"], N)
-    mean = float((step * weight).sum() / weight.sum()) if recording.uneven else recording.dt
+    arrays = {name: _stack([piece[name] for piece in pieces]) for name in pieces[0]}
+    sizes = np.array([len(piece["u"]) for piece in pieces])
+    weight = (np.arange(sizes.max())[:, None] < sizes).astype(float)
+    mean = recording.dt
+    if recording.uneven:
+        mean = float((arrays["step"] * weight).sum() / weight.sum())
+    else:
+        arrays["step"] = np.full(weight.shape, mean)
     return Data(
-        X=_stack(pieces["X"], N + 1),
-        V=_stack(pieces["V"], N + 1),
-        u=_stack(pieces["u"], N),
-        past=np.stack(pieces["past"], axis=-1),
-        past_step=np.stack(pieces["past_step"], axis=-1),
-        voltage=_stack(pieces["voltage"], N),
-        step=step if recording.uneven else np.full(weight.shape, mean),
+        **arrays,
         weight=weight,
         scenario=np.array(scenario, int),
         run=np.array(run, int),
@@ -243,6 +213,45 @@ def make_data(
         has_voltage=has_voltage,
         unmeasured=unmeasured,
     )
+
+
+def _kept(lengths: np.ndarray, without: Sequence[int]) -> np.ndarray:
+    """Runs of three samples and more, `without` some unless none would remain."""
+    long = lengths >= 3
+    kept = long.copy()
+    for number, at in enumerate(np.argwhere(lengths > 0)):
+        kept[tuple(at)] &= number not in without
+    return kept if kept.any() else long
+
+
+def _unmeasured(recording: Recording) -> tuple[str, ...]:
+    """Coordinates of the position that were not measured; other channels are refused."""
+    lacking = recording.missing
+    of_pose = lacking.get("X_WB", ())
+    unmeasured = tuple(c for c in of_pose if c in XYZ)
+    if "V_WB_B" in lacking or unmeasured != of_pose:
+        channels = ", ".join(f"{name} {'/'.join(which)}" for name, which in lacking.items())
+        raise UserError(
+            f"recording: {channels} is missing; a diagnosis needs attitude and all of the twist. "
+            "Without a DVL give u, v, w from measured positions (differences, turned into B)"
+        )
+    return unmeasured
+
+
+def _cut(
+    X: np.ndarray, V: np.ndarray, u: np.ndarray, volts: np.ndarray, held: np.ndarray,
+    first: int, segment: int, behind: int,
+) -> Iterator[dict[str, np.ndarray]]:  # fmt: skip
+    """Pieces of a run from sample `first` on, with the commands of `behind` steps before each."""
+    last = len(held)
+    count = -(-(last - first) // segment)
+    edges = np.linspace(first, last, count + 1).round().astype(int)
+    for a, b in itertools.pairwise(edges):
+        before = np.maximum(np.arange(a - behind, a), 0)
+        yield {
+            "X": X[a : b + 1], "V": V[a : b + 1], "u": u[a:b], "past": u[before],
+            "past_step": held[before], "voltage": volts[a:b], "step": held[a:b],
+        }  # fmt: skip
 
 
 def _refuse_units(
@@ -260,7 +269,8 @@ def _refuse_units(
         )
 
 
-def _stack(parts: list[np.ndarray], length: int) -> np.ndarray:
-    """Parts side by side, the last value held to the common length."""
+def _stack(parts: list[np.ndarray]) -> np.ndarray:
+    """Parts side by side, the last value held to the length of the longest."""
+    length = max(len(p) for p in parts)
     padded = [np.concatenate([p, np.repeat(p[-1:], length - len(p), axis=0)]) for p in parts]
     return np.stack(padded, axis=-1)

@@ -1,10 +1,15 @@
 """Faults of the data, and what is not identifiable from them, found before any model is fitted."""
 
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ....models.config.errors import UserError
+from ....models.recordings.build import Trajectory
 from ....models.recordings.kinematics import spikes
 from ....models.recordings.schema import UNEVEN
 from ....models.recordings.store import Recording
@@ -44,62 +49,16 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
     Raises:
         UserError: a velocity has the sign opposite to the motion of the pose.
     """
-    stuck: dict[str, list[int]] = {}
-    jumps: list[int] = []
-    clock: list[int] = []
-    spiked: list[int] = []
-    filled: list[int] = []
-    held: dict[str, list[float]] = {name: [] for name in _INSTRUMENTS}
-    agreeing = np.zeros((3, 6))
-    longest, late, names = 0.0, 0.0, []
-    for number, run in enumerate(recording.trajectories()):
-        names.append(run.scenario)
-        for name, values in (("X_WB", run.X_WB), ("V_WB_B", run.V_WB_B)):
-            for label, column in zip(_CHANNELS[name], values.T, strict=True):
-                still = _longest(np.diff(column) == 0) * recording.dt
-                if still > _STUCK and np.isfinite(column).all():
-                    stuck.setdefault(label, []).append(number)
-        state = np.concatenate([run.X_WB, run.V_WB_B], axis=1)
-        for name, columns in _INSTRUMENTS.items():
-            same = (np.diff(state[:, columns], axis=0) == 0).all(axis=1)
-            held[name].append(float((same & run.V_WB_B[1:].any(axis=1)).mean()))
-        elapsed = run.sensors.get(UNEVEN)
-        step = np.full(len(state) - 1, recording.dt) if elapsed is None else np.diff(elapsed)
-        moved = motion(run.X_WB)
-        expected = (run.V_WB_B[1:] + run.V_WB_B[:-1]) / 2
-        both = np.isfinite(moved + expected)
-        per = np.where(both, moved, 0.0) / step[:, None]
-        of = np.where(both, expected, 0.0)
-        agreeing += np.array([(per * of).sum(axis=0), (of**2).sum(axis=0), (per**2).sum(axis=0)])
-        distance = np.linalg.norm(moved[:, :3], axis=1)
-        excess = np.abs(distance - np.linalg.norm(run.V_WB_B[:-1, :3], axis=1) * step)
-        excess = excess[np.isfinite(excess)]
-        if excess.size and np.any(excess > 30 * np.median(excess) + 0.1):
-            jumps.append(number)
-        elif too_long := clock_jump(moved, expected, step):
-            clock.append(number)
-            late = max(late, too_long)
-        if spikes(run.V_WB_B.T).any():
-            spiked.append(number)
-        bend = np.abs(np.diff(run.V_WB_B, 2, axis=0)).max(axis=1, initial=0.0)
-        line = _longest(bend < 1e-7 * np.nanstd(run.V_WB_B))
-        if line >= _FILLED:
-            filled.append(number)
-            longest = max(longest, (line + 1) * recording.dt)
-    _refuse_signs(agreeing, int(recording.lengths.sum()))
-    twist = _CHANNELS["V_WB_B"]
-    stuck = {c: r for c, r in stuck.items() if len(r) < len(names) or c in twist}
-
-    def which(runs: list[int]) -> str:
-        """Their scenarios, with the repetition where there are several."""
-        listed = []
-        for number in runs[:_NAMED]:
-            first = names.index(names[number])
-            several = names.count(names[number]) > 1
-            listed.append(names[number] + (f" (run {number - first + 1})" if several else ""))
-        more = f" and {len(runs) - _NAMED} more" if len(runs) > _NAMED else ""
-        return f"{', '.join(listed)}{more}"
-
+    faults = [_faults_of(run, recording.dt) for run in recording.trajectories()]
+    names = [run.scenario for run in recording.trajectories()]
+    held = {name: [f.held[i] for f in faults] for i, name in enumerate(_INSTRUMENTS)}
+    _refuse_signs([f.agreeing for f in faults], int(recording.lengths.sum()))
+    stuck = _stuck(faults)
+    jumps, clock, spiked, filled = (
+        [n for n, f in enumerate(faults) if getattr(f, kind)]
+        for kind in ("jumps", "late", "spiked", "filled")
+    )
+    which = partial(_listed, names)
     found = [
         f"{channel} repeats one value for {_STUCK:g} s or more in {which(runs)}: stuck? Give the "
         "column without it, or leave the run out"
@@ -115,18 +74,18 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
         found.append(f"the position jumps by far more than the velocity says in {which(jumps)}")
     if clock:
         found.append(
-            f"time stamps jump by {late:.2g} s in {which(clock)}, while the vehicle moves on as in "
-            "one step: a jump of the clock; mend the column t"
+            f"time stamps jump by {max(f.late for f in faults):.2g} s in {which(clock)}, while the "
+            "vehicle moves on as in one step: a jump of the clock; mend the column t"
         )
     if filled:
         found.append(
-            f"samples were filled in on a straight line, for up to {longest:.2g} s, in "
+            "samples were filled in on a straight line, for up to "
+            f"{max(f.filled for f in faults):.2g} s, in "
             f"{which(filled)}: lost samples or a jump of the clock"
         )
     if spiked:
-        found.append(
-            f"single velocities lie far from both their neighbours in {which(spiked)}: outliers"
-        )
+        far = "single velocities lie far from both their neighbours in"
+        found.append(f"{far} {which(spiked)}: outliers")
     found += [
         f"samples are missing, or the clock jumped: {note}"
         for note in recording.notes
@@ -136,6 +95,78 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
     if bad and len(bad) < len(names):
         found[0] += f" (left out: {len(bad)} of {len(names)} runs)"
     return found, bad
+
+
+class _Faults(NamedTuple):
+    """Faults of one run.
+
+    Attributes:
+        stuck: channels that repeat one value.
+        held: share of the samples that repeat those before, by instrument.
+        jumps: whether the pose jumps.
+        late: time by which the clock jumps (s), or 0.
+        spiked: whether there are outliers.
+        filled: longest time filled in on a straight line (s), or 0.
+        agreeing: for `_refuse_signs`.
+    """
+
+    stuck: list[str]
+    held: list[float]
+    jumps: bool
+    late: float
+    spiked: bool
+    filled: float
+    agreeing: Float[np.ndarray, "3 6"]
+
+
+def _faults_of(run: Trajectory, dt: float) -> _Faults:
+    stuck, held = [], []
+    for name, values in (("X_WB", run.X_WB), ("V_WB_B", run.V_WB_B)):
+        for label, column in zip(_CHANNELS[name], values.T, strict=True):
+            still = _longest(np.diff(column) == 0) * dt
+            if still > _STUCK and np.isfinite(column).all():
+                stuck.append(label)
+    state = np.concatenate([run.X_WB, run.V_WB_B], axis=1)
+    for columns in _INSTRUMENTS.values():
+        same = (np.diff(state[:, columns], axis=0) == 0).all(axis=1)
+        held.append(float((same & run.V_WB_B[1:].any(axis=1)).mean()))
+    elapsed = run.sensors.get(UNEVEN)
+    step = np.full(len(state) - 1, dt) if elapsed is None else np.diff(elapsed)
+    moved = motion(run.X_WB)
+    expected = (run.V_WB_B[1:] + run.V_WB_B[:-1]) / 2
+    both = np.isfinite(moved + expected)
+    per = np.where(both, moved, 0.0) / step[:, None]
+    of = np.where(both, expected, 0.0)
+    agreeing = np.array([(per * of).sum(axis=0), (of**2).sum(axis=0), (per**2).sum(axis=0)])
+    distance = np.linalg.norm(moved[:, :3], axis=1)
+    excess = np.abs(distance - np.linalg.norm(run.V_WB_B[:-1, :3], axis=1) * step)
+    excess = excess[np.isfinite(excess)]
+    jumps = bool(excess.size and np.any(excess > 30 * np.median(excess) + 0.1))
+    late = 0.0 if jumps else clock_jump(moved, expected, step)
+    bend = np.abs(np.diff(run.V_WB_B, 2, axis=0)).max(axis=1, initial=0.0)
+    line = _longest(bend < 1e-7 * np.nanstd(run.V_WB_B))
+    filled = (line + 1) * dt if line >= _FILLED else 0.0
+    spiked = bool(spikes(run.V_WB_B.T).any())
+    return _Faults(stuck, held, jumps, late, spiked, filled, agreeing)
+
+
+def _stuck(faults: list[_Faults]) -> dict[str, list[int]]:
+    """Runs in which a channel is stuck; a pose that is so in all runs was held in place."""
+    channels = dict.fromkeys(c for f in faults for c in f.stuck)
+    runs = {c: [n for n, f in enumerate(faults) if c in f.stuck] for c in channels}
+    twist = _CHANNELS["V_WB_B"]
+    return {c: r for c, r in runs.items() if len(r) < len(faults) or c in twist}
+
+
+def _listed(names: list[str], numbers: list[int]) -> str:
+    """Scenarios of some runs, with the repetition where there are several."""
+    listed = []
+    for number in numbers[:_NAMED]:
+        first = names.index(names[number])
+        several = names.count(names[number]) > 1
+        listed.append(names[number] + (f" (run {number - first + 1})" if several else ""))
+    more = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
+    return f"{', '.join(listed)}{more}"
 
 
 def motion(X_WB: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "M 6"]:
@@ -168,9 +199,9 @@ def clock_jump(
     return longest
 
 
-def _refuse_signs(agreeing: Float[np.ndarray, "3 6"], samples: int) -> None:
+def _refuse_signs(agreeing: Sequence[Float[np.ndarray, "3 6"]], samples: int) -> None:
     """Refuse wrong signs; `agreeing`: sums of motion times velocity, and of the squares of both."""
-    product, square, moved = agreeing
+    product, square, moved = sum(agreeing, np.zeros((3, 6)))
     slope = product / np.maximum(square, 1e-12)
     left = np.maximum(moved - slope * product, 0.0) / max(samples, 1)
     error = np.sqrt(left / np.maximum(square, 1e-12))

@@ -83,3 +83,12 @@ def test_each_fault_is_found_and_nothing_else(facts: Facts, name: str, words: st
     found = failed(facts)
     assert words in found[name]
     assert set(found) <= {name, "ATTITUDE_QUATERNION", "SCALED_PRESSURE2"}
+
+
+def test_a_failsafe_that_is_set_for_the_dive_is_told_with_its_present_value():
+    facts = with_parameter("FS_PILOT_INPUT", 0.0)
+    needs = Requirements(8, rates=NEEDS.rates, sets=FAILSAFES)
+    assert failed(facts, needs) == {}
+    words = {found.name: found.words for found in preflight(needs, facts)}
+    assert words["FS_PILOT_INPUT"] == "is 0: is set to 2 for the dive"
+    assert "FS_GCS_ENABLE" in failed(with_parameter("FS_GCS_ENABLE", None), needs)

@@ -9,7 +9,7 @@ from spinndrift.models.config.errors import UserError
 from spinndrift.systems.mavlink.safety import (
     GUARDS,
     SafetyConfig,
-    Sight,
+    Snapshot,
     State,
     Supervisor,
     limited,
@@ -20,10 +20,10 @@ CONFIG = SafetyConfig(dead_man=1.0)
 START = State("MANUAL", np.array([5.0, -3.0, -1.0]))
 
 
-def sight(t: float, **changes) -> Sight:
+def snapshot(t: float, **changes) -> Snapshot:
     """A healthy dive at time t, with changes."""
     ages = AGES | changes.pop("ages", {})
-    fine = Sight(t, np.zeros(6), np.array([5.0, -3.0, -1.0]), 0, ages, True, "MANUAL", 15.8)
+    fine = Snapshot(t, np.zeros(6), np.array([5.0, -3.0, -1.0]), 0, ages, True, "MANUAL", 15.8)
     return fine._replace(**changes)
 
 
@@ -51,16 +51,16 @@ ENDS |= {"depth_limits": "disarm"}
 
 def dive(supervisor: Supervisor, seconds: float = 4.0, at: float = 1.0, **fault) -> list:
     """Orders every 20 ms; the fault begins at `at` and lasts half a second."""
-    state, rulings = START, []
+    state, decisions = START, []
     for k in range(round(seconds / 0.02)):
         t = 0.02 * k
         # the estimator is lost only after a second
         lasts = 1.5 if "health" in fault else 0.5
-        seen = sight(t, **(fault if at <= t < at + lasts else {}))
-        ruling = supervisor.step(state, seen)
-        state = ruling.state
-        rulings.append((t, ruling))
-    return rulings
+        seen = snapshot(t, **(fault if at <= t < at + lasts else {}))
+        decision = supervisor.step(state, seen)
+        state = decision.state
+        decisions.append((t, decision))
+    return decisions
 
 
 def test_every_guard_has_a_fault_here():
@@ -68,47 +68,47 @@ def test_every_guard_has_a_fault_here():
 
 
 def test_a_healthy_dive_flies():
-    assert {ruling.order for _, ruling in dive(Supervisor(CONFIG))} == {"fly"}
+    assert {decision.order for _, decision in dive(Supervisor(CONFIG))} == {"fly"}
 
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_guard_ends_the_dive_for_good_and_only_that_guard_does(name: str):
-    rulings = dive(Supervisor(CONFIG), **FAULTS[name])
-    orders = [ruling.order for _, ruling in rulings]
+    decisions = dive(Supervisor(CONFIG), **FAULTS[name])
+    orders = [decision.order for _, decision in decisions]
     first = next(i for i, order in enumerate(orders) if order != "fly")
-    assert 1.0 <= rulings[first][0] <= (2.2 if name == "estimate" else 1.02)
+    assert 1.0 <= decisions[first][0] <= (2.2 if name == "estimate" else 1.02)
     assert orders[first : first + 25] == ["neutral"] * 25  # half a second
     assert set(orders[first + 26 :]) == {ENDS.get(name, "hold_depth")}
-    assert all(np.all(ruling.F_Bo_B == 0) for _, ruling in rulings[first:])
-    final = rulings[-1][1].state
+    assert all(np.all(decision.F_Bo_B == 0) for _, decision in decisions[first:])
+    final = decisions[-1][1].state
     assert final.tripped == name
     assert final.reason
     # without the guard the dive goes on
     others = {k: guard for k, guard in GUARDS.items() if k != name}
     if name != "wrench":
         blind = dive(Supervisor(CONFIG, others), **FAULTS[name])
-        assert {ruling.order for _, ruling in blind} == {"fly"}
+        assert {decision.order for _, decision in blind} == {"fly"}
 
 
 def test_an_estimator_that_recovers_in_time_is_no_reason():
     state, supervisor, orders = START, Supervisor(CONFIG), set()
     for k in range(200):
         t = 0.02 * k
-        ruling = supervisor.step(state, sight(t, health=2 if (t % 1.0) < 0.8 else 0))
-        state = ruling.state
-        orders.add(ruling.order)
+        decision = supervisor.step(state, snapshot(t, health=2 if (t % 1.0) < 0.8 else 0))
+        state = decision.state
+        orders.add(decision.order)
     assert orders == {"fly"}
 
 
 def test_without_aid_plan_or_key_their_guards_are_silent():
     ages = {name: AGES[name] for name in ("vehicle", "attitude", "depth")}
-    ruling = Supervisor().step(START, sight(0.0)._replace(ages=ages))
-    assert ruling.order == "fly"
+    decision = Supervisor().step(START, snapshot(0.0)._replace(ages=ages))
+    assert decision.order == "fly"
 
 
 def test_the_end_may_be_to_disarm():
-    rulings = dive(Supervisor(SafetyConfig(end="disarm")), **FAULTS["fence"])
-    assert rulings[-1][1].order == "disarm"
+    decisions = dive(Supervisor(SafetyConfig(end="disarm")), **FAULTS["fence"])
+    assert decisions[-1][1].order == "disarm"
 
 
 @given(

@@ -8,11 +8,9 @@ import numpy as np
 
 from ...models.config.errors import UserError
 from ...models.vehicles.vehicle import load_vehicle
-from ..mavlink.codec import MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS, thruster_pwm
+from ..mavlink.codec import FRAME_THRUSTERS, MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS, thruster_pwm
 from .signals import Parameter, Series, Spans, series
 
-_FRAMES = {1: 6, 2: 8}
-"""Thrusters of ArduSub's frames VECTORED and VECTORED_6DOF, by FRAME_CONFIG."""
 _PRESETS, _USUAL = {6: "bluerov2", 8: "bluerov2_heavy"}, 8
 _OFF = 0  # SERVOn_FUNCTION of an output that the autopilot leaves to DO_SET_SERVO
 
@@ -89,7 +87,7 @@ def _vehicle(
     named: str | None, frame: int | None, channel_of: Mapping[int, int], functions: _Functions
 ) -> tuple[str, list[str]]:
     """The vehicle's name, and a sentence if it is not the usual one."""
-    count, told = _FRAMES.get(-1 if frame is None else frame), f"FRAME_CONFIG {frame}"
+    count, told = FRAME_THRUSTERS.get(-1 if frame is None else frame), f"FRAME_CONFIG {frame}"
     six = set(channel_of) == set(range(1, 7)) and functions.keys() >= {7, 8}
     if count is None and six and not _drives(functions[7]) and not _drives(functions[8]):
         count, told = 6, "SERVOn_FUNCTION"

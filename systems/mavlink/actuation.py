@@ -23,7 +23,6 @@ from ...models.config.errors import UserError
 from ...models.thrusters import Thrusters
 from ..compiled.jit import VectorFunction
 from .codec import (
-    MOTOR_FUNCTIONS,
     NEUTRAL_US,
     manual_control_fields,
     rc_override_fields,
@@ -184,11 +183,6 @@ def make_actuation(way: Way, thrusters: Thrusters, parameters: Mapping[str, floa
     if way == "thruster_passthrough":
         return ThrusterPassthrough(thrusters)
     return (ManualControl if way == "manual_control" else RcOverride)(thrusters, parameters)
-
-
-def motor_functions(thrusters: int) -> dict[str, float]:
-    """SERVOn_FUNCTION of motors 1 to n on outputs 1 to n."""
-    return {f"SERVO{i}_FUNCTION": float(MOTOR_FUNCTIONS[i - 1]) for i in range(1, thrusters + 1)}
 
 
 def _manual(vehicle: Peer, fields: Mapping[str, int]) -> Message:

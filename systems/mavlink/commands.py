@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from ...models.config.errors import UserError
 from .codec import ARMED_FLAG, MODES
 from .dialect import Message, mavlink
-from .link import Link
+from .link import Link, Peer
 
 RESULTS = {number: entry.name for number, entry in mavlink.enums["MAV_RESULT"].items()}
 _ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
@@ -24,6 +24,12 @@ class VehicleRefused(UserError):
     """The vehicle did not do what it was asked; the sentence has its reason."""
 
 
+def command_long(vehicle: Peer, number: int, *parameters: float, attempt: int = 0) -> Message:
+    """COMMAND_LONG with up to seven parameters; the others are zero."""
+    values = (*parameters, *(0.0,) * (7 - len(parameters)))
+    return mavlink.MAVLink_command_long_message(*vehicle, number, attempt, *values)
+
+
 def command(
     link: Link, number: int, *parameters: float, timeout: float = 1.0, attempts: int = 3
 ) -> int | None:
@@ -33,14 +39,13 @@ def command(
         UserError: there is no vehicle.
     """
     vehicle = link.find_vehicle()
-    values = (*parameters, *(0.0,) * (7 - len(parameters)))
 
     def answers(message: Message) -> bool:
         return message.command == number and message.result != mavlink.MAV_RESULT_IN_PROGRESS
 
     for attempt in range(attempts):
         started = time.monotonic()
-        link.send(mavlink.MAVLink_command_long_message(*vehicle, number, attempt, *values))
+        link.send(command_long(vehicle, number, *parameters, attempt=attempt))
         found = link.wait_for("COMMAND_ACK", timeout, answers, started)
         if found is not None:
             return int(found.message.result)
@@ -135,14 +140,8 @@ def _until_seen(
     if result != _ACCEPTED:
         raise VehicleRefused(f"{what}: {_answer(result)}{_reason(link, started, _SPOKEN)}")
     vehicle = link.find_vehicle()
-    asked = mavlink.MAVLink_command_long_message(
-        *vehicle,
-        mavlink.MAV_CMD_REQUEST_MESSAGE,
-        0,
-        float(mavlink.MAVLINK_MSG_ID_HEARTBEAT),
-        *(0.0,) * 6,
-    )
-    link.send(asked)  # instead of waiting for the next second's
+    heartbeat = float(mavlink.MAVLINK_MSG_ID_HEARTBEAT)  # without waiting for the next second's
+    link.send(command_long(vehicle, mavlink.MAV_CMD_REQUEST_MESSAGE, heartbeat))
     if link.wait_for("HEARTBEAT", _STATE, shows, started) is None:
         raise VehicleRefused(
             f"{what}: accepted, and not seen in {_STATE:g} s of heartbeats"

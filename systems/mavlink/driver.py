@@ -23,11 +23,12 @@ from ...models.config.errors import UserError
 from ...models.thrusters import Thrusters
 from . import commands, telemetry
 from .actuation import Command, Way, make_actuation
+from .dialect import mavlink
 from .guard_process import Guard, stop_thrusters
 from .link import GROUND_STATION, Link
 from .parameters import Borrowed, Parameters
 from .preflight import FAILSAFES, Facts, Finding, Requirements, preflight
-from .safety import SafetyConfig, Sight, State, Supervisor
+from .safety import SafetyConfig, Snapshot, State, Supervisor
 from .telemetry import Reading
 from .transport import Connection
 
@@ -180,6 +181,7 @@ class Driver:
             rates,
             self.config.system,
             self.config.safety.min_voltage,
+            {} if self._dry else FAILSAFES,
         )
 
     def preflight(self) -> list[Finding]:
@@ -195,7 +197,7 @@ class Driver:
         system, estimator = self.link.latest("SYS_STATUS"), self.link.latest("EKF_STATUS_REPORT")
         facts = Facts(
             self.link.statistics(),
-            {**self.parameters, **({} if self._dry else FAILSAFES)},  # `prepare` sets them
+            self.parameters,
             int(heartbeat.message.type),
             int(heartbeat.message.autopilot),
             status.armed,
@@ -278,19 +280,19 @@ class Driver:
         """
         if self._state is None:
             self._state = State(_FLY, np.asarray(p_WBo, float))
-        ruling = self._supervisor.step(
-            self._state, self._sight(t, np.asarray(F_Bo_B, float), p_WBo, health, ages or {})
+        decision = self._supervisor.step(
+            self._state, self._snapshot(t, np.asarray(F_Bo_B, float), p_WBo, health, ages or {})
         )
-        self._state = ruling.state
+        self._state = decision.state
         if self._guard is not None:
             self._guard.beat()
         volts = telemetry.battery(self.link)
         volts = float(self._thrusters.nominal_voltage) if np.isnan(volts) else volts
         gain = telemetry.pilot_gain(self.link, self.parameters)
-        command = self._actuation.command(self.vehicle, ruling.F_Bo_B, volts, gain)
-        self._carry_out(ruling.order, command)
+        command = self._actuation.command(self.vehicle, decision.F_Bo_B, volts, gain)
+        self._carry_out(decision.order, command)
         self._sent.append((time.monotonic(), command.pwm))
-        return Acted(ruling.order, ruling.F_Bo_B, command.pwm, ruling.state.reason)
+        return Acted(decision.order, decision.F_Bo_B, command.pwm, decision.state.reason)
 
     def _carry_out(self, order: str, command: Command) -> None:
         if self._dry or order == "yield":
@@ -300,9 +302,10 @@ class Driver:
             return
         self.link.send(self._actuation.neutral(self.vehicle))
         if order == "hold_depth" and self._ended != order:
-            self._ask(commands.mavlink.MAV_CMD_DO_SET_MODE, 1.0, float(commands.mode_number(_HOLD)))
+            number = float(commands.mode_number(_HOLD))
+            self._ask(mavlink.MAV_CMD_DO_SET_MODE, 1.0, number)
         elif order == "disarm" and self._ended != order:
-            self._ask(commands.mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, commands.FORCED_DISARM)
+            self._ask(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, commands.FORCED_DISARM)
         status = telemetry.status(self.link, time.monotonic())
         if status is not None and (
             (order == "hold_depth" and status.mode == _HOLD)
@@ -311,35 +314,31 @@ class Driver:
             self._ended = order  # seen; until then it is asked for again with every command
 
     def _ask(self, command: int, *parameters: float) -> None:
-        values = (*parameters, *(0.0,) * (7 - len(parameters)))
-        self.link.send(
-            commands.mavlink.MAVLink_command_long_message(*self.vehicle, command, 0, *values)
-        )
+        self.link.send(commands.command_long(self.vehicle, command, *parameters))
 
-    def _sight(
+    def _snapshot(
         self,
         t: float,
         F: np.ndarray,
         p: np.ndarray,
         health: int,
         ages: Mapping[str, float],
-    ) -> Sight:
+    ) -> Snapshot:
         link, now = self.link, time.monotonic()
         status = telemetry.status(link, now)
-        infinite = float("inf")
         depth = min(link.age(name) for name in ("SCALED_PRESSURE2", "SCALED_PRESSURE"))
         attitude = min(link.age(name) for name in ("ATTITUDE_QUATERNION", "ATTITUDE"))
-        seen = {"vehicle": link.statistics().silence, "attitude": attitude, "depth": depth, **ages}
+        seen = {"vehicle": link.silence, "attitude": attitude, "depth": depth, **ages}
         leak = "a leak is reported" if status is not None and status.leak else ""
         # in a dry run the vehicle stays as it is
         armed = self._dry or (status is not None and status.armed)
         mode = _FLY if self._dry or status is None else status.mode
-        return Sight(
+        return Snapshot(
             t,
             F,
             np.asarray(p, float),
             health,
-            {k: v if np.isfinite(v) else infinite for k, v in seen.items()},
+            seen,
             armed,
             mode,
             telemetry.battery(link),
@@ -376,7 +375,7 @@ class Driver:
                 self._guard.busy()
             failed = stop_thrusters(self.link, self._borrowed.path)
             if not failed:
-                self._guard.farewell()
+                self._guard.release()
             self._guard = None
         self.link.close()
         if failed:

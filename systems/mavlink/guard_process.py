@@ -2,7 +2,7 @@
 
 The autopilot's failsafes do not stop thrusters 7 and 8 in pass-through, and a killed process can't
 stop anything. The guard reads a beat from its standard input. When the pipe closes without the word
-of farewell, or no beat comes in time, it ends the commanding process, connects to the vehicle,
+of release, or no beat comes in time, it ends the commanding process, connects to the vehicle,
 sends neutral, disarms, and gives borrowed parameters back.
 
 It is started before arming and imports neither JAX nor Drake, so that it acts at once.
@@ -25,7 +25,7 @@ from .link import Link, Peer
 from .parameters import Borrowed, Parameters
 from .transport import Connection
 
-_BEAT, _BUSY, _FAREWELL = b".", b"w", b"!"
+_BEAT, _BUSY, _RELEASE = b".", b"w", b"!"
 _PATIENCE = {_BEAT: 1.0, _BUSY: 30.0}  # s without a word, after the last one
 _NEUTRAL_FOR, _PERIOD = 1.0, 0.05  # s of neutral messages, s between them
 _READY_IN = 30.0  # s: a loaded machine starts an interpreter slowly
@@ -38,7 +38,7 @@ class Guard:
     """The commanding process' handle of the guard.
 
     After a `beat` the next word has to come within a second; `busy` allows half a minute, for what
-    comes before and after the loop. Say `farewell` only when the thrusters have been stopped: a
+    comes before and after the loop. Call `release` only when the thrusters have been stopped: a
     process that ends without it is followed by the guard's rescue.
     """
 
@@ -85,11 +85,11 @@ class Guard:
         except OSError as error:
             raise UserError("the guard process has ended; the dive can't go on") from error
 
-    def farewell(self) -> None:
+    def release(self) -> None:
         """Say that the thrusters are stopped; the guard ends."""
         if self._process.stdin is not None and not self._process.stdin.closed:
             with suppress(OSError):
-                self._process.stdin.write(_FAREWELL)
+                self._process.stdin.write(_RELEASE)
                 self._process.stdin.close()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(5.0)
@@ -127,13 +127,13 @@ def _give_back(link: Link, borrowed: Path | None) -> Mapping[str, float]:
 
 
 def _watch() -> bool:
-    """Wait for the farewell; false if the words end without it."""
+    """Wait for the release; false if the words end without it."""
     last = _BUSY
     while True:
         if not select.select([sys.stdin.buffer], [], [], _PATIENCE[last])[0]:
             return False
         read = os.read(sys.stdin.fileno(), 4096)
-        if _FAREWELL in read:
+        if _RELEASE in read:
             return True
         if not read:
             return False
@@ -145,7 +145,7 @@ def _tell(*sentences: str) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Guard; the exit status is 0 after a farewell, 1 after a rescue, 2 if that failed."""
+    """Guard; the exit status is 0 after a release, 1 after a rescue, 2 if that failed."""
     where, system, parent, file = arguments
     connection, borrowed = Connection.parse(where), Path(file) if file else None
     signal.signal(signal.SIGINT, signal.SIG_IGN)

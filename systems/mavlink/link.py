@@ -105,6 +105,7 @@ class Link:
         self._changed = threading.Condition()
         self._sending = threading.Lock()
         self._reconnections = 0
+        self._last = -float("inf")
         self._closing = False
         self._transport: Transport | None = connection.open()
         self._record = _open_record(record, self._transport)
@@ -147,6 +148,11 @@ class Link:
         found = self._newest.get(name)
         return float("inf") if found is None else time.monotonic() - found.arrival
 
+    @property
+    def silence(self) -> float:
+        """Time since the vehicle was last heard (s), infinite before the first message."""
+        return time.monotonic() - self._last
+
     def texts(self, since: float = 0.0) -> list[tuple[float, int, str]]:
         """Status texts after a local time (s): arrival, severity, text."""
         return [text for text in list(self._texts) if text[0] > since]
@@ -172,14 +178,13 @@ class Link:
             count = sum(now - t < _RECENT for t in list(times))
             if count:
                 rates[name] = count / _RECENT
-        last = max((found.arrival for found in list(self._newest.values())), default=-float("inf"))
         half, parser = self.clock.uncertainty, self._parser
         return Statistics(
             parser.received,
             parser.lost,
             parser.damaged,
             self._reconnections,
-            now - last,
+            self.silence,
             rates,
             None if half is None else 2 * half,
             self.clock.reboots,
@@ -312,6 +317,7 @@ class Link:
         if name == "STATUSTEXT":
             self._texts.append((arrival, message.severity, message.text))
         self._times.setdefault(name, deque(maxlen=1000)).append(arrival)
+        self._last = arrival
         with self._changed:
             self._newest[name] = found
             if name in _BY_FIELD:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from .codec import MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS
+from .codec import FRAME_THRUSTERS, MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS
 from .dialect import mavlink
 from .link import GROUND_STATION, Statistics
 from .mixer import FRAMES
@@ -42,6 +42,7 @@ class Requirements:
         rates: least rate (Hz) of the messages that the estimator and the guards read.
         system: our system id.
         min_voltage: least battery voltage (V); 0 does not check it.
+        sets: parameters that are set before arming, with their values for the dive.
     """
 
     thrusters: int
@@ -49,6 +50,7 @@ class Requirements:
     rates: Mapping[str, float] = field(default_factory=dict)
     system: int = GROUND_STATION
     min_voltage: float = 13.2
+    sets: Mapping[str, float] = field(default_factory=dict)
 
 
 class Facts(NamedTuple):
@@ -132,8 +134,7 @@ def _rates(needs: Requirements, facts: Facts) -> Found:
 
 def _frame(needs: Requirements, facts: Facts) -> Found:
     number = int(facts.parameters.get("FRAME_CONFIG", -1))
-    count = {1: 6, 2: 8}.get(number)
-    fits = count == needs.thrusters
+    fits = FRAME_THRUSTERS.get(number) == needs.thrusters
     words = f"FRAME_CONFIG {number} ({FRAMES.get(number, 'unknown')})"
     remedy = f": the scenario's vehicle has {needs.thrusters} thrusters; name the one connected"
     yield "frame", fits, words + ("" if fits else remedy)
@@ -188,7 +189,10 @@ def _failsafes(needs: Requirements, facts: Facts) -> Found:
         else:
             fine = found is not None and found >= wanted
         state = "is not among its parameters" if found is None else f"is {found:g}"
-        yield name, fine, state + ("" if fine else f": set {wanted:g}")
+        if found is not None and name in needs.sets and found != needs.sets[name]:
+            yield name, True, f"{state}: is set to {needs.sets[name]:g} for the dive"
+        else:
+            yield name, fine, state + ("" if fine else f": set {wanted:g}")
 
 
 def _state(needs: Requirements, facts: Facts) -> Found:

@@ -71,7 +71,7 @@ class SafetyConfig:
         require(self.max_depth > self.min_depth, self, "max_depth", "give more than min_depth")
 
 
-class Sight(NamedTuple):
+class Snapshot(NamedTuple):
     """What is seen at one time. Ages are in s, infinite where nothing came yet."""
 
     t: float
@@ -116,115 +116,92 @@ class State(NamedTuple):
     """When it tripped (s)."""
 
 
-Guard = Callable[[SafetyConfig, State, Sight], str]
+Guard = Callable[[SafetyConfig, State, Snapshot], str]
 """The reason to stop, or nothing."""
 
 
-def _wrench(config: SafetyConfig, state: State, sight: Sight) -> str:
+def _wrench(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
     del config, state
-    finite = np.isfinite(sight.F_Bo_B).all()
-    return "" if finite else f"the controller wants a wrench that is not finite: {sight.F_Bo_B}"
+    finite = np.isfinite(snapshot.F_Bo_B).all()
+    return "" if finite else f"the controller wants a wrench that is not finite: {snapshot.F_Bo_B}"
 
 
-def _silence(config: SafetyConfig, state: State, sight: Sight) -> str:
-    del state
-    return _too_old(config.silence, sight, "vehicle", "the vehicle was not heard")
+def _stale(name: str, field: str, words: str) -> Guard:
+    """A guard on the age of `name`, with its limit in the field `field`; a limit of 0 is none."""
+
+    def guard(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
+        del state
+        age, limit = snapshot.ages.get(name), getattr(config, field)
+        if age is None or limit == 0 or age <= limit:
+            return ""
+        return f"{words} for {age:.1f} s (limit {limit:g} s)"
+
+    return guard
 
 
-def _attitude(config: SafetyConfig, state: State, sight: Sight) -> str:
-    del state
-    return _too_old(config.stale, sight, "attitude", "no new attitude came")
-
-
-def _depth(config: SafetyConfig, state: State, sight: Sight) -> str:
-    del state
-    return _too_old(config.stale, sight, "depth", "no new depth came")
-
-
-def _aid(config: SafetyConfig, state: State, sight: Sight) -> str:
-    del state
-    return _too_old(config.stale_aid, sight, "aid", "no new velocity or position came")
-
-
-def _plan(config: SafetyConfig, state: State, sight: Sight) -> str:
-    del state
-    return _too_old(config.plan_age, sight, "plan", "the planner made no new plan")
-
-
-def _dead_man(config: SafetyConfig, state: State, sight: Sight) -> str:
-    del state
-    if config.dead_man == 0:
-        return ""
-    return _too_old(config.dead_man, sight, "dead_man", "the dead-man key was not pressed")
-
-
-def _too_old(limit: float, sight: Sight, name: str, words: str) -> str:
-    age = sight.ages.get(name)
-    return "" if age is None or age <= limit else f"{words} for {age:.1f} s (limit {limit:g} s)"
-
-
-def _estimate(config: SafetyConfig, state: State, sight: Sight) -> str:
-    if not np.isfinite(sight.p_WBo).all():
-        return f"the estimated position is not finite: {sight.p_WBo}"
+def _estimate(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
+    if not np.isfinite(snapshot.p_WBo).all():
+        return f"the estimated position is not finite: {snapshot.p_WBo}"
     since = state.lost_since
-    if sight.health < _LOST or since is None or sight.t - since <= config.lost:
+    if snapshot.health < _LOST or since is None or snapshot.t - since <= config.lost:
         return ""
-    return f"the estimator has been lost for {sight.t - since:.1f} s (limit {config.lost:g} s)"
+    return f"the estimator has been lost for {snapshot.t - since:.1f} s (limit {config.lost:g} s)"
 
 
-def _depth_limits(config: SafetyConfig, state: State, sight: Sight) -> str:
+def _depth_limits(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
     del state
-    depth = -float(sight.p_WBo[2])
+    depth = -float(snapshot.p_WBo[2])
     if config.min_depth <= depth <= config.max_depth:
         return ""
     return f"depth {depth:.1f} m is outside {config.min_depth:g} to {config.max_depth:g} m"
 
 
-def _fence(config: SafetyConfig, state: State, sight: Sight) -> str:
-    x, y = np.abs(sight.p_WBo - state.p_WBo)[:2]
+def _fence(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
+    x, y = np.abs(snapshot.p_WBo - state.p_WBo)[:2]
     if x <= config.fence[0] and y <= config.fence[1]:
         return ""
     half = f"{config.fence[0]:g} × {config.fence[1]:g} m"
     return f"{x:.1f} m and {y:.1f} m from the start along x and y: outside the fence of ± {half}"
 
 
-def _pilot(config: SafetyConfig, state: State, sight: Sight) -> str:
+def _pilot(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
     del config
-    if sight.mode == state.mode:
+    if snapshot.mode == state.mode:
         return ""
-    return f"the mode was changed to {sight.mode} (we had set {state.mode}): a pilot steers"
+    return f"the mode was changed to {snapshot.mode} (we had set {state.mode}): a pilot steers"
 
 
-def _disarmed(config: SafetyConfig, state: State, sight: Sight) -> str:
+def _disarmed(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
     del config, state
-    return "" if sight.armed else "the vehicle was disarmed"
+    return "" if snapshot.armed else "the vehicle was disarmed"
 
 
-def _failsafe(config: SafetyConfig, state: State, sight: Sight) -> str:
+def _failsafe(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
     del config, state
-    return f"the vehicle's failsafe is on: {sight.failsafe}" if sight.failsafe else ""
+    return f"the vehicle's failsafe is on: {snapshot.failsafe}" if snapshot.failsafe else ""
 
 
-def _rival(config: SafetyConfig, state: State, sight: Sight) -> str:
+def _rival(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
     del config, state
-    return "another ground station uses our system id" if sight.rivals else ""
+    return "another ground station uses our system id" if snapshot.rivals else ""
 
 
-def _outputs(config: SafetyConfig, state: State, sight: Sight) -> str:
+def _outputs(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
     del state
-    if sight.outputs <= config.outputs:
+    time = snapshot.outputs
+    if time <= config.outputs:
         return ""
     return (
-        f"the vehicle's outputs have differed from the commanded ones for {sight.outputs:.1f} s: "
+        f"the vehicle's outputs have differed from the commanded ones for {time:.1f} s: "
         "somebody else commands, or its parameters are others"
     )
 
 
-def _battery(config: SafetyConfig, state: State, sight: Sight) -> str:
+def _battery(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
     del state
-    if np.isnan(sight.voltage) or sight.voltage >= config.min_voltage:
+    if np.isnan(snapshot.voltage) or snapshot.voltage >= config.min_voltage:
         return ""
-    return f"battery {sight.voltage:.1f} V is below {config.min_voltage:g} V"
+    return f"battery {snapshot.voltage:.1f} V is below {config.min_voltage:g} V"
 
 
 GUARDS: dict[str, Guard] = {
@@ -233,13 +210,13 @@ GUARDS: dict[str, Guard] = {
     "rival": _rival,
     "outputs": _outputs,
     "failsafe": _failsafe,
-    "silence": _silence,
-    "attitude": _attitude,
-    "depth": _depth,
-    "aid": _aid,
+    "silence": _stale("vehicle", "silence", "the vehicle was not heard"),
+    "attitude": _stale("attitude", "stale", "no new attitude came"),
+    "depth": _stale("depth", "stale", "no new depth came"),
+    "aid": _stale("aid", "stale_aid", "no new velocity or position came"),
     "estimate": _estimate,
-    "plan": _plan,
-    "dead_man": _dead_man,
+    "plan": _stale("plan", "plan_age", "the planner made no new plan"),
+    "dead_man": _stale("dead_man", "dead_man", "the dead-man key was not pressed"),
     "depth_limits": _depth_limits,
     "fence": _fence,
     "battery": _battery,
@@ -250,7 +227,7 @@ GUARDS: dict[str, Guard] = {
 _YIELDING = ("pilot", "disarmed")
 
 
-class Ruling(NamedTuple):
+class Decision(NamedTuple):
     """What to do now."""
 
     state: State
@@ -266,27 +243,27 @@ class Supervisor:
     config: SafetyConfig = field(default_factory=SafetyConfig)
     guards: Mapping[str, Guard] = field(default_factory=lambda: dict(GUARDS))
 
-    def step(self, state: State, sight: Sight) -> Ruling:
+    def step(self, state: State, snapshot: Snapshot) -> Decision:
         """The order at one time.
 
         Once a guard has tripped, thrusters are neutral for half a second. Then the dive ends as
         configured, or by leaving the vehicle to the pilot who took it. A lost depth sensor, a
         silent vehicle or one whose depth is out of bounds is disarmed: it can't hold its depth.
         """
-        lost = sight.health >= _LOST
-        since = (sight.t if state.lost_since is None else state.lost_since) if lost else None
+        lost = snapshot.health >= _LOST
+        since = (snapshot.t if state.lost_since is None else state.lost_since) if lost else None
         state = state._replace(lost_since=since)
         if not state.tripped:
             for name, guard in self.guards.items():
-                reason = guard(self.config, state, sight)
+                reason = guard(self.config, state, snapshot)
                 if reason:
-                    state = state._replace(tripped=name, reason=reason, since=sight.t)
+                    state = state._replace(tripped=name, reason=reason, since=snapshot.t)
                     break
         if state.tripped:
-            ended = state._replace(F_Bo_B=np.zeros(6), t=sight.t)
-            return Ruling(ended, self._end(state, sight.t), np.zeros(6))
-        F = limited(self.config, state.F_Bo_B, sight.F_Bo_B, sight.t - state.t)
-        return Ruling(state._replace(F_Bo_B=F, t=sight.t), "fly", F)
+            ended = state._replace(F_Bo_B=np.zeros(6), t=snapshot.t)
+            return Decision(ended, self._end(state, snapshot.t), np.zeros(6))
+        F = limited(self.config, state.F_Bo_B, snapshot.F_Bo_B, snapshot.t - state.t)
+        return Decision(state._replace(F_Bo_B=F, t=snapshot.t), "fly", F)
 
     def _end(self, state: State, t: float) -> Order:
         if state.tripped in _YIELDING:

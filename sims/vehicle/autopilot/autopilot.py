@@ -2,7 +2,7 @@
 
 from .arming import refusal_to_arm
 from .channels import Channels
-from .failsafes import CRITICAL, WARNING, Deed, Failsafes, Text
+from .failsafes import CRITICAL, WARNING, FailsafeAction, Failsafes, Text
 from .mixer import FRAMES, NEUTRAL, Demands, Spool, mix
 from .modes import ALT_HOLD, MANUAL, SURFACE, Controller
 from .modes import refusal as refusal_of_mode
@@ -141,10 +141,10 @@ class Autopilot:
         if t - self._input_at >= _INPUT_PERIOD - 1e-9:
             self._input_at = t
             self.channels.update(t, self.parameters)
-        deeds = self.failsafes.step(t, self.armed, motion)
+        actions = self.failsafes.step(t, self.armed, motion)
         self._collect()
-        for deed in deeds:
-            self._do(deed)
+        for action in actions:
+            self._do(action)
         if self.motor_test.step(t):
             self._collect()
             self.disarm()
@@ -186,14 +186,14 @@ class Autopilot:
         elif function in (DISARM, ARM_TOGGLE):
             self.disarm()
 
-    def _do(self, deed: Deed) -> None:
-        if deed == "neutral":
+    def _do(self, action: FailsafeAction) -> None:
+        if action == "neutral":
             self._neutral()
-        elif deed == "disarm":
+        elif action == "disarm":
             self.disarm()
         else:
-            mode = ALT_HOLD if deed.startswith("hold depth") else SURFACE
-            if not self.set_mode(mode) and deed.endswith("or disarm"):
+            mode = ALT_HOLD if action.startswith("hold depth") else SURFACE
+            if not self.set_mode(mode) and action.endswith("or disarm"):
                 self.disarm()
 
     def _neutral(self) -> None:

@@ -11,7 +11,9 @@ GCS_TIMEOUT = 2.5  # s without a message that counts as the ground station's
 _FAST, _SLOW = 0.02, 0.3  # s between checks of the pilot's input; of the others
 CRITICAL, WARNING = 2, 4  # severities of STATUSTEXT
 
-Deed = Literal["neutral", "disarm", "hold depth or disarm", "surface or disarm", "surface"]
+FailsafeAction = Literal[
+    "neutral", "disarm", "hold depth or disarm", "surface or disarm", "surface"
+]
 
 
 @dataclass(frozen=True)
@@ -53,20 +55,20 @@ class Failsafes:
         """Note a heartbeat of the ground station."""
         self._gcs_heard = t
 
-    def step(self, t: float, armed: bool, motion: Motion) -> list[Deed]:
+    def step(self, t: float, armed: bool, motion: Motion) -> list[FailsafeAction]:
         """What is to be done at time t."""
-        deeds: list[Deed] = []
+        actions: list[FailsafeAction] = []
         if t - self._fast_at >= _FAST - 1e-9:
             self._fast_at = t
-            deeds += self._check_pilot(t)
+            actions += self._check_pilot(t)
         if t - self._slow_at >= _SLOW - 1e-9:
             self._slow_at = t
-            deeds += self._check_gcs(t, armed)
-            deeds += self._check_leak(t, armed, motion)
-            deeds += self._check_battery(t, motion)
-        return deeds
+            actions += self._check_gcs(t, armed)
+            actions += self._check_leak(t, armed, motion)
+            actions += self._check_battery(t, motion)
+        return actions
 
-    def _check_pilot(self, t: float) -> list[Deed]:
+    def _check_pilot(self, t: float) -> list[FailsafeAction]:
         p = self._parameters
         way = p.integer("FS_PILOT_INPUT")
         if way == 0 or t < self._pilot_heard + p["FS_PILOT_TIMEOUT"]:
@@ -78,7 +80,7 @@ class Failsafes:
         self.texts.append(Text(CRITICAL, "Lost manual control"))
         return ["neutral", "disarm"] if way == 2 else ["neutral"]
 
-    def _check_gcs(self, t: float, armed: bool) -> list[Deed]:
+    def _check_gcs(self, t: float, armed: bool) -> list[FailsafeAction]:
         way = self._parameters.integer("FS_GCS_ENABLE")
         if way == 0 or self._gcs_heard is None:
             return []
@@ -92,14 +94,14 @@ class Failsafes:
         if self.gcs or not armed:
             return []
         self.gcs = True
-        deeds: dict[int, list[Deed]] = {
+        actions: dict[int, list[FailsafeAction]] = {
             2: ["disarm"],
             3: ["hold depth or disarm"],
             4: ["surface or disarm"],
         }
-        return deeds.get(way, [])
+        return actions.get(way, [])
 
-    def _check_leak(self, t: float, armed: bool, motion: Motion) -> list[Deed]:
+    def _check_leak(self, t: float, armed: bool, motion: Motion) -> list[FailsafeAction]:
         way = self._parameters.integer("FS_LEAK_ENABLE")
         if not motion.leak or way == 0:
             self.leak = False
@@ -111,7 +113,7 @@ class Failsafes:
         self.leak = True
         return ["surface"] if way == 2 and armed else []
 
-    def _check_battery(self, t: float, motion: Motion) -> list[Deed]:
+    def _check_battery(self, t: float, motion: Motion) -> list[FailsafeAction]:
         p = self._parameters
         low = p["BATT_LOW_VOLT"]
         if low <= 0 or motion.voltage >= low:
@@ -122,8 +124,8 @@ class Failsafes:
             return []
         self.battery = True
         self.texts.append(Text(WARNING, f"Battery 1 is low {motion.voltage:.2f}V used 0 mAh"))
-        deeds: dict[int, list[Deed]] = {2: ["disarm"], 3: ["surface"]}
-        return deeds.get(p.integer("BATT_FS_LOW_ACT"), [])
+        actions: dict[int, list[FailsafeAction]] = {2: ["disarm"], 3: ["surface"]}
+        return actions.get(p.integer("BATT_FS_LOW_ACT"), [])
 
     def _due(self, name: str, t: float, every: float) -> bool:
         due = t - self._warned[name] > every

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from ....models.config.errors import UserError
+from ....systems.mavlink.codec import FRAME_THRUSTERS
 from .parameters import Parameters
 
 NEUTRAL = 1500
@@ -70,12 +71,13 @@ def frame_for(thrusters: int) -> int:
     Raises:
         UserError: it has another number of thrusters.
     """
-    if thrusters not in (6, 8):
+    fitting = [frame for frame, count in FRAME_THRUSTERS.items() if count == thrusters]
+    if not fitting:
         raise UserError(
             f"the vehicle has {thrusters} thrusters: the simulated autopilot flies six (frame "
             "VECTORED) or eight (VECTORED_6DOF)"
         )
-    return 1 if thrusters == 6 else 2
+    return fitting[0]
 
 
 def mix(parameters: Parameters, frame: int, demands: Demands, most_throttle: float) -> list[int]:

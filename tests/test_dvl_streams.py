@@ -160,7 +160,7 @@ def test_a_stream_gives_the_time_of_validity_and_connects_again():
     server.close()
     server = Connection.parse(f"tcpin:127.0.0.1:{port}").open()
     assert _until(lambda: server.read(0.05) == b"hello\n")
-    assert stream.reconnections == 1
+    assert stream.reconnections >= 1  # a closing listener may still accept one
     server.write(report(vx=0.5))
     assert _until(lambda: (now := stream.newest) is not None and now.reading.velocity[0] == 0.5)
     assert stream.age() < 1.0

@@ -44,6 +44,14 @@ def interruptible() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _quick_compile() -> None:
+    """Compile training steps without optimisation: tests take few of them."""
+    from spinndrift.training.fitting.step import QUICK_COMPILE  # not before types are checked
+
+    QUICK_COMPILE["xla_backend_optimization_level"] = 0
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _few_compiled_programs() -> Iterator[None]:
     """Forget compiled programs in time, and remove what killed processes have left half stored."""

@@ -3,15 +3,19 @@
 import json
 import re
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from helpers import full_disk, run_python
 from spinndrift.models.config import typed_yaml as yaml
-from spinndrift.models.effects.extended import Extended, core
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.effects.extended import Extended
 from spinndrift.models.effects.library import kind
 from spinndrift.models.files.checkpoint import load_model, save_model
 from spinndrift.models.files.owned import MARKER
+from spinndrift.models.integrate import cast
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.spinn import Spinn, SpinnConfig
 from spinndrift.models.vehicles.vehicle import load_vehicle
@@ -223,7 +227,7 @@ def test_train_resume_and_evaluate(generated, tmp_path, capsys, monkeypatch):
     assert 0 < overall["learned"]["rmse_position"] < 1
 
 
-def test_training_starts_from_a_model_with_effects(generated, tmp_path, capsys):
+def test_training_starts_from_a_model_with_effects(generated, tmp_path, capsys, monkeypatch):
     """As a diagnosis writes it; what it found stays, a SPINN learns what is left."""
     vehicle, lag = load_vehicle("bluerov2_heavy"), kind("thruster_lag").of(time_constant=0.1)
     believed = tmp_path / "extended.spinn"
@@ -241,11 +245,17 @@ def test_training_starts_from_a_model_with_effects(generated, tmp_path, capsys):
     overall = json.loads((out / "evaluation.json").read_text())
     assert set(overall) == {"preset", "learned", "start"}
     # what was learned is a start too, as it is and with its own architecture alone
-    again = tmp_path / "again"
-    assert called(*given, "--model", out / "model.spinn", "--out", again) is None
-    trained_on = core(load_model(again / "model.spinn")[0])
-    assert isinstance(trained_on, Spinn)
-    assert trained_on.config == model.base.config
+    begun = []
+
+    def begin(config, start, *_, **__):
+        begun.append((config.model, start))
+        raise UserError("this far and no further")
+
+    monkeypatch.setattr("spinndrift.sims.learning.fit", begin)
+    assert called(*given, "--model", out / "model.spinn", "--out", tmp_path / "again") == 2
+    ((architecture, start),) = begun
+    assert architecture == model.base.config
+    assert eqx.tree_equal(cast(start, jnp.float64), cast(model, jnp.float64))
     other = ("train", generated, "--method", "euclidean-fdm", "--out", tmp_path / "no")
     assert called(*other, "--model", out / "model.spinn") == 2
     assert "coordinates" in capsys.readouterr().err

@@ -1,8 +1,8 @@
 """The demo from end to end, made small: the shipped log, a tiny model, half a second of flight."""
 
 import json
-from dataclasses import replace
 
+from diagonal import Diagonal
 from test_cli import TINY
 
 from spinndrift.models.files.owned import MARKER
@@ -12,7 +12,6 @@ from spinndrift.sims.run.folder import RUN
 from spinndrift.sims.run.loop import simulate
 from spinndrift.sims.scenarios.scenario import load_scenario
 from spinndrift.systems.logs.load import load_data
-from spinndrift.training.config import DriftConfig
 from spinndrift.training.fitting.run_folder import TRAINING
 
 SMALL = """
@@ -28,7 +27,9 @@ def test_demo_tells_the_whole_story(tmp_path, monkeypatch):
     load_data(EMBEDDED).cut(0.0, 12.0).save(source)
     out = tmp_path / "demo"
     scenario = load_scenario("pylon_crossing_calm", SMALL)
-    tiny = replace(TINY, drift=DriftConfig(iterations=0))  # test_cli has the fitted start
+    # test_cli has the fitted start of networks; this one compiles fast
+    start = Diagonal.of(mass=20.0, drag=20.0, diffusion=1.0)
+    monkeypatch.setattr("spinndrift.sims.learning.starting_model", lambda *_: start)
     flown = []
 
     def simulated(*given):
@@ -37,7 +38,7 @@ def test_demo_tells_the_whole_story(tmp_path, monkeypatch):
 
     monkeypatch.setattr("spinndrift.sims.demo.simulate", simulated)
     with demo_folder(out):
-        told = demo(source, out, scenario, tiny)
+        told = demo(source, out, scenario, TINY)
     assert "preset" in told
     assert "dive:" in told
     found = json.loads((out / "summary.json").read_text())
@@ -45,7 +46,7 @@ def test_demo_tells_the_whole_story(tmp_path, monkeypatch):
     assert consistent is not None
     assert f"(3 on average for a consistent filter): {consistent}" in told
     assert set(found["held_out"]) == {"preset", "learned"}
-    assert found["training"]["steps"] == tiny.steps
+    assert found["training"]["steps"] == TINY.steps
     report = (out / "report.html").read_text()
     for section in ("The data", "Training", "Held-out error", "The dive"):
         assert section in report
@@ -61,7 +62,7 @@ def test_demo_tells_the_whole_story(tmp_path, monkeypatch):
     report = (out / "dive" / "report.html").stat()
     checkpoint = (out / "training" / "checkpoint.npz").read_bytes()
     with demo_folder(out):
-        demo(source, out, scenario, tiny)
+        demo(source, out, scenario, TINY)
     assert (out / "training" / "checkpoint.npz").read_bytes() == checkpoint
     assert (out / "dive" / "report.html").stat().st_ino != report.st_ino
     for folder in (out, out / "training", out / "dive"):

@@ -16,7 +16,6 @@ from spinndrift.models.files.checkpoint import load_model, save_model
 from spinndrift.models.spinn import Spinn, SpinnConfig
 from spinndrift.models.vehicles.vehicle import load_vehicle
 
-QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 SMALL = {"width": 6, "depth": 1, "constant_mass": True, "coordinates": "euler"}
 
 
@@ -31,16 +30,11 @@ def model(potential="gravity"):
     return made
 
 
-def quick(function):
-    """Return the function compiled as fast as can be."""
-    return eqx.filter_jit(function, compiler_options=QUICK)
-
-
-displace = quick(lambda m, X, twist_dt: m.displace(X, twist_dt))
-energy = quick(lambda m, X: m.potential(X))
-wrench = quick(lambda m, X: m.potential_wrench(X))
-retract = quick(se3.retract)
-poses, coordinates_of = quick(euclidean.pose), quick(coordinates)
+displace = eqx.filter_jit(lambda m, X, twist_dt: m.displace(X, twist_dt))
+energy = eqx.filter_jit(lambda m, X: m.potential(X))
+wrench = eqx.filter_jit(lambda m, X: m.potential_wrench(X))
+retract = eqx.filter_jit(se3.retract)
+poses, coordinates_of = eqx.filter_jit(euclidean.pose), eqx.filter_jit(coordinates)
 
 
 def shaken(potential):
@@ -67,13 +61,13 @@ def test_the_rotation_matrix_is_scipys():
     q = attitudes(0, 20)
     expected = np.moveaxis(scipy_rotation(q).as_matrix(), 0, -1)
     np.testing.assert_allclose(
-        matrix(quick(euclidean.rotation)(jnp.asarray(q))), expected, atol=1e-14
+        matrix(eqx.filter_jit(euclidean.rotation)(jnp.asarray(q))), expected, atol=1e-14
     )
 
 
 def test_angle_rates_are_the_derivative_of_scipys_angles():
     q = attitudes(1, 20)
-    T = matrix(quick(euclidean.angle_rates)(jnp.asarray(q)))
+    T = matrix(eqx.filter_jit(euclidean.angle_rates)(jnp.asarray(q)))
     h = 1e-6
     for i, e in enumerate(np.eye(3)):
         ahead, behind = (
@@ -91,7 +85,7 @@ def test_coordinates_and_pose_are_inverse_up_to_full_turns():
 
 
 def test_models_on_the_group_are_displaced_by_the_exponential():
-    X = quick(se3.exp)(jnp.asarray(np.random.default_rng(0).normal(size=(6, 4))))
+    X = eqx.filter_jit(se3.exp)(jnp.asarray(np.random.default_rng(0).normal(size=(6, 4))))
     V = jnp.asarray(np.random.default_rng(1).normal(size=(6, 4)))
     dynamics = load_vehicle("bluerov2_heavy").dynamics()
     np.testing.assert_array_equal(displace(dynamics, X, V), retract(X, V))
@@ -103,7 +97,7 @@ def test_the_euler_step_is_the_groups_to_first_order():
     gaps = []
     for h in (1e-2, 5e-3):
         moved, exact = displace(model(), X, h * V), retract(X, h * V)
-        gaps.append(np.max(np.abs(quick(se3.local)(moved, exact))))
+        gaps.append(np.max(np.abs(eqx.filter_jit(se3.local)(moved, exact))))
     assert gaps[0] / gaps[1] == pytest.approx(4, rel=0.1)  # one step errs by O(h²)
 
 
@@ -150,14 +144,14 @@ def test_coordinates_pass_half_a_turn_in_a_rollout_where_data_jump():
     V = jnp.asarray([0, 0, 0, 0, 0, 1.0])
     q = jnp.asarray([0, 0, 0, 0, 0, 3.0])
     F = jnp.zeros((10, 6))
-    qs, _ = quick(lambda m, q, V: m.rollout(q, V, F, 0.05))(model(), q, V)
+    qs, _ = eqx.filter_jit(lambda m, q, V: m.rollout(q, V, F, 0.05))(model(), q, V)
     assert float(qs[-1, 5]) > np.pi
     assert float(coordinates_of(poses(qs[-1]))[5]) < -2.5
 
 
 def test_rates_grow_without_bound_towards_vertical():
     V = jnp.asarray([0, 0, 0, 0, 0, 1.0])
-    rates = quick(euclidean.coordinate_rates)
+    rates = eqx.filter_jit(euclidean.coordinate_rates)
     sizes = [
         np.max(np.abs(rates(jnp.asarray([0, 0, 0, 0, p, 0.0]), V)))
         for p in (1.0, 1.5, 1.57, np.pi / 2)

@@ -12,7 +12,6 @@ from spinndrift.models.config.errors import UserError
 from spinndrift.models.rigid_body import FossenDynamics, spatial_inertia
 from spinndrift.models.spinn import Spinn, SpinnConfig
 
-QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 SMALL = {"width": 8, "depth": 2}
 
 
@@ -259,7 +258,7 @@ def test_float32_gradients_are_finite_from_rest_and_scales_have_none(spd, potent
     dW = integrate.brownian_increments(jax.random.key(1), (3, 1, 6, 8), 0.05, jnp.float32)
     arrays, static = eqx.partition(model, eqx.is_array)
 
-    @functools.partial(jax.jit, compiler_options=QUICK)
+    @jax.jit
     @jax.value_and_grad
     def loss(arrays):
         Xs, Vs = integrate.rollout(eqx.combine(arrays, static), X, V, F, 0.05, dW, remat=False)

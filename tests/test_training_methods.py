@@ -81,14 +81,6 @@ def start(config):
     return create_spinn(config.model, reference, jax.random.key(0), jnp.float32)
 
 
-@pytest.fixture
-def quick(monkeypatch):
-    """Compile fast; steps are few."""
-    options = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-    monkeypatch.setattr("spinndrift.training.fitting.step.QUICK_COMPILE", options)
-
-
-@pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(
     "name",
     [
@@ -107,7 +99,6 @@ def test_a_few_steps_make_the_loss_smaller(name, windows):
     assert losses[-2:].mean() < losses[:2].mean()
 
 
-@pytest.mark.usefixtures("quick")
 def test_instability_ends_training_with_a_report(windows, monkeypatch):
     found = Diagnosis((), (), (), "motion runs away")  # what it looks for is tested with the guard
     monkeypatch.setattr("spinndrift.training.fitting.fit.explain_non_finite", lambda *_: found)

@@ -17,6 +17,7 @@ from spinndrift.models.disturbances import (
     JonswapWaves,
     OrnsteinUhlenbeckWrench,
     ShipWake,
+    Surface,
     Tether,
     WhiteWrench,
     jonswap,
@@ -75,6 +76,7 @@ KINDS = [
     JonswapWaves(spreading=5.0),
     ShipWake(),
     Tether(),
+    Surface(100.0, 3.0),
     preset("harbour"),
     Combined(),
 ]

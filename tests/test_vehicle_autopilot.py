@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from measured_mixer import MEASURED
 
 from spinndrift.models.config.errors import UserError
 from spinndrift.sims.vehicle.autopilot.autopilot import FORCE_ARM, Autopilot
@@ -58,21 +59,6 @@ def armed(motion: Motion | None = None, **values: float | int) -> Dive:
     assert dive.autopilot.arm()
     dive.run(1.5, sticks())
     return dive
-
-
-# (forward, right, down | roll, pitch, yaw) of each thruster at PWM above 1500, as measured
-MEASURED = np.array(
-    [
-        [-1, 1, 0, 0, 0, 1],
-        [-1, -1, 0, 0, 0, -1],
-        [1, 1, 0, 0, 0, -1],
-        [1, -1, 0, 0, 0, 1],
-        [0, 0, 1, 1, -1, 0],
-        [0, 0, 1, -1, -1, 0],
-        [0, 0, 1, 1, 1, 0],
-        [0, 0, 1, -1, 1, 0],
-    ]
-)
 
 
 def test_mixer_has_the_signs_that_were_measured_on_each_thruster():

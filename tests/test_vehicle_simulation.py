@@ -144,7 +144,7 @@ def test_depth_is_held(pilot: Pilot):
 
 
 def test_the_truth_is_a_recording(pilot: Pilot, tmp_path):
-    write_vehicle(pilot.simulation, SCENARIO, tmp_path)
+    write_vehicle(pilot.simulation.truth, SCENARIO, tmp_path)
     recording = Recording.load(tmp_path / "truth.nc")
     data = recording.dataset
     assert data.sizes["time"] == pytest.approx(20 * pilot.simulation.time, abs=2)

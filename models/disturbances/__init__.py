@@ -9,6 +9,7 @@ from .current import GaussMarkovCurrent as GaussMarkovCurrent
 from .linear_waves import orbital_factors as orbital_factors
 from .linear_waves import wave_number as wave_number
 from .ornstein_uhlenbeck import OrnsteinUhlenbeckWrench as OrnsteinUhlenbeckWrench
+from .surface import Surface as Surface
 from .tether import Tether as Tether
 from .wake import ShipWake as ShipWake
 from .waves import JonswapWaves as JonswapWaves

@@ -13,12 +13,21 @@ from ..randomness import Scalar
 from .base import Disturbance
 from .current import GaussMarkovCurrent
 from .ornstein_uhlenbeck import OrnsteinUhlenbeckWrench
+from .surface import Surface
 from .tether import Tether
 from .wake import ShipWake
 from .waves import JonswapWaves
 from .white import WhiteWrench
 
-Kind = WhiteWrench | OrnsteinUhlenbeckWrench | GaussMarkovCurrent | JonswapWaves | ShipWake | Tether
+Kind = (
+    WhiteWrench
+    | OrnsteinUhlenbeckWrench
+    | GaussMarkovCurrent
+    | JonswapWaves
+    | ShipWake
+    | Tether
+    | Surface
+)
 """The kinds that a scenario can name by a tag."""
 
 

@@ -1,24 +1,18 @@
-"""The simulated station under an autopilot: pulse widths in, motion and a DVL's readings out."""
+"""The simulated station under an autopilot: what it senses, and a DVL's readings."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from pydrake.systems.analysis import Simulator
 
 from ...models.frames import frd_to_flu
 from ...models.se3 import from_position_rpy
-from ...systems.closed_loop import seeded
 from ...systems.mavlink import codec
 from ...systems.station.config import StationConfig
 from ...systems.station.simulated import make_driven_station
-from .autopilot.mixer import NEUTRAL, frame_for
 from .autopilot.navigation import Motion, rotated
-
-_LOWEST, _HIGHEST = 1000, 2000  # µs: at and beyond these a speed controller stops
-_WARM_UP = 0.45  # s: every event of the diagram has occurred
+from .physics import Physics
 
 
 @dataclass(frozen=True)
@@ -40,8 +34,8 @@ class DvlReading:
     altitude: float
 
 
-class Plant:
-    """The station of a scenario, stepped one period at a time."""
+class Plant(Physics):
+    """The station of a scenario: physics, sensors and filter."""
 
     def __init__(self, config: StationConfig):
         """Build and compile.
@@ -49,53 +43,20 @@ class Plant:
         Raises:
             UserError: a part of the configuration names what can't be read.
         """
-        self.config = config
-        self.vehicle = config.load_vehicle()
-        self.thrusters = len(self.vehicle.propulsion.mounts)
-        self._station = make_driven_station(config)
-        self._simulator = self._started()
-        self._simulator.AdvanceTo(_WARM_UP)
-        self._simulator = self._started()
-        self._steps = 0
-        nominal = self.vehicle.propulsion.voltage
-        self._resting_voltage = nominal if config.voltage is None else config.voltage
+        super().__init__(config, make_driven_station)
         self._dvl_time = 0.0
         dvl = config.sensing.dvl
         rpy = jnp.array((0.0, 0.0, 0.0) if dvl is None else dvl.rpy)
         self._q_BD = np.array(from_position_rpy(jnp.zeros(3), rpy)[:4])
 
-    def _started(self) -> Simulator:
-        simulator = Simulator(self._station)
-        context = simulator.get_mutable_context()
-        seeded(self._station, context, self.config.seed)
-        neutral = np.full(self.thrusters, float(NEUTRAL))
-        self._pwm = self._station.GetInputPort("pwm").FixValue(context, neutral)
-        simulator.Initialize()
-        return simulator
-
     def parameters(self) -> dict[str, float]:
         """Parameters of an autopilot that knows this vehicle: frame, directions, DVL's place."""
-        values = {"FRAME_CONFIG": float(frame_for(self.thrusters))}
+        values = super().parameters()
         dvl = self.config.sensing.dvl
         if dvl is not None:
             place = frd_to_flu(np.array(dvl.position)).tolist()
             values |= dict(zip(("VISO_POS_X", "VISO_POS_Y", "VISO_POS_Z"), place, strict=True))
-        for n, mount in enumerate(self.vehicle.propulsion.mounts, 1):
-            values[f"MOT_{n}_DIRECTION"] = mount.motor
         return values
-
-    @property
-    def time(self) -> float:
-        """The simulation's time (s)."""
-        return self._steps * self.config.period
-
-    def step(self, outputs: list[int]) -> None:
-        """Advance one period with the pulse widths (µs) of the first outputs, one a thruster."""
-        us = np.array(outputs[: self.thrusters], float)
-        us[(us <= _LOWEST) | (us >= _HIGHEST)] = NEUTRAL
-        self._pwm.GetMutableData().set_value(us)
-        self._steps += 1
-        self._simulator.AdvanceTo(self.time)
 
     def motion(self, specific_gravity: float = 1.0, leak: bool = False) -> Motion:
         """What the autopilot knows: the filter's estimates and the last readings.
@@ -109,9 +70,7 @@ class Plant:
         climb = rotated(X[:4], V[:3])[2]
         gauge = self.config.sensing.depth is not None
         depth = self._value("depth") if gauge else np.zeros(2)
-        volts = self._loaded_voltage()
-        resistance = self.vehicle.propulsion.resistance
-        amps = (self._resting_voltage - volts) / resistance if resistance > 0 else 0.0
+        volts, amps = self.battery()
         return Motion(
             q_WB=X[:4],
             omega_B=imu[3:],
@@ -119,8 +78,8 @@ class Plant:
             height=float(X[6] * gradient / own),
             climb=float(climb * gradient / own),
             pressure=float((depth[0] if depth[1] else -X[6]) * gradient),
-            voltage=float(volts),
-            current=float(max(amps, 0.0)),
+            voltage=volts,
+            current=amps,
             leak=leak,
         )
 
@@ -137,15 +96,3 @@ class Plant:
             return None
         v_B = rotated(self._q_BD, reading[:3])
         return DvlReading(time, min(dt, 1.0), v_B, float(reading[5]), float(reading[4]))
-
-    def truth(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6"]]:
-        """Pose X_WB and twist V_WB_B."""
-        return self._value("X_WB_cheat"), self._value("V_WB_B_cheat")
-
-    def _value(self, name: str) -> np.ndarray:
-        return np.array(self._station.GetOutputPort(name).Eval(self._simulator.get_context()))
-
-    def _loaded_voltage(self) -> float:
-        plant: Any = self._station.GetSubsystemByName("plant")
-        own = plant.GetMyContextFromRoot(self._simulator.get_context())
-        return float(plant.GetOutputPort("voltage_loaded").Eval(own)[0])

@@ -18,8 +18,8 @@ _MOST_MERIT = 0.4  # m/s: figure of merit of a reading without confidence
 class Simulation:
     """What happens in a scenario's water, tick by tick, and what goes over the links."""
 
-    def __init__(self, scenario: Scenario, ports: int):
-        """Build plant and vehicle; this compiles.
+    def __init__(self, scenario: Scenario, ports: int, record: bool = True):
+        """Build plant and vehicle; this compiles. `record` is whether to log the truth.
 
         Raises:
             UserError: the scenario names what can't be read, or an unknown parameter.
@@ -32,7 +32,8 @@ class Simulation:
         parameters = self.plant.parameters() | own
         self.vehicle = Vehicle(parameters, self.settings.clock)
         self.ports = Ports(self.vehicle, ports)
-        self.truth = TruthLog(self.plant, self.vehicle, scenario.log.rate)
+        self.truth = TruthLog(self.plant, scenario.log.rate, self._seen)
+        self._record = record
         self.time = 0.0
         self._ticks = 0
         self._motion = self._known()
@@ -51,7 +52,8 @@ class Simulation:
             self.vehicle.reboot()
         period = self.plant.config.period
         while self.plant.time + period <= self.time + 1e-9:
-            self.truth.sample(self.plant.time)
+            if self._record:
+                self.truth.sample(self.plant.time)
             self.plant.step(self.vehicle.autopilot.outputs.us)
             self._motion = self._known()
         self.vehicle.step(self.time, self._motion)
@@ -59,6 +61,23 @@ class Simulation:
         if reading is not None:
             self._tell_dvl(reading)
         return self.ports.step()
+
+    def _seen(self) -> dict[str, np.ndarray]:
+        """Pulse widths, the pilot's channels, voltage, and the autopilot's state."""
+        autopilot = self.vehicle.autopilot
+        state = [
+            autopilot.mode,
+            autopilot.armed,
+            autopilot.failsafes.any,
+            autopilot.pilot.gain,
+            self.vehicle.boots,
+        ]
+        return {
+            "pwm": np.array(autopilot.outputs.us[: self.plant.thrusters], float),
+            "rc": np.array(autopilot.channels.us, float),
+            "voltage": np.array([autopilot.motion.voltage]),
+            "autopilot_state": np.array(state, float),
+        }
 
     def _known(self):
         leak = self.settings.leak

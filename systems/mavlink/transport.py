@@ -9,7 +9,8 @@ one.
 import select
 import socket
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -63,8 +64,26 @@ class Connection:
         Raises:
             UserError: host, port or device can't be opened; the sentence says why.
         """
-        try:
+        with self._refusing():
             return _KINDS[self.kind](self, timeout)
+
+    def open_datagrams(self) -> "Datagrams":
+        """Open a UDP connection whose datagrams keep their bounds.
+
+        Raises:
+            UserError: it is none, or host or port can't be opened; the sentence says why.
+        """
+        if not self.kind.startswith("udp"):
+            raise UserError(
+                f"connection {self}: datagrams need udpin:HOST:PORT or udpout:HOST:PORT"
+            )
+        with self._refusing():
+            return Datagrams(self)
+
+    @contextmanager
+    def _refusing(self) -> Iterator[None]:
+        try:
+            yield
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             raise UserError(f"connection {self}: {reason}; {_REMEDIES[self.kind]}") from error
@@ -182,59 +201,92 @@ class _TcpListener:
         _shut(self._listener)
 
 
-class _Udp:
-    """UDP datagrams, to a fixed peer or to those that have been heard."""
+class Datagrams:
+    """A UDP socket whose datagrams keep their bounds and their senders."""
 
-    def __init__(self, connection: Connection, timeout: float):
-        del timeout
+    def __init__(self, connection: Connection):
+        """Bind the address of `udpin`; that of `udpout` is `peer`.
+
+        Raises:
+            OSError: there is no such address, or it is in use.
+        """
         found = socket.getaddrinfo(connection.address, connection.number, type=socket.SOCK_DGRAM)
         family, kind, protocol, _, address = found[0]
         self._socket = socket.socket(family, kind, protocol)
-        self._peers: dict[tuple, float] = {}
-        self._fixed: tuple | None = None
+        self.peer: tuple | None = None
         try:
             if connection.kind == "udpin":
                 self._socket.bind(address)
             else:
-                self._fixed = address
+                self.peer = address
             self._socket.setblocking(False)
         except OSError:
             self._socket.close()
             raise
         self.port = self._socket.getsockname()[1] if connection.kind == "udpin" else 0
 
-    def read(self, timeout: float) -> bytes:
+    def receive(self, timeout: float) -> list[tuple[bytes, tuple]]:
+        """Datagrams that have arrived, with their senders; waits up to `timeout` (s) for the first.
+
+        Raises:
+            Lost: the socket is closed.
+        """
+        arrived: list[tuple[bytes, tuple]] = []
         if not _readable(self._socket, timeout):
-            return b""
-        parts = []
-        while True:
+            return arrived
+        while len(arrived) < 64:  # let a flood not starve the caller
             try:
-                data, peer = self._socket.recvfrom(_CHUNK)
+                arrived.append(self._socket.recvfrom(_CHUNK))
             except (BlockingIOError, ConnectionError):  # empty, or no one listens at the peer yet
-                return b"".join(parts)
+                break
             except OSError as error:
                 raise Lost(str(error)) from error
-            if self._fixed is None:
-                self._peers[peer] = time.monotonic()
-            parts.append(data)
-            if len(parts) >= 64:  # let a flood not starve the caller
-                return b"".join(parts)
+        return arrived
+
+    def send(self, data: bytes, peer: tuple) -> None:
+        """Send a datagram; what can't be sent at once is lost, as UDP packets may be.
+
+        Raises:
+            Lost: the socket is closed.
+        """
+        try:
+            self._socket.sendto(data, peer)
+        except (BlockingIOError, ConnectionError):
+            return
+        except OSError as error:  # without a route for the moment it is lost as well
+            if self._socket.fileno() < 0:
+                raise Lost(str(error)) from error
+
+    def close(self) -> None:
+        """Close; further calls raise `Lost`."""
+        _shut(self._socket)
+
+
+class _Udp:
+    """UDP datagrams, to a fixed peer or to those that have been heard."""
+
+    def __init__(self, connection: Connection, timeout: float):
+        del timeout
+        self._datagrams = Datagrams(connection)
+        self._peers: dict[tuple, float] = {}
+        self.port = self._datagrams.port
+
+    def read(self, timeout: float) -> bytes:
+        arrived = self._datagrams.receive(timeout)
+        if self._datagrams.peer is None:
+            now = time.monotonic()
+            self._peers.update((peer, now) for _, peer in arrived)
+        return b"".join(data for data, _ in arrived)
 
     def write(self, data: bytes) -> None:
         now = time.monotonic()
+        fixed = self._datagrams.peer
         heard = [peer for peer, last in list(self._peers.items()) if now - last < _SILENT]
-        for peer in heard if self._fixed is None else [self._fixed]:
-            try:
-                self._socket.sendto(data, peer)
-            except (BlockingIOError, ConnectionError):
-                continue
-            except OSError as error:
-                if self._socket.fileno() < 0:
-                    raise Lost(str(error)) from error
-                # no route for the moment: the packet is lost, as UDP packets may be
+        for peer in heard if fixed is None else [fixed]:
+            self._datagrams.send(data, peer)
 
     def close(self) -> None:
-        _shut(self._socket)
+        self._datagrams.close()
 
 
 class _Serial:

@@ -5,6 +5,7 @@ from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import RandomSource
 
+from ...models.disturbances import Combined, Surface
 from ...models.sensors import Sensor
 from ..drake import constant
 from ..estimation.ekf import Ekf
@@ -50,12 +51,31 @@ def make_station(
 def make_driven_station(config: StationConfig) -> Diagram:
     """The simulated station with pulse widths as its input `pwm` (µs) in place of `F_Bo_B`.
 
-    Its thrusters have another driver: an autopilot.
+    Its thrusters have another driver, an autopilot, under which the vehicle may rest for long: its
+    water has a surface.
 
     Raises:
         UserError: as `make_station`.
     """
     return _simulated(config, None, driven=True)
+
+
+def make_driven_plant(config: StationConfig) -> Diagram:
+    """The driven station without sensors and filter: input `pwm`, the cheats as outputs.
+
+    Raises:
+        UserError: as `make_station`.
+    """
+    builder = DiagramBuilder()
+    allocation, plant, water = _add_body(builder, config, driven=True)
+    add_noise(builder, plant, "noise", config.period)
+    add_noise(builder, water, "noise", _WATER * config.period)
+    add_noise(builder, water, "initial_noise", _NEVER)
+    builder.ExportInput(allocation.get_input_port(0), "pwm")
+    _export_truth(builder, plant, water)
+    diagram = builder.Build()
+    diagram.set_name("plant")
+    return diagram
 
 
 def check_stand_in(system: System, config: StationConfig) -> None:
@@ -126,17 +146,41 @@ class StationBuilder:
         return dict.fromkeys(self.measured, suite) | self.systems
 
 
-def _simulated(config: StationConfig, estimator: System | None, driven: bool = False) -> Diagram:
-    thrusters = config.load_vehicle().thrusters()
-    X0, V0 = config.initial_state()
-    water_period = _WATER * config.period
-    builder = DiagramBuilder()
-    station, add = StationBuilder(builder), builder.AddNamedSystem
+def _add_body(
+    builder: DiagramBuilder, config: StationConfig, driven: bool
+) -> tuple[System, System, System]:
+    """Add allocation, plant, disturbances and battery, connected but for noise and command."""
+    vehicle, (X0, V0) = config.load_vehicle(), config.initial_state()
+    thrusters, disturbance = vehicle.thrusters(), config.disturbance()
+    if driven:
+        disturbance = Combined((*disturbance.members, Surface.of(vehicle)))
+    add, connect = builder.AddNamedSystem, builder.Connect
     driver = PulseWidths(thrusters) if driven else ThrustAllocation(thrusters, config.voltage)
     allocation = add("allocation", driver)
     body = LearnedPlant(config.dynamics(), config.period, config.substeps, X0, V0, thrusters)
     plant = add("plant", body)
-    water = add("disturbances", DisturbanceSource(config.disturbance(), water_period))
+    water = add("disturbances", DisturbanceSource(disturbance, _WATER * config.period))
+    nominal = float(thrusters.nominal_voltage)
+    battery = add("battery", constant([nominal if config.voltage is None else config.voltage]))
+    connect(battery.get_output_port(), plant.GetInputPort("voltage"))
+    connect(allocation.GetOutputPort("pwm"), plant.GetInputPort("pwm"))
+    for name in ("F_disturbance_Bo_B", "flow_W"):
+        connect(water.GetOutputPort(name), plant.GetInputPort(name))
+    for name in ("X_WB", "V_WB_B"):
+        connect(plant.GetOutputPort(name), water.GetInputPort(name))
+    return allocation, plant, water
+
+
+def _export_truth(builder: DiagramBuilder, plant: System, water: System) -> None:
+    truth = ((plant, "X_WB"), (plant, "V_WB_B"), (water, "F_disturbance_Bo_B"), (water, "flow_W"))
+    for cheat, (system, name) in zip(CHEATS, truth, strict=True):
+        builder.ExportOutput(system.GetOutputPort(name), cheat.name)
+
+
+def _simulated(config: StationConfig, estimator: System | None, driven: bool = False) -> Diagram:
+    builder = DiagramBuilder()
+    station, add = StationBuilder(builder), builder.AddNamedSystem
+    allocation, plant, water = _add_body(builder, config, driven)
     sensors = station.add_sensors(config.sensing, plant)
     ekf = add("ekf", estimator or _filter(config))
     sizes = station_ports(config)[1]
@@ -144,18 +188,9 @@ def _simulated(config: StationConfig, estimator: System | None, driven: bool = F
     offered = {name: sizes[name] for name in (*sensors, "pwm")}
     check_ports("filter", ekf, ({}, needed), (offered, reported))
 
-    station.connect(allocation, "pwm", plant)
-    for name in ("F_disturbance_Bo_B", "flow_W"):
-        station.connect(water, name, plant)
-    for name in ("X_WB", "V_WB_B"):
-        station.connect(plant, name, water)
     for name, source in (sensors | {"pwm": allocation}).items():
         if ekf.HasInputPort(name):
             station.connect(source, name, ekf)
-    nominal = float(thrusters.nominal_voltage)
-    volts = nominal if config.voltage is None else config.voltage
-    battery = add("battery", constant([volts]))
-    builder.Connect(battery.get_output_port(), plant.GetInputPort("voltage"))
     _add_noises(builder, config, sensors, (plant, water, ekf))
 
     command = allocation.get_input_port(0)
@@ -169,9 +204,7 @@ def _simulated(config: StationConfig, estimator: System | None, driven: bool = F
             value = [0.0, *[1.0] * (size - 1)] if name == "health" else [np.nan] * size
             unknown = add(f"no_{name}", constant(value))
             builder.ExportOutput(unknown.get_output_port(), name)
-    truth = ((plant, "X_WB"), (plant, "V_WB_B"), (water, "F_disturbance_Bo_B"), (water, "flow_W"))
-    for cheat, (system, name) in zip(CHEATS, truth, strict=True):
-        builder.ExportOutput(system.GetOutputPort(name), cheat.name)
+    _export_truth(builder, plant, water)
     diagram = builder.Build()
     diagram.set_name("station")
     return diagram

@@ -13,6 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.interpolate import RegularGridInterpolator
 
 from .rigid_body import GRAVITY
 
@@ -31,6 +32,12 @@ class ThrusterCurve(eqx.Module):
         self, pwm: Float[Array, "*shape"], voltage: Float[Array, "*#shape"]
     ) -> Float[Array, "*shape"]:
         """Steady force in N at `pwm` µs."""
+
+    def steady(
+        self, pwm: Float[np.ndarray, "*shape"], voltage: Float[np.ndarray, "*#shape"]
+    ) -> Float[np.ndarray, "*shape"]:
+        """`force` in NumPy, for checks of data that are to compile nothing."""
+        return np.asarray(self.force(jnp.asarray(pwm), jnp.asarray(voltage)))
 
     @abc.abstractmethod
     def pwm(
@@ -139,6 +146,16 @@ class T200Curve(ThrusterCurve):
         parts = jnp.clip((side * pwm[None] - start) / _over(jnp.diff(self.knots), pwm), 0, 1)
         return jnp.sum(side * rise * parts, axis=0)
 
+    def steady(
+        self, pwm: Float[np.ndarray, "*shape"], voltage: Float[np.ndarray, "*#shape"]
+    ) -> Float[np.ndarray, "*shape"]:
+        table = RegularGridInterpolator(
+            (np.asarray(self.voltages), np.asarray(self.knots)), np.asarray(self.forces)
+        )
+        points = np.stack(np.broadcast_arrays(voltage, pwm), axis=-1)
+        low, high = zip(*((axis[0], axis[-1]) for axis in table.grid), strict=True)
+        return table(np.clip(points, low, high))
+
     def pwm(
         self, force: Float[Array, "*shape"], voltage: Float[Array, "*#shape"]
     ) -> Float[Array, "*shape"]:
@@ -219,6 +236,13 @@ class QuadraticCurve(ThrusterCurve):
         rests = RESTING * offset / jnp.maximum(self.dead_band, 1e-9)
         rests = jnp.where(jnp.abs(offset) <= self.dead_band, rests, 0)
         return jnp.where(turns, self.full_force * u * jnp.abs(u), rests) + 0 * voltage
+
+    def steady(
+        self, pwm: Float[np.ndarray, "*shape"], voltage: Float[np.ndarray, "*#shape"]
+    ) -> Float[np.ndarray, "*shape"]:
+        u = (pwm - NEUTRAL) / 400
+        turns = (400 * np.abs(u) > float(self.dead_band)) & (400 * np.abs(u) < 500)
+        return np.where(turns, float(self.full_force) * u * np.abs(u), 0.0) + 0 * voltage
 
     def pwm(
         self, force: Float[Array, "*shape"], voltage: Float[Array, "*#shape"]

@@ -11,6 +11,7 @@ import pytest
 from helpers import shared_data
 from spinndrift.models.rigid_body import GRAVITY
 from spinndrift.models.thruster_curves import RESTING, QuadraticCurve, T200Curve
+from spinndrift.models.vehicles.vehicle import load_vehicle
 
 VOLTS = jnp.array([10.0, 12.0, 14.0, 16.0, 18.0, 20.0])
 PWM = jnp.arange(1100.0, 1901.0)
@@ -147,3 +148,12 @@ def test_quadratic_inverse_round_trips_clamps_and_takes_the_nearer_at_the_jump()
 def test_quadratic_refuses_nonsense(full_force, dead_band):
     with pytest.raises(ValueError, match=r"full_force|dead_band"):
         QuadraticCurve(full_force, dead_band)
+
+
+@pytest.mark.parametrize("name", ["bluerov2_heavy", "ardusub_sitl"])
+def test_the_curve_in_numpy_is_the_compiled_one(name):
+    curve = load_vehicle(name).thrusters().curve
+    rng = np.random.default_rng(3)
+    pwm, volts = rng.uniform(950, 2050, (8, 500)), rng.uniform(9, 21, (1, 500))
+    expected = np.asarray(curve.force(jnp.asarray(pwm), jnp.asarray(volts)))
+    np.testing.assert_allclose(curve.steady(pwm, volts), expected, atol=RESTING)

@@ -54,6 +54,9 @@ class Diagnose:
     wrong in most of them. `auto` fits none, or all if that explains clearly more than names."""
     water_density: Annotated[float | None, WATER_DENSITY] = None
     """kg/m³, if a log's autopilot assumed fresh water in the sea (as in `spinndrift import`)."""
+    accept: tuple[str, ...] = ()
+    """Words of severe findings on the data that are accepted (docs/checks.md), such as no-commands.
+    """
     out: Path = Path("diagnosis")
     """Folder to write."""
 
@@ -70,13 +73,17 @@ class Diagnose:
 
             from ...models.files.atomic import atomic_files
             from ...models.files.checkpoint import load_model, save_model
+            from ...models.recordings.checks.examine import examine
+            from ...models.recordings.checks.finding import check_accepted
             from ...models.vehicles.vehicle import load_vehicle
             from ...systems.logs.load import LogOptions, load_data
             from ...training.diagnosis.findings.result import schema
             from ...training.diagnosis.pipeline import DiagnoseConfig, diagnose
             from ..reports.diagnosis_report import diagnosis_page
+            from ..reports.findings import add_findings, print_findings
 
         self._check()
+        check_accepted(self.accept)
         config = DiagnoseConfig(alpha=self.alpha, refit=self.refit)
         base, metadata = (None, {}) if self.model is None else load_model(self.model, dtype=float)
         named = metadata.get("vehicle")
@@ -88,15 +95,19 @@ class Diagnose:
                 vehicle=self.vehicle or (named if self._is_log() else None),
                 options=LogOptions(water_density=self.water_density),
                 resample=False,
+                accept=self.accept,
                 progress=update,
             )
         stated = self._vehicle(recording.vehicle, named)
         vehicle = load_vehicle(stated)
+        recording = examine(recording, vehicle, str(self.data), self.accept)
+        print_findings(console(), recording)
         if self.diffusion is not None:
             base = vehicle.dynamics(np.array(self.diffusion))
         with progress_bar("diagnosing") as update:
             finding = diagnose(recording, vehicle, base, config, update)
         page = diagnosis_page(finding, f"Diagnosis of {self.data.name}")
+        add_findings(page, recording)
         with atomic_files(self.out) as partial:
             finding.diagnosis.save(partial / "diagnosis.json")
             text = json.dumps(schema(), indent=2) + "\n"

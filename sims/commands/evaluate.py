@@ -36,6 +36,9 @@ class Evaluate:
     """Length of each window (s)."""
     vehicle: str | None = None
     """Preset name or YAML file to compare with; by default what the model names."""
+    accept: tuple[str, ...] = ()
+    """Words of severe findings on the data that are accepted (docs/checks.md), such as no-commands.
+    """
 
     def place(self) -> AbstractContextManager[Path | None]:
         """Check and lock the outputs."""
@@ -50,18 +53,25 @@ class Evaluate:
     def run(self) -> None:
         """Load, predict, compare."""
         with interrupts_held():
+            from ...models.recordings.checks.examine import examine
+            from ...models.recordings.checks.finding import check_accepted
             from ...models.vehicles.vehicle import load_vehicle
             from ...systems.logs.load import load_data
             from ...training.data.windows import make_windows
             from ..learning import FINE_SUBSTEPS, Start, compare, judged, windowing
+            from ..reports.findings import print_findings
 
         if self.out is not None and self.out.suffix not in (".csv", ".json", ".nc"):
             raise UserError(f"--out {self.out}: end the name in .csv, .json or .nc")
+        check_accepted(self.accept)
         start, metadata = Start.read(self.model)
         name = self.vehicle or metadata.get("vehicle") or "bluerov2_heavy"
         vehicle = load_vehicle(name)
         with progress_bar(f"reading {self.data.name}") as update:
-            recording = load_data(self.data, vehicle=self.vehicle, progress=update)
+            recording = load_data(
+                self.data, vehicle=self.vehicle, accept=self.accept, progress=update
+            )
+        recording = examine(recording, vehicle, str(self.data), self.accept)
         windows = make_windows(
             recording,
             vehicle,
@@ -78,6 +88,7 @@ class Evaluate:
         if self.out is not None:
             found.save(self.out)
         shown = console()
+        print_findings(shown, recording)
         shown.print(f"{len(windows)} windows of {self.length:g} s")
         shown.print(found.summary())
         if self.out is not None:

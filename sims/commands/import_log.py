@@ -3,7 +3,7 @@
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import FlagCreatePairsOff, Positional
 
@@ -11,6 +11,9 @@ from ...models.config.checks import WATER_DENSITY, Within
 from ...models.config.errors import UserError
 from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar
+
+if TYPE_CHECKING:
+    from ...models.vehicles.vehicle import Vehicle
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,9 @@ class Import:
     """Keep a log's disarmed stretches too."""
     system: Annotated[int | None, Within(1, 255)] = None
     """MAVLink system id, if a log holds several autopilots."""
+    accept: tuple[str, ...] = ()
+    """Words of severe findings on the data that are accepted (docs/checks.md), such as no-commands.
+    """
 
     def place(self) -> AbstractContextManager[Path]:
         """Check and lock the outputs."""
@@ -59,24 +65,47 @@ class Import:
     def run(self) -> None:
         """Read, convert, write, summarise."""
         with interrupts_held():
+            from ...models.recordings.checks.examine import examine
+            from ...models.recordings.checks.finding import check_accepted
             from ...models.recordings.summary import summarize
             from ...systems.logs.load import LogOptions, load_data
+            from ..reports.findings import print_findings
 
+        check_accepted(self.accept)
         out = self._out()
         if out.suffix != ".nc":
             raise UserError(f"--out {out}: a Recording is a NetCDF file; give a name ending in .nc")
         options = LogOptions(self.minimum, self.gap, self.water_density, self.disarmed, self.system)
         with progress_bar(f"reading {self.log.name}") as update:
             recording = load_data(
-                self.log, rate=self.rate, vehicle=self.vehicle, options=options, progress=update
+                self.log,
+                rate=self.rate,
+                vehicle=self.vehicle,
+                options=options,
+                accept=self.accept,
+                progress=update,
             )
+        vehicle = known_vehicle(recording.vehicle)
+        recording = examine(recording, vehicle, str(self.log), self.accept)
         recording.save(out)
         shown = console()
-        shown.print(summarize(recording))
+        shown.print(summarize(recording), markup=False)
+        print_findings(shown, recording)
         shown.print(f"wrote {out}")
 
     def _out(self) -> Path:
         return self.out if self.out is not None else Path(f"{stem(self.log)}.nc")
+
+
+def known_vehicle(name: str) -> "Vehicle | None":
+    """The vehicle of a recording; None if it names none, or one that is not here."""
+    with interrupts_held():
+        from ...models.vehicles.vehicle import load_vehicle
+
+    try:
+        return load_vehicle(name) if name else None
+    except UserError:
+        return None
 
 
 def stem(path: Path) -> str:

@@ -51,6 +51,9 @@ class Train:
     """Seed of the initial networks and of all noise, instead of that of the settings."""
     resume: bool = False
     """Continue the run in `--out`."""
+    accept: tuple[str, ...] = ()
+    """Words of severe findings on the data that are accepted (docs/checks.md), such as no-commands.
+    """
 
     def place(self) -> AbstractContextManager[Path]:
         """Check and lock the outputs."""
@@ -64,16 +67,20 @@ class Train:
         """Train, evaluate, report."""
         with interrupts_held():
             from ...models.config.typed_yaml import load
+            from ...models.recordings.checks.examine import examine
+            from ...models.recordings.checks.finding import check_accepted
             from ...models.vehicles.vehicle import load_vehicle
             from ...systems.logs.load import load_data
             from ...training.config import TrainingConfig
             from ...training.methods import method_config
             from ..cores import share_cores
             from ..learning import Start, learn
+            from ..reports.findings import print_findings
             from ..reports.learning_report import add_data, add_evaluation, add_training
             from ..reports.pages import Page
 
         share_cores()
+        check_accepted(self.accept)
         if self.method is not None:
             config = method_config(self.method, self.config)
         else:
@@ -89,8 +96,12 @@ class Train:
             load_vehicle(self.vehicle)  # fails now, not after the data are read
         start, metadata = (None, {}) if self.model is None else Start.read(self.model)
         with progress_bar(f"reading {self.data.name}") as update:
-            recording = load_data(self.data, vehicle=self.vehicle, progress=update)
+            recording = load_data(
+                self.data, vehicle=self.vehicle, accept=self.accept, progress=update
+            )
         vehicle = load_vehicle(recording.vehicle or metadata.get("vehicle") or "bluerov2_heavy")
+        recording = examine(recording, vehicle, str(self.data), self.accept)
+        print_findings(console(), recording)
         with progress_bar("training") as update:
             learned = learn(
                 recording,

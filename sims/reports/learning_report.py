@@ -18,6 +18,7 @@ from .figures_learning import (
     learning_figure,
     recording_figure,
 )
+from .findings import add_findings
 from .pages import Page
 
 _LEFT_OUT = ("rmse_geodesic", "rmse_velocity", "finite")
@@ -35,7 +36,8 @@ def add_data(page: Page, recording: Recording) -> Page:
     page.figure(recording_figure(recording), "Measured motion, one colour per stretch.")
     if recording.notes:
         page.table([(note,) for note in recording.notes], ("contents and gaps of the source",))
-    return page.details("Ranges of all variables", summarize(recording))
+    page.details("Ranges of all variables", summarize(recording))
+    return add_findings(page, recording)
 
 
 def add_training(page: Page, learned: Learned) -> Page:

@@ -1,10 +1,12 @@
 """A vehicle's log to a recording: telemetry (.tlog) and DataFlash (.BIN), plain or .xz/.gz."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 from ...models.config.errors import UserError
+from ...models.recordings.checks.finding import enforce, with_findings
 from ...models.recordings.csv import METADATA, read_csv
 from ...models.recordings.schema import check_plausible
 from ...models.recordings.store import Recording
@@ -51,6 +53,7 @@ def import_log(
     rate: float | None = RATES[-1],
     vehicle: str | None = None,
     options: LogOptions | None = None,
+    accept: Sequence[str] = (),
     progress: Progress = no_progress,
 ) -> tuple[Recording, ImportReport]:
     """Import a log: one scenario for each stretch of constant mode, armed, without gaps or resets.
@@ -62,11 +65,12 @@ def import_log(
         vehicle: preset or file whose thruster directions the PWM is to have; None takes the preset
             with the thrusters of the log's frame (`wiring`). It is named in the result.
         options: what is taken from the log.
+        accept: words of severe findings that are accepted (docs/checks.md).
         progress: called with the fraction done, 0 to 1.
 
     Raises:
-        UserError: if there is no such log, it can't be read, nothing usable is in it, or its frame
-            has another number of thrusters than the vehicle.
+        UserError: if there is no such log, it can't be read, nothing usable is in it, its frame
+            has another number of thrusters than the vehicle, or a severe finding is not accepted.
     """
     path = Path(path)
     options = options or LogOptions()
@@ -76,6 +80,10 @@ def import_log(
     raw = read_log_bytes(path, progress)
     try:
         signals = _signals(raw, vehicle, options, progress)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    enforce(str(path), signals.findings, accept)
+    try:
         rate = own_rate(signals) if rate is None else rate
         trajectories, lines, dropped = fuse(
             signals,
@@ -107,7 +115,8 @@ def import_log(
         raise UserError(f"{path}: {error}") from error
     period = 1.0 / signals.outputs.rate
     progress(1.0)
-    return Recording(recording.dataset.assign_attrs(command_period=period)), report
+    dataset = with_findings(recording.dataset, signals.findings)
+    return Recording(dataset.assign_attrs(command_period=period)), report
 
 
 def own_rate(signals: Signals) -> float:
@@ -124,6 +133,7 @@ def load_data(
     vehicle: str | None = None,
     options: LogOptions | None = None,
     resample: bool = True,
+    accept: Sequence[str] = (),
     progress: Progress = no_progress,
 ) -> Recording:
     """Read data of any kind: a recording (.nc), a CSV folder, or a vehicle's log.
@@ -135,6 +145,7 @@ def load_data(
         vehicle: preset or file; None keeps the one that the data name, or that of a log's frame.
         options: what is taken from a log.
         resample: False keeps the unevenly spaced samples of CSV files.
+        accept: words of severe findings in a log that are accepted (docs/checks.md).
         progress: called with the fraction done, 0 to 1.
 
     Raises:
@@ -165,6 +176,7 @@ def load_data(
             rate=RATES[-1] if rate is None and resample else rate,
             vehicle=vehicle,
             options=options,
+            accept=accept,
             progress=progress,
         )
         return logged

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...models.recordings.checks.finding import Finding
 from ...models.recordings.schema import LIMITS
 from ..mavlink.codec import filter_delay
 
@@ -56,6 +57,7 @@ class Signals:
         vehicle: preset or file whose thrusters these are.
         spans: armed, mode, aiding, wiring: the states that are constant within a segment.
         cuts: times at which a segment must end: resets, reboots.
+        findings: what is wrong with the log.
     """
 
     attitude: Series
@@ -73,6 +75,7 @@ class Signals:
     has: tuple[str, ...] = ()
     lacks: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def series(t: np.ndarray, x: ArrayLike, source: str, quantity: str) -> Series | None:

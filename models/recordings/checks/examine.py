@@ -1,0 +1,81 @@
+"""All checks of a recording, and what is left of it."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ...config.errors import UserError
+from ...vehicles.vehicle import Vehicle
+from ..build import Trajectory
+from ..schema import UNEVEN
+from ..store import Recording
+from .commands import command_findings
+from .finding import Finding, check_accepted, enforce, findings_of, with_findings
+from .velocity import held_finding, unmeasured
+
+_SHORTEST_S = 1.0
+"""A shorter piece beside a cut is left out too."""
+
+
+def examine(
+    recording: Recording, vehicle: Vehicle | None, source: str, accept: Iterable[str] = ()
+) -> Recording:
+    """Check a recording; return it without the stretches that were cut, with the findings in it.
+
+    Args:
+        recording: of any source; findings of its import are kept.
+        vehicle: whose thrusters the commands are; None if it is not known.
+        source: named in messages.
+        accept: words of severe findings that are accepted.
+
+    Raises:
+        UserError: for severe findings that are not accepted, or if nothing is left.
+    """
+    check_accepted(accept)
+    recording, cut = _without_unmeasured(recording, source)
+    found = [*findings_of(recording.dataset), *cut, *command_findings(recording, vehicle)]
+    enforce(source, found, accept)
+    return type(recording)(with_findings(recording.dataset, found))
+
+
+def _without_unmeasured(recording: Recording, source: str) -> tuple[Recording, list[Finding]]:
+    """The recording without stretches in which the velocity was not measured."""
+    found: list[Finding] = []
+    pieces: list[Trajectory] = []
+    for run in recording.trajectories():
+        t = run.sensors.get(UNEVEN, recording.dt * np.arange(len(run)))
+        bad = np.zeros(len(run), bool)
+        for word, columns, samples in unmeasured(run, t):
+            at = run.start + t[np.flatnonzero(samples)] - t[0]
+            place = f"{run.scenario}, {at[0]:.1f} to {at[-1]:.1f} s, {columns}"
+            found.append(held_finding(word, place, columns))
+            bad |= samples
+        pieces += [run] if not bad.any() else _pieces(run, t, ~bad)
+    if not found:
+        return recording, []
+    if not pieces:
+        raise UserError(f"{source}: {found[0]}, and nothing is left; record it with a DVL's lock")
+    attrs = recording.dataset.attrs
+    kept = Recording.from_trajectories(pieces, recording.dt)
+    return Recording(kept.dataset.assign_attrs(attrs)), found
+
+
+def _pieces(run: Trajectory, t: np.ndarray, good: np.ndarray) -> list[Trajectory]:
+    """The stretches of good samples that are not too short."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]])))
+    found = []
+    for a, b in edges.reshape(-1, 2).tolist():
+        if t[b - 1] - t[a] < _SHORTEST_S:
+            continue
+        part = slice(a, b)
+        found.append(
+            Trajectory(
+                run.scenario,
+                run.X_WB[part],
+                run.V_WB_B[part],
+                {name: values[part] for name, values in run.commands.items()},
+                {name: values[part] for name, values in run.sensors.items()},
+                run.start + float(t[a] - t[0]),
+            )
+        )
+    return found

@@ -1,0 +1,190 @@
+"""How much of each command the motion accounts for: the statistic behind the checks of commands.
+
+Along each axis a body answers as
+
+    F(t - τ) = m v̇ + d v + e |v| v + (restoring, Coriolis, a constant),    m, d, e ≥ 0,
+
+because mass and drag take up energy and never give it. The commanded force is regressed on the
+motion with these signs (least squares with non-negative coefficients), so that a share of 1 means
+that the command belongs to the motion, whatever the vehicle's mass and drag are, and a share of 0
+that no passive body could have moved so. The opposite regression, of acceleration on command and
+velocity, fails where drag dominates: command and velocity are then nearly proportional.
+
+Derivatives are avoided: both sides are correlated with a smooth window φ, and ∫φ v̇ = -∫φ' v. A
+linear filter on both sides leaves the coefficients unchanged.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ..resample import grid, hold, linear, rotations, slerp
+from ..store import Recording
+
+HALF_WIDTH_S = 0.3
+"""Half width of the window: a period of 0.6 s is damped to a half, a thruster's lag is inside."""
+LAGS_S = np.round(np.arange(-1.0, 1.01, 0.1), 3)
+"""s by which the motion may follow the command (negative: precede it)."""
+_LEAST_RUN = 8
+"""Windows that a run must have to be used."""
+_ACF_S = 5.0
+_SUBSETS = [np.array(s) for s in ([0], [1], [2], [0, 1], [0, 2], [1, 2], [0, 1, 2])]
+_CORIOLIS = {0: ((1, 5), (2, 4)), 1: ((2, 3), (0, 5)), 2: ((0, 4), (1, 3)),
+             3: ((4, 5), (1, 2)), 4: ((3, 5), (0, 2)), 5: ((3, 4), (0, 1))}  # fmt: skip
+"""Products of twist components in the equation of each axis: Coriolis and Munk terms."""
+
+
+@dataclass(frozen=True)
+class AxisResponse:
+    """Sums of products of one axis' motion R (3: v̇, v, |v|v) and of all commands C (m), by lag.
+
+    Attributes:
+        RR: (3, 3).
+        RC: (lags, 3, m).
+        CC: (lags, m, m).
+        count: independent windows: those of the record over their correlation along time.
+        motion: root mean square of v̇ (m/s² or rad/s²).
+    """
+
+    RR: Float[np.ndarray, "3 3"]
+    RC: Float[np.ndarray, "L 3 m"]
+    CC: Float[np.ndarray, "L m m"]
+    count: float
+    motion: float
+
+    def fit(
+        self, weights: Float[np.ndarray, "m *H"], lag: int
+    ) -> tuple[Float[np.ndarray, "*H"], Float[np.ndarray, "*H"]]:
+        """Share of the force C·weights that the motion accounts for, and the mass m fitted to it.
+
+        `weights` may have trailing axes of hypotheses; `lag` is an index into `LAGS_S`.
+        """
+        w = weights.reshape(len(weights), -1)
+        size = np.einsum("mh,mn,nh->h", w, self.CC[lag], w)
+        b = self.RC[lag] @ w
+        best, mass = np.zeros(w.shape[1]), np.zeros(w.shape[1])
+        for subset in _SUBSETS:
+            own = self.RR[np.ix_(subset, subset)]
+            x = np.linalg.lstsq(own, b[subset], rcond=1e-10)[0]
+            gain = np.where((x >= 0).all(axis=0), np.sum(x * b[subset], axis=0), 0.0)
+            mass = np.where(gain > best, x[0] if subset[0] == 0 else 0.0, mass)
+            best = np.maximum(best, gain)
+        share = np.where(size > 0, best / np.maximum(size, 1e-300), 0.0)
+        shape = weights.shape[1:]
+        return np.clip(share, 0.0, 1.0 - 1e-6).reshape(shape), mass.reshape(shape)
+
+
+def responses(
+    recording: Recording, commands: Float[np.ndarray, "J K N m"], period: float
+) -> dict[int, AxisResponse]:
+    """The response of every axis with a measured velocity (0 … 5); empty if all runs are short.
+
+    `period` (s) is the step at which commands are known.
+    """
+    half = max(HALF_WIDTH_S, 1.5 * period)
+    pieces = [
+        piece
+        for j, k in np.argwhere(recording.lengths > 1)
+        if (piece := _filtered(recording, int(j), int(k), commands, half)) is not None
+    ]
+    if not pieces:
+        return {}
+    step = max(round(half / 2 / recording.dt), 1) * recording.dt
+    found = {}
+    for axis in range(6):
+        usable = [p for p in pieces if np.isfinite(p.rate[:, axis]).all()]
+        if usable:
+            found[axis] = _axis(axis, usable, step)
+    return found
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """One run, filtered and thinned: v̇ (n, 6), motion terms (n, q), commands by lag (L, n, m)."""
+
+    rate: np.ndarray
+    terms: np.ndarray
+    commands: np.ndarray
+
+
+def _filtered(
+    recording: Recording, j: int, k: int, commands: np.ndarray, half: float
+) -> _Piece | None:
+    dt, length = recording.dt, int(recording.lengths[j, k])
+    V = recording.dataset["V_WB_B"].to_numpy()[j, k, :length]
+    q = recording.dataset["X_WB"].to_numpy()[j, k, :length, :4]
+    f = np.nan_to_num(commands[j, k, :length])
+    if recording.uneven:
+        t = recording.elapsed(j, k)
+        even = grid(t[0], t[-1], dt)
+        V, q, f = linear(even, t, V.T).T, slerp(even, t, q.T).T, hold(even, t, f.T, dt).T
+    n = max(round(half / dt), 2)
+    step = max(round(half / 2 / dt), 1)
+    reach = np.rint(LAGS_S / dt).astype(int)
+    if len(V) < 2 * n + 1 + _LEAST_RUN * step:
+        return None
+    x = np.arange(-n, n + 1) / n
+    window = np.cos(np.pi * x / 2) ** 4
+    slope = -2 * np.pi * np.cos(np.pi * x / 2) ** 3 * np.sin(np.pi * x / 2) / (n * dt)
+    slope, window = slope / window.sum(), window / window.sum()
+    held = np.concatenate([f[:1], (f[1:] + f[:-1]) / 2])  # about t of a command held from t on
+    up = rotations(q.T).inv().apply([0.0, 0.0, 1.0])
+    products = [V[:, a] * V[:, b] for pair in _CORIOLIS.values() for a, b in pair]
+    terms = np.concatenate([V, V * np.abs(V), up, np.stack(products, axis=1)], axis=1)
+    inner = np.arange(len(V))
+    shifted = np.stack([held[np.clip(inner - r, 0, len(V) - 1)] for r in reach])
+    return _Piece(
+        _smoothed(V, -slope, step),
+        _smoothed(terms, window, step),
+        np.stack([_smoothed(c, window, step) for c in shifted]),
+    )
+
+
+def _smoothed(x: np.ndarray, window: np.ndarray, step: int) -> np.ndarray:
+    """Correlation of every column with the window, at every `step`-th place, less its mean."""
+    views = np.lib.stride_tricks.sliding_window_view(x, window.size, axis=0)[::step]
+    y = views @ window
+    return y - y.mean(axis=0)
+
+
+def _axis(axis: int, pieces: Sequence[_Piece], step: float) -> AxisResponse:
+    free = [12, 13, 14, 15 + 2 * axis, 16 + 2 * axis]
+    terms = np.concatenate([p.terms for p in pieces])
+    R = np.stack(
+        [np.concatenate([p.rate[:, axis] for p in pieces]), terms[:, axis], terms[:, 6 + axis]], 1
+    )
+    Z = terms[:, free]
+    Z = Z[:, np.isfinite(Z).all(axis=0)]
+    Z = Z[:, Z.std(axis=0) > 1e-9]
+    C = np.concatenate([p.commands for p in pieces], axis=1)
+    Q = np.linalg.qr(Z)[0] if Z.size else np.zeros((len(R), 0))
+    R = R - Q @ (Q.T @ R)
+    C = C - Q @ (Q.T @ C)
+    zero = int(np.argmin(np.abs(LAGS_S)))
+    lengths = np.cumsum([len(p.rate) for p in pieces])[:-1]
+    count = len(R) / _correlation(np.split(C[zero], lengths), round(_ACF_S / step))
+    return AxisResponse(
+        R.T @ R,
+        np.einsum("na,lnm->lam", R, C),
+        np.einsum("lna,lnb->lab", C, C),
+        count,
+        float(np.sqrt(np.mean(R[:, 0] ** 2))),
+    )
+
+
+def _correlation(pieces: Sequence[np.ndarray], most: int) -> float:
+    """1 + 2 Σ ρ² of the commands along time: windows for one independent window.
+
+    Two series with the autocorrelation ρ are correlated by chance with the variance of n/(1 + 2 Σ
+    ρ²) independent pairs (Bartlett 1935).
+    """
+    size = sum(float(np.sum(p**2)) for p in pieces)
+    if size <= 0:
+        return 1.0
+    total = 1.0
+    for lag in range(1, most + 1):
+        products = (float(np.sum(p[lag:] * p[:-lag])) for p in pieces if len(p) > lag)
+        total += 2 * (sum(products) / size) ** 2
+    return total

@@ -1,0 +1,91 @@
+"""Velocities that were not measured: values that stand still, and values no vehicle has."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..build import Trajectory
+from ..resample import rotations
+from .finding import Finding
+
+FASTEST = 15.0
+"""m/s; above it a velocity is an instrument's mark of failure, such as -32.768 m/s."""
+_HELD_S, _USUAL_HOLDS = 1.0, 10.0
+"""A value held for this long, and for this many of the record's own holds, is not measured."""
+_SAME, _STEP = 1e-9, 0.03
+"""m/s: rounding of a held value, and the least jump with which a held zero begins or ends."""
+_TURNS = 1e-3
+"""rad/s: spread of the rates above which the vehicle moves."""
+_SPREAD = 2
+"""Samples beside an impossible one that resampling may have mixed with it."""
+
+
+def unmeasured(
+    run: Trajectory, t: Float[np.ndarray, " N"]
+) -> Iterator[tuple[str, str, Bool[np.ndarray, " N"]]]:
+    """Word, columns and samples of each stretch of a run whose velocity was not measured."""
+    V = run.V_WB_B[:, :3]
+    known = np.asarray(np.isfinite(V).all(axis=0))
+    for columns in ([0, 1, 2], [2]):
+        if known[columns].all():
+            fast = np.asarray(np.abs(V[:, columns]).max(axis=1) > FASTEST)
+            if fast.any():
+                reach = np.ones(2 * _SPREAD + 1)
+                yield "velocity-impossible", _names(columns), np.convolve(fast, reach, "same") > 0
+            break
+    if not known[:2].all():
+        return
+    turned = rotations(run.X_WB[:, :4].T).apply(np.nan_to_num(V))
+    for held in _held(run, t, V[:, :2], turned[:, :2]):
+        yield "velocity-held", _names([0, 1]), held
+
+
+def _names(columns: list[int]) -> str:
+    return ",".join("uvw"[c] for c in columns)
+
+
+def _held(run: Trajectory, t: np.ndarray, *frames: np.ndarray) -> Iterator[Bool[np.ndarray, " N"]]:
+    """Stretches of a value that is constant in the body or in the world while the rates vary."""
+    N, done = len(run), np.zeros(len(run), bool)
+    for v in frames:
+        edges = _edges(v)
+        usual = float(np.median(np.diff(t[np.minimum(edges, N - 1)])))
+        least = max(_HELD_S, _USUAL_HOLDS * usual)
+        for start, stop in pairwise(edges.tolist()):
+            inside = np.zeros(N, bool)
+            inside[start:stop] = True
+            if t[stop - 1] - t[start] < least or (inside & done).any():
+                continue
+            if np.ptp(run.V_WB_B[start:stop, 3:], axis=0).max() < _TURNS:
+                continue
+            if np.abs(v[start]).max() < _SAME and not _jumps(v, start, stop):
+                continue
+            done |= inside
+            yield inside
+
+
+def _edges(v: np.ndarray) -> np.ndarray:
+    """Indices at which a new value begins, and the length."""
+    new = np.flatnonzero(np.abs(np.diff(v, axis=0)).max(axis=1) > _SAME) + 1
+    return np.concatenate([[0], new, [len(v)]])
+
+
+def _jumps(v: np.ndarray, start: int, stop: int) -> bool:
+    """Whether a stretch of zeros begins or ends with a jump, within two samples of it."""
+    before, after = v[max(start - 2, 0) : start], v[stop : stop + 2]
+    return any(part.size > 0 and bool(np.abs(part).max() > _STEP) for part in (before, after))
+
+
+def held_finding(word: str, place: str, columns: str) -> Finding:
+    """The sentence on one stretch."""
+    if word == "velocity-held":
+        text = f"{columns} stand still at one value while the vehicle moves: a DVL without lock"
+        return Finding(word, place, f"{text}; the stretch is left out", "check the DVL's status")
+    return Finding(
+        word,
+        place,
+        f"{columns} above {FASTEST:g} m/s, which marks a failure; the samples are left out",
+        "leave such samples empty, or cut there",
+    )

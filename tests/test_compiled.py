@@ -17,7 +17,7 @@ from pydrake.systems.primitives import (
 
 from helpers import ROOT
 from spinndrift.models.config.errors import UserError
-from spinndrift.sims.run.loop import simulate
+from spinndrift.sims.run.loop import _simulator, simulate
 from spinndrift.sims.scenarios.scenario import load_scenario, scenario_names
 from spinndrift.systems.closed_loop import build_diagram
 from spinndrift.systems.compiled.network import NotPureError
@@ -282,10 +282,14 @@ def test_a_planner_flies_as_in_drake():
 
 @pytest.mark.parametrize("name", scenario_names())
 def test_every_shipped_scenario_is_one_loop(name):
-    """All of its systems tell what they compute; tracing, not compiling, shows that it fits."""
+    """All of its systems tell what they compute; tracing, not compiling, shows that it fits.
+
+    It is long enough that the loop is taken unasked.
+    """
     scenario = load_scenario(name)
     diagram = build_diagram(scenario.station, scenario.controller, goal=scenario.goal)
-    simulator = CompiledSimulator(diagram)
+    simulator = _simulator(diagram, scenario, "auto")
+    assert isinstance(simulator, CompiledSimulator)
     sizes = [jax.ShapeDtypeStruct((n,), float) for n in simulator._sizes]
     state, logged = jax.eval_shape(simulator._run, *sizes)
     assert state.shape == sizes[0].shape

@@ -81,8 +81,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engin
 
     Drake steps the diagram, or one compiled loop does (`systems.compiled.simulator`), which is
     several times as fast and differs by rounding only. By default the loop is used if the diagram
-    can be compiled, the run may last long enough to repay the compilation, and no planner rolls out
-    in several threads: the loop has one.
+    can be compiled and the run may last long enough to repay the compilation.
 
     Ctrl-C ends the run after the current sample with the outcome `interrupted`; the run up to then
     is returned. A second Ctrl-C, or one before the first step, interrupts at once.
@@ -210,9 +209,7 @@ def _simulator(
     diagram: Diagram, scenario: Scenario, engine: Engine
 ) -> Simulator | CompiledSimulator:
     """The simulator that steps a diagram."""
-    planner = getattr(plan_source(diagram), "planner", None)
-    parallel = planner is not None and planner.config.threads > 1
-    if engine == "auto" and (parallel or scenario.duration < _WORTH_A_LOOP):
+    if engine == "auto" and scenario.duration < _WORTH_A_LOOP:
         engine = "drake"
     if engine == "drake":
         return Simulator(diagram)

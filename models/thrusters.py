@@ -83,15 +83,7 @@ class Thrusters(eqx.Module):
         n = p.shape[-1]
         s = np.ones(n) if motor_directions is None else np.asarray(motor_directions, float)
         w = np.ones(n) if effort is None else np.asarray(effort, float)
-        if p.shape != (3, n) or d.shape != (3, n) or s.shape != (n,) or w.shape != (n,):
-            raise ValueError(
-                "positions and directions must be (3, n), motor_directions and effort (n,); got "
-                f"{p.shape}, {d.shape}, {s.shape}, {w.shape}"
-            )
-        if not np.all(np.abs(s) == 1):
-            raise ValueError(f"motor_directions must be 1 or -1 each, not {s.tolist()}")
-        if not np.all(w > 0):
-            raise ValueError(f"effort must be positive, not {w.tolist()}")
+        _check_layout(p, d, s, w)
         if not (time_constant >= 0 and start_delay >= 0):
             raise ValueError(
                 f"time_constant {time_constant} and start_delay {start_delay} must be ≥ 0 s"
@@ -281,6 +273,20 @@ class Thrusters(eqx.Module):
 def _column(values: Array | np.ndarray, x: Array) -> Array:
     """One value for each entry of the first axis of `x`."""
     return jnp.asarray(values).reshape((-1,) + (1,) * (x.ndim - 1))
+
+
+def _check_layout(p: np.ndarray, d: np.ndarray, s: np.ndarray, w: np.ndarray) -> None:
+    """Refuse positions, directions, motor directions and efforts that are no thrusters."""
+    n = p.shape[-1]
+    if p.shape != (3, n) or d.shape != (3, n) or s.shape != (n,) or w.shape != (n,):
+        raise ValueError(
+            "positions and directions must be (3, n), motor_directions and effort (n,); got "
+            f"{p.shape}, {d.shape}, {s.shape}, {w.shape}"
+        )
+    if not np.all(np.abs(s) == 1):
+        raise ValueError(f"motor_directions must be 1 or -1 each, not {s.tolist()}")
+    if not np.all(w > 0):
+        raise ValueError(f"effort must be positive, not {w.tolist()}")
 
 
 def _independent(B: Float[np.ndarray, "6 n"]) -> list[int]:

@@ -12,8 +12,9 @@ from spinndrift.models import se3
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.sensors import SHIPPED, DepthSensor, Dvl
 from spinndrift.models.vehicles.vehicle import load_vehicle
-from spinndrift.systems.estimation.delayed import EkfConfig, Readings, status_names
+from spinndrift.systems.estimation.config import EkfConfig
 from spinndrift.systems.estimation.ekf import Ekf
+from spinndrift.systems.estimation.state import Readings, status_names
 from spinndrift.systems.plant.learned_plant import LearnedPlant
 from spinndrift.systems.plant.sensor_suite import SensorSuite
 

@@ -18,7 +18,9 @@ from spinndrift.models import se3
 from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu, wrap
 from spinndrift.sims.estimator_check.scores import within_three_sigma
 from spinndrift.systems.estimation import error_state
-from spinndrift.systems.estimation.delayed import DelayedFilter, EkfConfig, Readings, health_names
+from spinndrift.systems.estimation.config import EkfConfig
+from spinndrift.systems.estimation.delayed import DelayedFilter
+from spinndrift.systems.estimation.state import Readings, health_names
 
 SEEDS = 10
 EVERY = 20  # samples from one estimate that is kept to the next

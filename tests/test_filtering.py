@@ -15,7 +15,9 @@ from spinndrift.models import se3
 from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu
 from spinndrift.systems.estimation import error_state as es
 from spinndrift.systems.estimation import measurement
-from spinndrift.systems.estimation.delayed import DelayedFilter, EkfConfig, FilterState, Readings
+from spinndrift.systems.estimation.config import EkfConfig
+from spinndrift.systems.estimation.delayed import DelayedFilter
+from spinndrift.systems.estimation.state import FilterState, Readings
 
 SEEDS, STEPS = 40, 600
 RNG = np.random.default_rng(0)

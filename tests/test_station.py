@@ -21,7 +21,7 @@ from spinndrift.systems.compiled.pure import Event, Pure, shown
 from spinndrift.systems.compiled.simulator import CompiledSimulator
 from spinndrift.systems.controllers.health_gate import HealthGate
 from spinndrift.systems.controllers.kinds import MppiImpedance, Own, Tracking, TrackReference
-from spinndrift.systems.estimation.delayed import EkfConfig
+from spinndrift.systems.estimation.config import EkfConfig
 from spinndrift.systems.planning.mppi_config import MppiConfig
 from spinndrift.systems.planning.obstacles import BoxHull, Cylinders, Pylon
 from spinndrift.systems.planning.paths import HoldPose, PoseConfig

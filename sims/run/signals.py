@@ -13,8 +13,8 @@ from pydrake.systems.primitives import LogVectorOutput
 
 from ...systems.closed_loop import Signal
 from ...systems.compiled.signal_log import add_log
-from ...systems.estimation.delayed import status_names
 from ...systems.estimation.error_state import POSITION, ROTATION, VELOCITY
+from ...systems.estimation.state import status_names
 from ...systems.planning.passage import Passage
 from ...systems.planning.plan import PlanLayout
 from ..scenarios.scenario import Scenario

@@ -2,7 +2,7 @@
 
 A controller is any system with the input ports `X_WB` (7) and `V_WB_B` (6), the estimated state,
 and the output port `F_Bo_B` (6), the commanded wrench. An input port `health` receives the health
-of the estimate (`systems.estimation.delayed.health_names`); the controllers here command a zero
+of the estimate (`systems.estimation.state.health_names`); the controllers here command a zero
 wrench while it is lost (`systems.controllers.health_gate`).
 """
 

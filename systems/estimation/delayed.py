@@ -9,10 +9,8 @@ the preintegrated increment of the buffered samples (the predictor of Khosravian
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import accumulate
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,12 +20,14 @@ from jaxtyping import Array, Bool, Float
 from scipy.stats import chi2
 
 from ...models import se3
-from ...models.config.checks import Vector3, check_numbers, require
+from ...models.config.checks import require
 from ...models.sensors import Imu, Sensor
 from . import error_state, inertial, measurement
+from .config import EkfConfig
 from .error_state import Navigation
 from .inertial import Motion, Samples
-from .trust import Shown, Trust, counted, imu_off, judged, sizes, suspected, with_doubt
+from .state import FilterState, Readings
+from .trust import Shown, Trust, counted, imu_off, judged, pulls, sizes, suspected, with_doubt
 
 _SAMPLE = 7
 """Columns of a slot: has sample, force 3, mean rate 3 | has reading, values, for each sensor | rate
@@ -39,103 +39,6 @@ _OBSERVED = {
     "position": error_state.POSITION,
     "attitude": error_state.ROTATION,
 }
-
-
-def status_names(fused: Sequence[str]) -> tuple[str, ...]:
-    """Components of the status vector, given the names of the sensors that the filter fuses.
-
-    Time of the horizon (s), last NIS of each sensor, rejections in a row, and time since a reading
-    was last accepted (s).
-    """
-    kinds = ("nis", "rejected", "age")
-    return ("time", *(f"{kind}_{name}" for kind in kinds for name in fused))
-
-
-def health_names(fused: Sequence[str]) -> tuple[str, ...]:
-    """Components of the health vector, given the names of the sensors that the filter fuses.
-
-    0 good, 1 degraded, 2 lost; then 1 where a sensor is trusted.
-    """
-    return ("state", "imu", *fused)
-
-
-@dataclass(frozen=True)
-class EkfConfig:
-    """Initial covariance and gates of the filter; the sensors' configurations give their noises.
-
-    Attributes:
-        position_std: of the initial position in body axes (m).
-        attitude_std: of the initial attitude about the body axes (rad).
-        velocity_std: of the initial velocity in body axes (m/s).
-        imu_factor: the filter multiplies the IMU's noise densities by this factor. It covers
-            second-order errors such as bias times attitude error. Over 30 one-minute runs in calm
-            water the NEES of attitude is 3.4 ± 0.2 at 1 and that of velocity 2.5 ± 0.1 at 1.5; a
-            consistent filter has 3 (`spinndrift check estimator --only calm`, and
-            `tests/test_filtering.py` without a DVL).
-        horizon: longest latency of a reading (s).
-        gate: probability that a good reading passes the chi-square gate.
-        patience: number of consecutive rejections after which a sensor is judged. Either it is at
-            fault and left out until as many readings pass in a row, or the filter may have
-            diverged: then the covariance grows by the squared residual and the reading is fused
-            (`systems.estimation.trust`).
-        output_rate: estimates per second (Hz).
-        silence: time without an accepted reading after which a sensor is not trusted (s).
-        lost_velocity: standard deviation of velocity above which the state is lost (m/s).
-        lost_attitude: the same for roll, pitch and yaw (rad).
-    """
-
-    position_std: Vector3 = (0.02, 0.02, 0.02)
-    attitude_std: Vector3 = (0.01, 0.01, 0.03)
-    velocity_std: Vector3 = (0.02, 0.02, 0.02)
-    imu_factor: float = 1.2
-    horizon: float = 0.24
-    gate: float = 0.999
-    patience: int = 10
-    output_rate: float = 20.0
-    silence: float = 3.0
-    lost_velocity: float = 0.5
-    lost_attitude: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Check signs and ranges."""
-        check_numbers(self)
-        for field in ("position_std", "attitude_std", "velocity_std"):
-            require(min(getattr(self, field)) >= 0, self, field, "give zero or more")
-        above_zero = ("imu_factor", "horizon", "output_rate", "silence")
-        for field in (*above_zero, "lost_velocity", "lost_attitude"):
-            require(getattr(self, field) > 0, self, field, "give a number above zero")
-        require(0 < self.gate < 1, self, "gate", "give a share between 0 and 1")
-        require(self.patience >= 1, self, "patience", "give at least 1")
-
-
-class FilterState(NamedTuple):
-    """The filter's state."""
-
-    nominal: Navigation
-    P: Float[Array, "e e"]
-    ring: Float[Array, "slots row"]
-    since: Float[Array, "12"]
-    """Since the time of P: elapsed time, sums of force · dt and rate · dt, variances due to missing
-    forces and rates; and v_B at the time of P."""
-    samples: Samples
-    motion: Motion
-    shown: Shown
-    trust: Trust
-
-
-class Readings(NamedTuple):
-    """Sensor outputs at one time; the time of validity of a reading selects its slot."""
-
-    imu: Float[Array, "6"]
-    """Specific force (m/s²) and angular rate (rad/s) in the sensor's axes."""
-    aids: tuple[Float[Array, "_"], ...]
-    """[values, valid, time of validity (s)] of each other sensor."""
-
-    def joined(self) -> tuple[Float[Array, "m"], Bool[Array, "n"], Float[Array, "n"]]:
-        """Values, validity flags and times (s) of the sensors besides the IMU."""
-        values = jnp.concatenate([each[:-2] for each in self.aids])
-        marks = jnp.stack([each[-2] > 0 for each in self.aids])
-        return values, marks, jnp.stack([each[-1] for each in self.aids])
 
 
 class DelayedFilter(eqx.Module):
@@ -366,7 +269,7 @@ class DelayedFilter(eqx.Module):
         trust = counted(
             self.aids, trust, used, done.accepted, done.nis, plain_nis, gates, innovations, time
         )
-        pulled = self._pulled(trust.pulled @ F.T, done, together, used)
+        pulled = pulls(self.aids, trust.pulled @ F.T, done, together, used)
         trust = suspected(
             self.aids,
             trust,
@@ -384,18 +287,6 @@ class DelayedFilter(eqx.Module):
             since=jnp.concatenate([jnp.zeros(_SINCE, P.dtype), done.nominal.v_B]),
             trust=trust,
         )
-
-    def _pulled(
-        self,
-        pulled: Float[Array, "n e"],
-        done: measurement.Update,
-        found: measurement.Innovation,
-        used: Bool[Array, "n"],
-    ) -> Float[Array, "n e"]:
-        """The pulls after an update: a sensor's own correction adds, those of others reduce."""
-        own = np.repeat(np.eye(len(self.aids), dtype=bool), sizes(self.aids), axis=1)
-        read = jnp.where(used[:, None], found.residual[None], 0)
-        return pulled - jnp.where(own, read, pulled @ found.H.T) @ done.gain.T
 
     def _vouched_for(self, state: FilterState, time: Float[Array, ""]) -> Bool[Array, "n"]:
         """For each sensor, whether the IMU and another sensor are well."""
@@ -425,22 +316,10 @@ class DelayedFilter(eqx.Module):
         open_ = jnp.zeros_like(jnp.diag(P)).at[error_state.VELOCITY].set(gone[7])
         P = P + jnp.diag(open_.at[error_state.ROTATION].set(gone[8]))
         if not self.imu.integrating:
-            P = P + time / self.period * self._between_samples(state)
+            turn, force = state.samples.interpolation(self.period)
+            P = P.at[error_state.ROTATION, error_state.ROTATION].add(time / self.period * turn)
+            P = P.at[error_state.VELOCITY, error_state.VELOCITY].add(time / self.period * force)
         return F, (P + P.T) / 2
-
-    def _between_samples(self, state: FilterState) -> Float[Array, "e e"]:
-        """Covariance of the interpolation over a period T of an IMU that does not integrate.
-
-        Between two known values a Brownian rate of density σ² has an integral of variance
-        σ² T³ / 12, and second differences of variance 2 σ² T. Independent forces of variance s²
-        have second differences of variance 6 s² and add a variance of at most s² T² to velocity.
-        Second differences of smooth motion are near zero.
-        """
-        T = self.period
-        open_ = jnp.zeros_like(state.P)
-        turn, force = state.samples.bends[3:, 3:], state.samples.bends[:3, :3]
-        open_ = open_.at[error_state.ROTATION, error_state.ROTATION].set(turn * T**2 / 24)
-        return open_.at[error_state.VELOCITY, error_state.VELOCITY].set(force * T**2 / 6)
 
     def status(self, state: FilterState, k: Float[Array, ""]) -> Float[Array, "_"]:
         """The status vector after `step` number k; see `status_names`."""

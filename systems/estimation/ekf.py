@@ -18,9 +18,77 @@ from ..compiled.jit import VectorFunction
 from ..compiled.pure import Event, Inputs, Pure, State, shown
 from ..drake import group, set_groups, value_or_zeros
 from ..plant.learned_plant import check_state
-from .delayed import DelayedFilter, EkfConfig, FilterState, Readings, health_names, status_names
+from .config import EkfConfig
+from .delayed import DelayedFilter
+from .state import FilterState, Readings, health_names, status_names
 
 _WAITING = 6  # state group of the buffered samples, after the filter's own and the outputs'
+
+
+class _Flat:
+    """The filter's functions of flat vectors, as which Drake keeps its state."""
+
+    def __init__(self, core: DelayedFilter, X_WB: Array, V_WB_B: Array):
+        self.core, self.X_WB, self.V_WB_B = core, X_WB, V_WB_B
+        self.start, self.unravel = ravel_pytree(core.init(X_WB, V_WB_B))
+
+    def initialise(self, w: Array) -> tuple[Array, ...]:
+        """State and outputs at time 0, with an initial error of the noise `w`."""
+        error = self.core.deviations()[:9] * w
+        X = se3.retract(self.X_WB, error[:6])
+        V = self.V_WB_B + jnp.concatenate([error[6:], jnp.zeros(3, w.dtype)])
+        flat = ravel_pytree(self.core.init(X, V))[0]
+        return flat, *self.show(flat, jnp.zeros((), w.dtype))
+
+    def show(self, flat: Array, t: Array) -> tuple[Array, ...]:
+        """The outputs at time `t`: the newest sample is one period old."""
+        core, state = self.core, self.unravel(flat)
+        X, V, P = core.present(state, jnp.minimum(t, core.period))
+        k = jnp.round(t / core.period) - 1
+        return X, V, P.reshape(-1), core.status(state, k), core.health(state, P, k)
+
+    def take_in(self, flat: Array, *given: Array) -> tuple[Array, Array, Array]:
+        """`DelayedFilter.take_in` and the first `move`: state, slot that needs `fuse`, slots.
+
+        `given`: samples that wait, the newest one, outputs of the other sensors, its number.
+        """
+        waiting, newest, *shown, last = given
+        samples = jnp.concatenate([waiting, newest]).reshape(-1, 6)
+        marked = tuple(each.marked(x) for each, x in zip(self.core.aids, shown, strict=True))
+        readings = Readings(samples[-1], marked)
+        state, slots = self.core.take_in(self.unravel(flat), samples, readings, last[0])
+        state, at = self.core.move(state, slots, jnp.zeros_like(last[0]))
+        return ravel_pytree(state)[0], at, slots
+
+    def move(self, flat: Array, slots: Array, first: Array) -> tuple[Array, Array]:
+        """`DelayedFilter.move`."""
+        slots = slots.reshape(-1, self.core.slot)
+        state, at = self.core.move(self.unravel(flat), slots, first[0])
+        return ravel_pytree(state)[0], at
+
+    def fuse(self, flat: Array, slot: Array, k: Array) -> Array:
+        """`DelayedFilter.fuse`."""
+        return ravel_pytree(self.core.fuse(self.unravel(flat), slot, k[0]))[0]
+
+
+def _filter(
+    on_board: Mapping[str, Sensor], config: EkfConfig
+) -> tuple[DelayedFilter, dict[str, Sensor]]:
+    """The filter of the sensors, and those that it fuses besides the IMU."""
+    imu = on_board.get("imu")
+    aids = {name: each for name, each in on_board.items() if each.observes is not None}
+    if not (isinstance(imu, Imu) and aids):
+        raise UserError(
+            "sensing: the filter needs an IMU called `imu` and a sensor to fuse with it, such "
+            "as dvl, depth or compass; add one, or give a filter of your own (!OwnFilter)"
+        )
+    core = DelayedFilter(imu, tuple(aids.values()), config)
+    ratio = imu.rate / config.output_rate
+    if abs(ratio - round(ratio)) > 1e-6 or ratio < 1 - 1e-6:
+        raise ValueError(
+            f"output_rate {config.output_rate} Hz does not divide the IMU's {imu.rate} Hz"
+        )
+    return core, aids
 
 
 class Ekf(LeafSystem):
@@ -72,36 +140,23 @@ class Ekf(LeafSystem):
                 to fuse with it.
         """
         super().__init__()
-        config = config or EkfConfig()
-        imu = on_board.get("imu")
-        aids = {name: each for name, each in on_board.items() if each.observes is not None}
-        if not (isinstance(imu, Imu) and aids):
-            raise UserError(
-                "sensing: the filter needs an IMU called `imu` and a sensor to fuse with it, such "
-                "as dvl, depth or compass; add one, or give a filter of your own (!OwnFilter)"
-            )
-        core = DelayedFilter(imu, tuple(aids.values()), config)
-        ratio = core.imu.rate / config.output_rate
-        if abs(ratio - round(ratio)) > 1e-6 or ratio < 1 - 1e-6:
-            raise ValueError(
-                f"output_rate {config.output_rate} Hz does not divide the IMU's {core.imu.rate} Hz"
-            )
-        self.filter = core
+        self.filter, aids = _filter(on_board, config or EkfConfig())
+        core = self.filter
         X0 = np.array([1.0, 0, 0, 0, 0, 0, 0]) if X0_WB is None else X0_WB
         X0, V0 = check_state(X0, np.zeros(6) if V0_WB_B is None else V0_WB_B)
+        self._flat = flat = _Flat(core, jnp.asarray(X0), jnp.asarray(V0))
 
-        sizes = {"imu": imu.port_size} | {name: each.port_size for name, each in aids.items()}
+        sizes = {"imu": core.imu.port_size}
+        sizes |= {name: each.port_size for name, each in aids.items()}
         self._readings = [self.DeclareVectorInputPort(*item) for item in sizes.items()]
         gaussian = RandomDistribution.kGaussian
         self._initial_noise = self.DeclareVectorInputPort("initial_noise", 9, gaussian)
 
-        start, unravel = ravel_pytree(core.init(jnp.asarray(X0), jnp.asarray(V0)))
-        n = start.size
         outputs = {"X_WB": 7, "V_WB_B": 6, "covariance": core.errors**2}
         outputs |= {"status": len(status_names([*aids])), "health": len(health_names([*aids]))}
-        self._ratio, self._period = round(ratio), core.period
+        self._ratio, self._period = round(core.imu.rate / core.config.output_rate), core.period
         self._samples = core.samples_at_once(self._ratio)
-        self._filter = self.DeclareDiscreteState(BasicVector(np.asarray(start).tolist()))
+        self._filter = self.DeclareDiscreteState(BasicVector(np.asarray(flat.start).tolist()))
         self._outputs = [self.DeclareDiscreteState(size) for size in outputs.values()]
         self._waiting = self.DeclareDiscreteState(6 * (self._samples - 1))
         for name, index in zip(outputs, self._outputs, strict=True):
@@ -109,68 +164,35 @@ class Ekf(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._initialise)
         self.DeclarePeriodicDiscreteUpdateEvent(core.period, 0.0, self._update)
 
-        def initialise(w: Array) -> tuple[Array, ...]:
-            error = core.deviations()[:9] * w
-            X = se3.retract(jnp.asarray(X0), error[:6])
-            V = jnp.asarray(V0) + jnp.concatenate([error[6:], jnp.zeros(3, w.dtype)])
-            state = core.init(X, V)
-            return ravel_pytree(state)[0], *show(state, jnp.zeros((), w.dtype))
-
-        def show(state: FilterState, t: Array) -> tuple[Array, ...]:
-            # The newest sample is one period old.
-            X, V, P = core.present(state, jnp.minimum(t, core.period))
-            k = jnp.round(t / core.period) - 1
-            return X, V, P.reshape(-1), core.status(state, k), core.health(state, P, k)
-
-        def take_in(flat: Array, *given: Array) -> tuple[Array, Array, Array]:
-            waiting, newest, *shown, last = given
-            samples = jnp.concatenate([waiting, newest]).reshape(-1, 6)
-            marked = tuple(each.marked(x) for each, x in zip(core.aids, shown, strict=True))
-            readings = Readings(samples[-1], marked)
-            state, slots = core.take_in(unravel(flat), samples, readings, last[0])
-            state, at = core.move(state, slots, jnp.zeros_like(last[0]))
-            return ravel_pytree(state)[0], at, slots
-
-        def move(flat: Array, slots: Array, first: Array) -> tuple[Array, Array]:
-            state, at = core.move(unravel(flat), slots.reshape(-1, core.slot), first[0])
-            return ravel_pytree(state)[0], at
-
-        def fuse(flat: Array, slot: Array, k: Array) -> Array:
-            return ravel_pytree(core.fuse(unravel(flat), slot, k[0]))[0]
-
-        self._functions = take_in, move, fuse, show, unravel
-        results = list(outputs.values())
-        self._start = VectorFunction(initialise, [9], [n, *results])
+        n, m, results = flat.start.size, self._samples, list(outputs.values())
+        self._start = VectorFunction(flat.initialise, [9], [n, *results])
         # Several calls: XLA runs small programs inline and larger ones on its thread pool.
-        m = self._samples
         self._take_in = VectorFunction(
-            take_in, [n, 6 * (m - 1), *sizes.values(), 1], [n, 1, core.slot * m]
+            flat.take_in, [n, 6 * (m - 1), *sizes.values(), 1], [n, 1, core.slot * m]
         )
-        self._move = VectorFunction(move, [n, core.slot * m, 1], [n, 1])
-        self._fuse = VectorFunction(fuse, [n, core.slot, 1], [n])
-        self._show = VectorFunction(lambda x, t: show(unravel(x), t[0]), [n, 1], results)
+        self._move = VectorFunction(flat.move, [n, core.slot * m, 1], [n, 1])
+        self._fuse = VectorFunction(flat.fuse, [n, core.slot, 1], [n])
+        self._show = VectorFunction(lambda x, t: flat.show(x, t[0]), [n, 1], results)
 
     def filter_state(self, context: Context) -> FilterState:
         """The filter's state at its horizon, for inspection."""
-        core = self.filter
-        like = core.init(jnp.zeros(7), jnp.zeros(6))
-        return ravel_pytree(like)[1](jnp.asarray(group(context, self._filter)))
+        return self._flat.unravel(jnp.asarray(group(context, self._filter)))
 
     def pure(self) -> Pure:
         """The update as a pure function."""
-        take_in, move, fuse, show, unravel = self._functions
+        do = self._flat
         n, width = self._samples, self.filter.slot
         sizes = {port.get_name(): port.size() for port in self._readings}
 
         def step(state: State, given: list[Array], last: Array) -> Array:
             """The filter's state after the buffered samples and the present one."""
-            flat, at, slots = take_in(state[0], state[_WAITING], *given, last[None])
+            flat, at, slots = do.take_in(state[0], state[_WAITING], *given, last[None])
 
             def fuse_and_move(carry: tuple[Array, Array]) -> tuple[Array, Array]:
                 flat, at = carry
                 slot = jax.lax.dynamic_slice(slots.reshape(-1), (width * at.astype(int),), (width,))
-                flat = fuse(flat, slot, (last - n + 1 + at)[None])
-                return move(flat, slots, (at + 1)[None])  # no slot left at at = n
+                flat = do.fuse(flat, slot, (last - n + 1 + at)[None])
+                return do.move(flat, slots, (at + 1)[None])  # no slot left at at = n
 
             return jax.lax.while_loop(lambda carry: carry[1] < n, fuse_and_move, (flat, at))[0]
 
@@ -184,7 +206,7 @@ class Ekf(LeafSystem):
             flat = jax.lax.cond(phase > 0, lambda: state[0], lambda: step(state, given, tick - 1))
             told = jax.lax.cond(
                 jnp.mod(tick, self._ratio) == 0,
-                lambda: tuple(show(unravel(flat), t)),
+                lambda: do.show(flat, t),
                 lambda: tuple(state[1:_WAITING]),
             )
             return dict(enumerate([flat, *told, waiting]))

@@ -191,20 +191,23 @@ def transition(
     moment = T**3 / 12
     Q = Q.at[POSITION, POSITION].add(s_a * moment * eye)
     Q = Q.at[VELOCITY, VELOCITY].add(s_g * moment * (skew(g_B) @ skew(g_B).T))
-    walk = jnp.concatenate(
-        [
-            jnp.zeros(9, force.dtype),
-            jnp.full(3, imu.gyroscope_walk**2, force.dtype) * T,
-            jnp.full(3, imu.accelerometer_walk**2, force.dtype) * T,
-            *(
-                jnp.zeros(1, force.dtype)
-                if math.isinf(each.slow_error[1])
-                else (each.slow_error[0] ** 2 * (1 - r * r))[None]
-                for each, r in zip(aids, rho, strict=True)
-            ),
-        ]
+    return F, Q + jnp.diag(_walks(imu, aids, rho, T))
+
+
+def _walks(
+    imu: Imu, aids: Sequence[Sensor], rho: Sequence[Array], time: Float[Array, ""]
+) -> Float[Array, "e"]:
+    """Variances that biases and slow errors, which decay by `rho`, gain over a time (s)."""
+    dtype = time.dtype
+    slow = (
+        jnp.zeros(1, dtype)
+        if math.isinf(each.slow_error[1])
+        else (each.slow_error[0] ** 2 * (1 - r * r))[None]
+        for each, r in zip(aids, rho, strict=True)
     )
-    return F, Q + jnp.diag(walk)
+    gyroscope = jnp.full(3, imu.gyroscope_walk**2, dtype) * time
+    accelerometer = jnp.full(3, imu.accelerometer_walk**2, dtype) * time
+    return jnp.concatenate([jnp.zeros(9, dtype), gyroscope, accelerometer, *slow])
 
 
 def decays(aids: Sequence[Sensor], time: Float[Array, ""]) -> list[Float[Array, ""]]:

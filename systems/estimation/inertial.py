@@ -82,6 +82,16 @@ class Samples(NamedTuple):
         known = jnp.clip(self.count, 1, FEW)
         return jnp.concatenate([jnp.sum(self.forces, axis=0) / known, self.rates[-1]])
 
+    def interpolation(self, T: float) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
+        """Covariances of angle and velocity, interpolated over a period T of point samples.
+
+        Between two known values a Brownian rate of density σ² has an integral of variance
+        σ² T³ / 12, and second differences of variance 2 σ² T. Independent forces of variance s²
+        have second differences of variance 6 s² and add a variance of at most s² T² to velocity.
+        Second differences of smooth motion are near zero.
+        """
+        return self.bends[3:, 3:] * T**2 / 24, self.bends[:3, :3] * T**2 / 6
+
 
 class Motion(NamedTuple):
     """Statistics of the vehicle's motion, for the covariance of a missing sample."""
@@ -141,11 +151,8 @@ def take(
     fading = memory.rates[-1] * jnp.exp(-(memory.missing[1] + T) / _FADES)
     rate = jnp.where(good[1], rate, fading)
     force = se3.rotate(X_BS, sample[:3])
-    if any(imu.position):  # from the sensor's place to Bo
-        r = X_BS[4:]
-        spin = velocity_at(r, jnp.concatenate([jnp.zeros_like(rate), rate]))
-        turning = (rate - memory.rates[-1]) * imu.rate
-        force = force - se3.cross(rate, spin) - se3.cross(turning, r)
+    if any(imu.position):
+        force = _at_origin(force, X_BS[4:], rate, (rate - memory.rates[-1]) * imu.rate)
 
     # The sample's prediction error is compared with the standard deviation of such errors.
     step = jnp.concatenate([force, rate]) - memory.foreseen
@@ -178,6 +185,17 @@ def take(
     )
     row = jnp.concatenate([(number >= 1).astype(dtype)[None], force, mean, left_open])
     return jax.tree.map(lambda new, old: jnp.where(number >= 0, new, old), after, memory), row
+
+
+def _at_origin(
+    force: Float[Array, "3"],
+    place: Float[Array, "3"],
+    rate: Float[Array, "3"],
+    turning: Float[Array, "3"],
+) -> Float[Array, "3"]:
+    """The specific force at Bo, of that at a sensor's place, by angular rate and acceleration."""
+    spin = velocity_at(place, jnp.concatenate([jnp.zeros_like(rate), rate]))
+    return force - se3.cross(rate, spin) - se3.cross(turning, place)
 
 
 def _learn(

@@ -25,11 +25,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ...models.sensors import Imu, Sensor
 from .error_state import INERTIAL, POSITION
-from .measurement import small_inverse
+from .measurement import Innovation, Update, small_inverse
 
 _STUCK_TOGETHER = 2  # repeats of all values of a sensor with several
 _OFF = 20.0  # bound on the IMU's error, in standard deviations of its bias
@@ -282,6 +283,19 @@ def suspected(
     of_others = jnp.where(came, 1 - 1 / _RECENT, 1)[:, None]
     fades = jnp.where(trust.suspect(time)[:, None], fades, of_others)
     return trust._replace(pulled=pulled * fades)
+
+
+def pulls(
+    aids: Sequence[Sensor],
+    pulled: Float[Array, "n e"],
+    done: Update,
+    found: Innovation,
+    used: Bool[Array, "n"],
+) -> Float[Array, "n e"]:
+    """The pulls after an update: a sensor's own correction adds, those of others reduce."""
+    own = np.repeat(np.eye(len(aids), dtype=bool), sizes(aids), axis=1)
+    read = jnp.where(used[:, None], found.residual[None], 0)
+    return pulled - jnp.where(own, read, pulled @ found.H.T) @ done.gain.T
 
 
 def with_doubt(

@@ -93,62 +93,37 @@ class MppiConfig:
         check_numbers(self)
         for name in ("horizon", "sequences", "realisations", "shown_paths", "threads"):
             require(getattr(self, name) >= 1, self, name, "give a whole number of 1 or more")
-        require(
-            self.substeps is None or self.substeps >= 1,
-            self,
-            "substeps",
-            "give a whole number of 1 or more, or null",
-        )
+        for name in ("dt", "period", "margin", "clearance_std"):
+            require(getattr(self, name) > 0, self, name, "give a number above zero")
+        for name in ("terminal_time", "effort_weight", "rate_weight", "margin_weight"):
+            require(getattr(self, name) >= 0, self, name, "give zero or more")
+        for name in ("wrench_fraction", "smallest_noise", "cvar_part"):
+            require(0 < getattr(self, name) <= 1, self, name, "give a part in (0, 1]")
+        require(self.risk_weight >= 0, self, "risk_weight", "give zero or more")
+        risk = self.collision_risk
+        remedy = "give a probability in (0, 1), or null"
+        require(risk is None or 0 < risk < 1, self, "collision_risk", remedy)
+        self._check_sampling()
+
+    def _check_sampling(self) -> None:
+        """Check how sequences and their realisations are drawn and stepped."""
+        whole = "give a whole number of 1 or more, or null"
+        require(self.substeps is None or self.substeps >= 1, self, "substeps", whole)
         even = self.realisations == 1 or self.realisations % 2 == 0
         require(even, self, "realisations", "give 1 or an even number")
-        positive = (
-            "dt",
-            "period",
-            "smallest_noise",
-            "effective_samples",
-            "margin",
-            "clearance_std",
-        )
-        for name in positive:
-            require(getattr(self, name) > 0, self, name, "give a number above zero")
-        for name in (
-            "terminal_time",
-            "effort_weight",
-            "rate_weight",
-            "margin_weight",
-            "risk_weight",
-        ):
-            require(getattr(self, name) >= 0, self, name, "give zero or more")
         require(min(self.noise) >= 0, self, "noise", "give six numbers of zero or more")
-        require(
-            bool(self.knots) and min(self.knots) >= 1, self, "knots", "give counts of 1 or more"
-        )
-        require(
-            max(self.knots) <= self.horizon, self, "knots", "give no more pieces than `horizon`"
-        )
-        require(0 < self.wrench_fraction <= 1, self, "wrench_fraction", "give a part in (0, 1]")
-        require(self.smallest_noise <= 1, self, "smallest_noise", "give a part in (0, 1]")
-        require(0 < self.cvar_part <= 1, self, "cvar_part", "give a part in (0, 1]")
-        require(
-            self.effective_samples < self.sequences,
-            self,
-            "effective_samples",
-            "give fewer than `sequences`",
-        )
+        some = bool(self.knots) and min(self.knots) >= 1
+        require(some, self, "knots", "give counts of 1 or more")
+        pieces = max(self.knots) <= self.horizon
+        require(pieces, self, "knots", "give no more pieces than `horizon`")
+        samples = self.effective_samples
+        require(samples > 0, self, "effective_samples", "give a number above zero")
+        fewer = samples < self.sequences
+        require(fewer, self, "effective_samples", "give fewer than `sequences`")
         require(self.threads <= self.sequences, self, "threads", "give no more than `sequences`")
-        require(
-            self.collision_risk is None or 0 < self.collision_risk < 1,
-            self,
-            "collision_risk",
-            "give a probability in (0, 1), or null",
-        )
         shift = self.period / self.dt
-        require(
-            abs(shift - round(shift)) < 1e-6 and round(shift) >= 1,
-            self,
-            "period",
-            f"give a multiple of dt = {self.dt}",
-        )
+        multiple = abs(shift - round(shift)) < 1e-6 and round(shift) >= 1
+        require(multiple, self, "period", f"give a multiple of dt = {self.dt}")
 
     def with_substeps_of(self, metadata: Mapping[str, Any]) -> "MppiConfig":
         """These settings with the steps that a checkpoint's metadata names, unless given here."""

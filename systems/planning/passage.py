@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import label
 from scipy.special import ndtr
 
@@ -71,8 +71,8 @@ def widest_way(
         return np.inf
     low_z = max(bed, min(start[2], goal[2]) - _REACH)
     high_z = max(low_z + 1e-3, min(0.0, max(start[2], goal[2]) + _REACH))
-    ends = np.array([(p.bottom, p.top) for p in pylons])
-    levels = np.unique(np.clip([*ends.ravel(), low_z, high_z], low_z, high_z))
+    ends = [z for p in pylons for z in (p.bottom, p.top)]
+    levels = np.unique(np.clip([*ends, low_z, high_z], low_z, high_z))
     slabs = list(pairwise(levels))
     x, y, radius = np.array([(p.x, p.y, p.diameter / 2) for p in pylons]).T
     hull, about = min(size[:2]) / 2, _ABOUT + max(size[:2])
@@ -83,14 +83,7 @@ def widest_way(
     xs, ys = (np.arange(a, b + cell, cell) for a, b in zip(low, high, strict=True))
     X, Y = np.meshgrid(xs, ys, indexing="ij")
 
-    around = np.full((len(slabs), *X.shape), np.inf)
-    for i in range(len(pylons)):
-        beside = np.hypot(X - x[i], Y - y[i]) - radius[i] - hull + cell / np.sqrt(2)
-        for k, (bottom, top) in enumerate(slabs):
-            past = float(max(top - ends[i, 1], ends[i, 0] - bottom)) - size[2] / 2
-            if ends[i, 0] <= bottom and ends[i, 1] >= top:
-                past = -np.inf
-            around[k] = np.minimum(around[k], _signed(beside, past))
+    around = _clearances(pylons, slabs, X, Y, size, cell)
 
     def near(point: np.ndarray, reach: float) -> np.ndarray:
         """Cells with a point within `reach` of the given one, and the cell that contains it."""
@@ -105,12 +98,22 @@ def widest_way(
         at_start = near(start, missing)
     at_goal = near(goal, goal_radius)
 
+    return _widest(around, at_start, at_goal, -hull - float(radius.max()))
+
+
+def _widest(
+    around: Float[np.ndarray, "slab x y"],
+    at_start: Bool[np.ndarray, "slab x y"],
+    at_goal: Bool[np.ndarray, "slab x y"],
+    worst: float,
+) -> float:
+    """Largest minimum of the cells' clearance (m) along a path, at least `worst`, by bisection."""
+
     def passes(clearance: float) -> bool:
         parts: Any = label(around >= clearance, structure=_NEIGHBOURS)
         parts = parts[0]
         return bool(np.intersect1d(parts[at_start & (parts > 0)], parts[at_goal]).size)
 
-    worst = -hull - float(radius.max())
     best = min(around[at_start].max(), around[at_goal].max())
     if passes(best):
         return float(best)
@@ -118,6 +121,26 @@ def widest_way(
         middle = (worst + best) / 2
         worst, best = (middle, best) if passes(middle) else (worst, middle)
     return best
+
+
+def _clearances(
+    pylons: Sequence[Pylon],
+    slabs: Sequence[tuple[float, float]],
+    X: Float[np.ndarray, "x y"],
+    Y: Float[np.ndarray, "x y"],
+    size: tuple[float, float, float],
+    cell: float,
+) -> Float[np.ndarray, "slab x y"]:
+    """Upper bound on the clearance (m) of the upright cylinder in each cell of each slab."""
+    around = np.full((len(slabs), *X.shape), np.inf)
+    for p in pylons:
+        gap = np.hypot(X - p.x, Y - p.y) - p.diameter / 2 - min(size[:2]) / 2
+        for k, (bottom, top) in enumerate(slabs):
+            past = float(max(top - p.top, p.bottom - bottom)) - size[2] / 2
+            if p.bottom <= bottom and p.top >= top:
+                past = -np.inf
+            around[k] = np.minimum(around[k], _signed(gap + cell / np.sqrt(2), past))
+    return around
 
 
 def upright_gap(

@@ -1,6 +1,7 @@
 """The vehicle's sensors as one system, each with its own rate."""
 
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice, pairwise
@@ -99,42 +100,7 @@ class SensorSuite(LeafSystem):
             [s.state_size for s in sensors],
         )
         self.DeclareInitializationDiscreteUpdateEvent(self._initialise)
-        ends = np.cumsum([0, *sizes, *fault_sizes])
-        draws = [slice(a, b) for a, b in pairwise(ends)]
-        memories = iter(range(2 * count, len(groups)))
-
-        def measured(i: int) -> _Part:
-            """A sensor's measurement; a late sensor's is output separately, after its latency."""
-            part, sensor = shown[i], sensors[i]
-            memory = (next(memories),) if part.faults and not sensor.late else ()
-
-            def measure(motion: Motion, t: Array, w: Array, state: Array, *kept: Array) -> Outputs:
-                state = sensor.measure(state, *motion, t, w[draws[i]])
-                if sensor.late:
-                    return (state,)
-                reading = sensor.reading(state, t)
-                if sensor.port_size > reading.size:  # with a validity flag and its time
-                    reading = jnp.concatenate([reading, jnp.stack([jnp.ones_like(t), t])])
-                return state, *part.show(reading, t, w[draws[count + i]], *kept)
-
-            writes = (i,) if sensor.late else (i, count + i, *memory)
-            return _Part(sensor.rate, measure, (i, *memory), writes)
-
-        def appears(i: int) -> _Part:
-            part, sensor = shown[i], sensors[i]
-            memory = (next(memories),) if part.faults else ()
-
-            def appear(motion: Motion, t: Array, w: Array, state: Array, *kept: Array) -> Outputs:
-                del motion
-                return part.show_held(sensor.reading(state, t), w[draws[count + i]], *kept)
-
-            held = count + i
-            return _Part(base, appear, (i, *((held, *memory) if memory else ())), (held, *memory))
-
-        parts: list[_Part] = []
-        for i, sensor in enumerate(sensors):
-            parts += [appears(i), measured(i)] if sensor.late else [measured(i)]
-        self._parts = parts
+        self._parts = parts = _parts(shown)
         # Sensors whose period is a multiple of the IMU's share its events and compiled calls.
         shared = [part for part in parts if _divides(part.rate, base)]
         self._declare(shared)
@@ -230,6 +196,25 @@ class _Part:
     writes: tuple[int, ...]
 
 
+def _parts(shown: Sequence["_Shown"]) -> list[_Part]:
+    """The updates of all sensors.
+
+    State groups are the sensors' states, their outputs, and the memories of those with faults; the
+    noise is that of the sensors, then that of their faults.
+    """
+    count, parts = len(shown), []
+    sizes = [*(each.sensor.noise_size for each in shown), *(each.noise_size for each in shown)]
+    draws = [slice(a, b) for a, b in pairwise(np.cumsum([0, *sizes]))]
+    memories = itertools.count(2 * count)
+    for i, each in enumerate(shown):
+        memory = (next(memories),) if each.faults else ()
+        groups, noise = (i, count + i, *memory), (draws[i], draws[count + i])
+        if each.sensor.late:
+            parts.append(each.appears(shown[0].sensor.rate, groups, noise[1]))
+        parts.append(each.measured(groups, noise))
+    return parts
+
+
 def _divides(rate: float, of: float) -> bool:
     ratio = of / rate
     return ratio > 0.5 and abs(ratio - round(ratio)) < 1e-9 * ratio
@@ -260,6 +245,35 @@ class _Shown:
         """Size of the faults' memory; a late sensor's includes its last held reading."""
         held = self.sensor.reading_size if self.sensor.late else 0
         return held + self._faulty.memory_size
+
+    def measured(self, groups: tuple[int, ...], noise: tuple[slice, slice]) -> _Part:
+        """The measurement; a late sensor's is output separately, after its latency."""
+        sensor, (state, output, *memory) = self.sensor, groups
+        own, of_faults = noise
+
+        def measure(motion: Motion, t: Array, w: Array, state: Array, *kept: Array) -> Outputs:
+            state = sensor.measure(state, *motion, t, w[own])
+            if sensor.late:
+                return (state,)
+            reading = sensor.reading(state, t)
+            if sensor.port_size > reading.size:  # with a validity flag and its time
+                reading = jnp.concatenate([reading, jnp.stack([jnp.ones_like(t), t])])
+            return state, *self.show(reading, t, w[of_faults], *kept)
+
+        if sensor.late:
+            return _Part(sensor.rate, measure, (state,), (state,))
+        return _Part(sensor.rate, measure, (state, *memory), (state, output, *memory))
+
+    def appears(self, rate: float, groups: tuple[int, ...], noise: slice) -> _Part:
+        """The output of a late sensor's newest reading, at `rate`."""
+        state, output, *memory = groups
+
+        def appear(motion: Motion, t: Array, w: Array, state: Array, *kept: Array) -> Outputs:
+            del motion
+            return self.show_held(self.sensor.reading(state, t), w[noise], *kept)
+
+        held = (output, *memory) if memory else ()
+        return _Part(rate, appear, (state, *held), (output, *memory))
 
     def show(self, reading: Array, t: Array, w: Array, *memory: Array) -> Outputs:
         """The output for a reading measured at t, and the faults' memory if there are any."""

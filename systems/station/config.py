@@ -18,7 +18,7 @@ from ...models.sensors import SHIPPED, Compass, DepthSensor, Dvl, Imu, Sensor, S
 from ...models.sensors import Kind as SensorKind
 from ...models.spinn import Spinn
 from ...models.vehicles.vehicle import Vehicle, load_vehicle
-from ..estimation.delayed import EkfConfig
+from ..estimation.config import EkfConfig
 from ..own import Offered, OwnFilter, OwnSensor
 from ..planning.obstacles import Pylon
 from ..planning.paths import PoseConfig

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from ....models.effects.following import FOLLOWERS
 from ....models.effects.unknown import MOTION, Unknown, powers
 from ....models.se3 import AXES, TWIST
+from ..data.arrays import Data
 from ..filter.problem import DiagnosisProblem, Evaluation
 from .structures import Group, Matched, Screen
 
@@ -260,14 +261,6 @@ def refined(screen: Screen, found: Matched, rng: np.random.Generator) -> Unknown
 def described(effect: Unknown, weights: np.ndarray, problem: DiagnosisProblem) -> dict[str, Any]:
     """Variables, one sentence, lag, frequency and region of what was matched."""
     d = problem.data
-    exists = d.weight > 0
-    heading = np.arctan2(
-        2 * (d.X[:-1, 0] * d.X[:-1, 3] + d.X[:-1, 1] * d.X[:-1, 2]),
-        1 - 2 * (d.X[:-1, 2] ** 2 + d.X[:-1, 3] ** 2),
-    )
-    seen = {n: d.V[:-1, i] for i, n in enumerate(TWIST)}
-    seen |= {"x": d.X[:-1, 4], "y": d.X[:-1, 5], "z": d.X[:-1, 6], "heading": heading}
-    seen |= {f"f{k + 1}": d.u[:, k] for k in range(d.u.shape[1])}
     lag = frequency = None
     where = effect.acts_on
     variables: Sequence[str] = _VARIABLES.get(effect.kind, ())
@@ -310,12 +303,24 @@ def described(effect: Unknown, weights: np.ndarray, problem: DiagnosisProblem) -
         description = (
             f"{what} that depends on the place in W (x, y), largest near ({x:.1f}, {y:.1f}) m"
         )
+    return {
+        "acts_on": where, "variables": list(variables), "description": description, "lag": lag,
+        "frequency": frequency or None, "region": _region(variables, d),
+    }  # fmt: skip
+
+
+def _region(variables: Sequence[str], d: Data) -> dict[str, tuple[float, float]]:
+    """Where the data lie: the 2nd and 98th percentiles of each variable."""
+    heading = np.arctan2(
+        2 * (d.X[:-1, 0] * d.X[:-1, 3] + d.X[:-1, 1] * d.X[:-1, 2]),
+        1 - 2 * (d.X[:-1, 2] ** 2 + d.X[:-1, 3] ** 2),
+    )
+    seen = {n: d.V[:-1, i] for i, n in enumerate(TWIST)}
+    seen |= {"x": d.X[:-1, 4], "y": d.X[:-1, 5], "z": d.X[:-1, 6], "heading": heading}
+    seen |= {f"f{k + 1}": d.u[:, k] for k in range(d.u.shape[1])}
     region = {}
     for name in variables:
         if name in seen:
-            low, high = np.percentile(seen[name][exists], (2, 98))
+            low, high = np.percentile(seen[name][d.weight > 0], (2, 98))
             region[name] = (float(low), float(high))
-    return {
-        "acts_on": where, "variables": list(variables), "description": description, "lag": lag,
-        "frequency": frequency or None, "region": region,
-    }  # fmt: skip
+    return region

@@ -1,0 +1,59 @@
+"""State and inputs of the delayed filter, and the names of its outputs."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .error_state import Navigation
+from .inertial import Motion, Samples
+from .trust import Shown, Trust
+
+
+class FilterState(NamedTuple):
+    """The filter's state."""
+
+    nominal: Navigation
+    P: Float[Array, "e e"]
+    ring: Float[Array, "slots row"]
+    since: Float[Array, "12"]
+    """Since the time of P: elapsed time, sums of force · dt and rate · dt, variances due to missing
+    forces and rates; and v_B at the time of P."""
+    samples: Samples
+    motion: Motion
+    shown: Shown
+    trust: Trust
+
+
+class Readings(NamedTuple):
+    """Sensor outputs at one time; the time of validity of a reading selects its slot."""
+
+    imu: Float[Array, "6"]
+    """Specific force (m/s²) and angular rate (rad/s) in the sensor's axes."""
+    aids: tuple[Float[Array, "_"], ...]
+    """[values, valid, time of validity (s)] of each other sensor."""
+
+    def joined(self) -> tuple[Float[Array, "m"], Bool[Array, "n"], Float[Array, "n"]]:
+        """Values, validity flags and times (s) of the sensors besides the IMU."""
+        values = jnp.concatenate([each[:-2] for each in self.aids])
+        marks = jnp.stack([each[-2] > 0 for each in self.aids])
+        return values, marks, jnp.stack([each[-1] for each in self.aids])
+
+
+def status_names(fused: Sequence[str]) -> tuple[str, ...]:
+    """Components of the status vector, given the names of the sensors that the filter fuses.
+
+    Time of the horizon (s), last NIS of each sensor, rejections in a row, and time since a reading
+    was last accepted (s).
+    """
+    kinds = ("nis", "rejected", "age")
+    return ("time", *(f"{kind}_{name}" for kind in kinds for name in fused))
+
+
+def health_names(fused: Sequence[str]) -> tuple[str, ...]:
+    """Components of the health vector, given the names of the sensors that the filter fuses.
+
+    0 good, 1 degraded, 2 lost; then 1 where a sensor is trusted.
+    """
+    return ("state", "imu", *fused)

@@ -33,34 +33,21 @@ from spinndrift.training.diagnosis.filter.noise import (
 )
 from spinndrift.training.diagnosis.filter.sensitivities import whitened_sensitivities
 from spinndrift.training.diagnosis.filter.transition import Transition
-from spinndrift.training.diagnosis.findings.reported import (
-    following,
-    noise_levels,
-    residual,
-    sentence,
-    verdict,
-    with_coefficients_off,
-)
+from spinndrift.training.diagnosis.findings.reported import following, noise_levels, residual
 from spinndrift.training.diagnosis.findings.result import (
     AxisResidual,
     Cause,
     Diagnosis,
-    Interval,
-    Ratio,
     Support,
-    Value,
     schema,
 )
-from spinndrift.training.diagnosis.pipeline import (
-    DiagnoseConfig,
-    Diagnoser,
-    best_gain,
-    coefficients_are_off,
-)
+from spinndrift.training.diagnosis.findings.sentences import sentence, verdict
+from spinndrift.training.diagnosis.pipeline import DiagnoseConfig, Diagnoser
 from spinndrift.training.diagnosis.selection.hypotheses import Fit
 from spinndrift.training.diagnosis.selection.model_selection import admissible, choose, is_itself
 from spinndrift.training.diagnosis.selection.search import Search
 from spinndrift.training.diagnosis.selection.state import Selection
+from spinndrift.training.diagnosis.validation.claims import clearly_better, vetoes
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(runs=2, seconds=6.0)
@@ -250,26 +237,16 @@ def test_a_lag_is_named_measured_and_extended(tmp_path):
     z, _, _ = at_ends(finding, finding.simulated["extended"])
     assert np.sqrt((z**2).mean()) == pytest.approx(1, abs=0.15)
     assert (at_ends(finding, finding.simulated["base"])[0] ** 2).mean() > (z**2).mean()
-    assert not coefficients_are_off(d)
-    assert best_gain(d) == d.gain["extended"].log_score_gain.value
-    # what a belief that is wrong in most coefficients shows: no name, and a refit that tells
-    refit = replace(d.gain["refitted"], log_score_gain=Interval(5.0, (4.0, 6.0)))
-    nothing = replace(d, causes=[], gain={"base": d.gain["base"], "refitted": refit})
-    assert coefficients_are_off(nothing)
-    assert coefficients_are_off(replace(d, causes=4 * d.causes))
-    off = [("linear_drag", 0.1, 0.2), ("quadratic_drag", 9.0, 3.0), ("quadratic_drag", 8.0, 2.0),
-           ("inertia", 1.0, 1.0)]  # fmt: skip
-    ratios = [
-        Ratio(name, "surge", believed, Value(found, "1", (0.9 * found, 1.1 * found)))
-        for name, found, believed in off
-    ]
-    said = with_coefficients_off(replace(nothing, ratios=ratios, verdict="adequate"))
-    assert said.verdict == "explained"
-    assert "quadratic_drag of surge 8 (believed: 2); linear_drag" in said.sentence
-    assert "inertia of" not in said.sentence
-    turned = Ratio("thrust", "heave", 3.0, Value(-3.0, "m/s²", (-3.1, -2.9)))
-    said = with_coefficients_off(replace(nothing, ratios=[*ratios, turned]))
-    assert "the most: thrust of heave -3 m/s² (believed: 3); quadratic_drag" in said.sentence
+    # the claim holds on left-out data, and would not hold of the belief
+    assert d.left == []
+    assert d.sentence.endswith("of the forecast error.")
+    assert all(0 < share.value < 1 for share in d.explained.values())
+    assert finding.asserted is finding.judged["extended"]
+    assert clearly_better(finding.judged["extended"], finding.judged["base"], 0)
+    at = list(d.explained)
+    rivals = {"base": finding.judged["base"], "refitted": finding.judged["extended"]}
+    (told,) = vetoes(rivals, "base", at, {}, 0)
+    assert told.startswith("refitted coefficients forecast")
 
 
 def check(value, rule, root=None):

@@ -51,7 +51,7 @@ class Diagnose:
     (`scales`), added mass, drag and buoyancy (`linear`), drag, buoyancy and the scale of each axis'
     command, where commands pass through gains that are not known (`command`), or all of a grey box
     (these, the thrusters' curve, dead band and levers, restoring moment), for a belief that is
-    wrong in most of them. `auto` fits none, or all if that explains clearly more than names."""
+    wrong in most of them. `auto` fits none, or all where left-out data refuse the names."""
     water_density: Annotated[float | None, WATER_DENSITY] = None
     """kg/m³, if a log's autopilot assumed fresh water in the sea (as in `spinndrift import`)."""
     accept: tuple[str, ...] = ()

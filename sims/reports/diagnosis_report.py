@@ -22,7 +22,7 @@ from .pages import Page
 _LEFT_OUT = {
     "scenario": "Each model and its noise levels were fitted without the scenario it is judged on.",
     "run": "There is one scenario: each model was fitted without the runs that it is judged on.",
-    "block": "There is one run: each model was fitted without the stretch that it is judged on.",
+    "block": "There are few runs: each model was fitted without the stretch that it is judged on.",
     "nothing": "Nothing could be left out: the models are judged on what they were fitted to.",
 }
 _UNITS = (
@@ -30,9 +30,9 @@ _UNITS = (
     "own, which hold some of its errors, a wrong belief would look like noise."
 )
 _VERDICTS = {
-    "adequate": "the data show no difference",
+    "adequate": "left-out data show no difference of a practical size",
     "explained": "named causes or coefficients explain every difference that the data show",
-    "partly_explained": "named causes, and structure or errors that no cause explains",
+    "partly_explained": "named causes or coefficients, and errors that they do not explain",
     "unexplained": "structure or errors that no cause explains",
 }
 _NOISE = {
@@ -40,6 +40,8 @@ _NOISE = {
     "attitude_rad": "of attitudes / rad",
     "velocity_m_s": "of velocities / (m/s)",
     "rate_rad_s": "of turning rates / (rad/s)",
+    "slip_position": "of an estimator: drift of positions / (m/√s)",
+    "slip_attitude": "of an estimator: drift of attitudes / (rad/√s)",
 }
 _WORDS = {
     "nat": "Unit of log likelihood: what wins n nats makes the data eⁿ times as likely. Won on "
@@ -79,6 +81,8 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
     )
     for problem in d.data.problems:
         page.text(f"**Data:** {problem}")
+    for one in d.left:
+        page.text(f"**Left:** {one}.")
     _add_causes(page, d)
     _add_coefficients(page, d)
     _add_experiments(page, finding)

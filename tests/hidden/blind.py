@@ -46,16 +46,31 @@ DATA: dict[str, Callable[[Plan], Plan]] = {
     "fast": lambda plan: replace(plan, rate=50.0),
     "long": lambda plan: replace(plan, scenarios=10, runs=1, seconds=60.0, loop="closed"),
     "pwm": lambda plan: replace(plan, form="pwm"),
+    "stretches": lambda plan: replace(
+        plan, scenarios=4, runs=1, seconds=60.0, rate=50.0, dead_reckoned=True
+    ),
+    "flights": lambda plan: replace(
+        plan, scenarios=3, runs=1, seconds=90.0, loop="closed", dead_reckoned=True
+    ),
     **dict.fromkeys(("calm", "exact", "coarse"), lambda plan: plan),
 }
 """How it is recorded: commands played, a pilot in closed loop, uneven time steps, 60 s in all, at
-10 or 50 Hz, a pilot's runs of a minute each, commands as PWM with each run's voltage; `NOISE`."""
+10 or 50 Hz, a pilot's runs of a minute each, commands as PWM with each run's voltage; the real form
+(four stretches of 60 s at 50 Hz, or a pilot's three of 90 s, through an estimator); `NOISE`."""
+ESTIMATED = Noise(
+    velocity=0.012, attitude=0.0035, position=0.0, velocity_memory=0.8, attitude_memory=3.0
+)
+"""Errors of an estimator: 1.2 cm/s with a memory of 0.8 s, 0.2° with one of 3 s."""
 NOISE = {
     "calm": Noise(diffusion=tuple(0.05 * b for b in Noise().diffusion)),
     "exact": Noise(velocity=0.0, rate=0.0, attitude=0.0, position=0.0),
     "coarse": Noise(velocity=0.02, rate=0.004, attitude=0.007, position=0.02),
+    "stretches": ESTIMATED,
+    "flights": ESTIMATED,
 }
-"""Hardly a disturbance, nothing but it, and instruments four times as noisy."""
+"""Hardly a disturbance, nothing but it, instruments four times as noisy, and an estimator."""
+REAL = ("stretches", "flights")
+"""Data in the form of real logs; their users know no diffusion."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +110,7 @@ class Blind:
             "size": self.size,
             "data": self.data,
             "causes": [told(e) for e in case.effects],
-            "diffusion": list(case.noise.diffusion),
+            "diffusion": [] if self.data in REAL else list(case.noise.diffusion),
             "every": every(case),
             "problems": problems,
             "limits": limits,

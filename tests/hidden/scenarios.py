@@ -260,7 +260,7 @@ class Pilot:
         """Offsets from the start in the start's heading, m and rad (6, B): sines and steps."""
         s = max(t - REST, 0.0)
         sines = np.sum(self.size * np.sin(2 * np.pi * self.frequency * s), axis=1)
-        n = np.sum(self.edges < s, axis=1)
+        n = np.minimum(np.sum(self.edges < s, axis=1), self.levels.shape[1] - 1)
         steps = np.take_along_axis(self.levels, n[:, None], axis=1)[:, 0]
         return sines + np.where(n > 0, steps, 0.0)
 

@@ -24,7 +24,7 @@ class Noise:
     """White wrench b (N√s, N·m√s) and standard deviations of what is measured.
 
     DVL 5 mm/s; gyro as the ICM-20602 at 20 Hz (7e-5 rad/s/√Hz and motion); attitude 0.1°;
-    position 5 mm.
+    position 5 mm. Errors of an estimator have a memory (s): Gauss–Markov, of velocity and attitude.
     """
 
     diffusion: tuple[float, ...] = (1.0, 1.0, 1.0, 0.03, 0.03, 0.03)
@@ -32,6 +32,8 @@ class Noise:
     rate: float = 0.001
     attitude: float = 0.0017
     position: float = 0.005
+    velocity_memory: float = 0.0
+    attitude_memory: float = 0.0
 
     @staticmethod
     def none() -> "Noise":
@@ -88,6 +90,15 @@ def streams(seed: int | Sequence[int], name: int) -> np.random.Generator:
     return np.random.default_rng([*np.atleast_1d(seed).tolist(), name])
 
 
+def remembered(white: np.ndarray, memory: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Gauss–Markov errors of the same variance as white ones (N, k, B), at times t (N, B)."""
+    found = white.copy()
+    for n in range(1, len(t)):
+        kept = np.exp(-(t[n] - t[n - 1]) / memory[:, None])
+        found[n] = kept * found[n - 1] + np.sqrt(1 - kept**2) * white[n]
+    return found
+
+
 def simulate(
     setup: Setup,
     effects: Sequence[Effect] = (),
@@ -111,6 +122,8 @@ def simulate(
     white, instruments = streams(seed, 1), streams(seed, 2)
     sizes = (noise.position, noise.attitude, noise.velocity, noise.rate)
     errors = np.repeat(sizes, 3)[:, None] * instruments.standard_normal((N, 12, B))
+    memory = np.repeat([0.0, noise.attitude_memory, noise.velocity_memory, 0.0], 3)
+    errors[:, memory > 0] = remembered(errors[:, memory > 0], memory[memory > 0], samples * h)
 
     y = np.zeros((plant.size, B))
     y[:3], y[3:7], y[7:13] = setup.p0, setup.q0, setup.nu0

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from ...models.effects.base import Effect
 from ...models.effects.unknown import Unknown
 from .candidates.unknowns import (
@@ -17,7 +19,7 @@ from .filter.problem import DiagnosisProblem, Evaluation
 from .findings import reported, result
 from .findings.experiments import experiments
 from .selection.hypotheses import Fit
-from .selection.model_selection import Hypothesis
+from .selection.model_selection import Hypothesis, parameters_of
 from .selection.search import Refit, Search, refitted
 from .selection.state import Selection
 
@@ -115,10 +117,65 @@ def reported_causes(
     following = experiments(problem, final, found.accepted, nuisance)
     return [
         reported.cause(
-            a, problem, final, joint, following[a.hypothesis], structures.get(a.hypothesis)
+            a.apart_from(found.hypotheses),
+            problem,
+            final,
+            joint,
+            following[a.hypothesis],
+            structures.get(a.hypothesis),
         )
         for a in found.accepted
     ]
+
+
+JointFit = tuple[np.ndarray, Evaluation, Fit | None]
+"""θ, its evaluation, and the fit; None without parameters."""
+
+
+def supported(
+    found: Selection,
+    nuisance: Sequence[int],
+    rows: list[int],
+    together: Callable[[Selection, list[int]], JointFit],
+) -> tuple[Selection, list[int], JointFit]:
+    """The causes that a joint fit bears out, all parameters, and the fit."""
+    problem, fit = found.problem, together(found, rows)
+    while dropped := _unsupported(found, fit):
+        theta = found.current.theta.copy()
+        theta[parameters_of(problem.library, dropped)] = 0.0
+        kept = tuple(a for a in found.accepted if a.hypothesis not in dropped)
+        found = found.at(problem.evaluate(theta), accepted=kept)
+        rows = reported.joint_rows(found, nuisance, problem)
+        fit = together(found, rows)
+    return found, rows, fit
+
+
+def _unsupported(found: Selection, fit: JointFit) -> list[Hypothesis]:
+    """Causes that the joint fit does not bear out.
+
+    Every interval includes no effect, or a parameter lies at a bound of its range other than no
+    effect: then it stands for something else.
+    """
+    theta, _, joint = fit
+    if joint is None:
+        return []
+    library, t = found.problem.library, reported.quantile(joint)
+    dropped = []
+    for h in found.hypotheses:
+        if h[0] == Unknown.name:
+            continue
+        rows = library.at(*h)
+        values = theta[rows]
+        errors = np.array([joint.errors[joint.parameters.index(i)] for i in rows])
+        ranges = [library.entries[i].parameter for i in rows]
+        ends = [b for p in ranges for b in (p.low, p.high)]
+        of_ends = np.repeat(values, 2)
+        at_end = [
+            b != 0 and np.isclose(v, b, rtol=1e-6) for v, b in zip(of_ends, ends, strict=True)
+        ]
+        if np.all(np.abs(values) < t * errors) or any(at_end):
+            dropped.append(h)
+    return dropped
 
 
 def law_causes(

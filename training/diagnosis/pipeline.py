@@ -16,7 +16,14 @@ from ...models.effects.library import Library
 from ...models.recordings.store import Recording
 from ...models.se3 import AXES
 from ...models.vehicles.vehicle import Vehicle
-from .causes import LAW_MARGIN, Progress, find_causes, law_causes, reported_causes
+from .causes import (
+    LAW_MARGIN,
+    Progress,
+    find_causes,
+    law_causes,
+    reported_causes,
+    supported,
+)
 from .data.arrays import Data
 from .data.checks import SPARSE, limits, problems, require_enough, unexcited
 from .disturbance.found import OF_OTHERS, all_laws, reported_laws
@@ -24,6 +31,7 @@ from .disturbance.laws import Law
 from .disturbance.levels import LEVEL
 from .filter.problem import DiagnosisProblem, Evaluation
 from .findings import reported, result
+from .findings.conclusion import conclude
 from .findings.ratios import ratios
 from .selection.hypotheses import Fit
 from .selection.model_selection import parameters_of
@@ -31,12 +39,10 @@ from .selection.refit_all import identify, with_coefficients
 from .selection.search import Refit, Search, refitted
 from .selection.state import Fits, Selection
 from .validation.blackbox import train
+from .validation.claims import Judgement, asserted, clearly_better
 from .validation.simulation import Contender, Simulated
-from .validation.validation import judge, model_gain, white_part
+from .validation.validation import Judged, judge, model_gain, white_part
 
-_CLEARLY, _MANY = 0.05, 3
-"""Held-out nats a sample by which refitted coefficients must beat all causes together before most
-of them count as wrong, and number of causes above which they may be."""
 _RESAMPLED, _OF_A_STEP, _NO_TIME = 0.02, 0.1, 0.06
 """In resampled data: nats a sample that a law must win, and least lag or delay (share of a step).
 In any data, delays below 6 % of a step are rejected: integration error looks like one. With ten
@@ -58,8 +64,8 @@ class DiagnoseConfig:
             (added masses, drag, buoyancy), `command` (a factor on the wrench of each axis, drag,
             buoyancy: for commands of unknown scale; the inertia stays as believed) or `all` (these,
             the thrust curve and lever arms, the centre of buoyancy: `identify`). `auto` is `none`
-            unless refitted coefficients predict left-out runs clearly better than the causes found:
-            then most coefficients of the believed model are wrong, and `all` are fitted.
+            if left-out data bear out its verdict (`validation.claims`). Else `all` are fitted, and
+            the diagnosis that forecasts better is taken.
         most: causes at most.
         horizon: length of the simulations for validation (s).
         seed: of bootstraps and simulated noise.
@@ -95,7 +101,17 @@ class Finding:
     final: Evaluation
     fits: Fits
     laws: list[Law]
-    simulated: dict[str, Simulated]
+    judged: dict[str, Judged]
+
+    @property
+    def simulated(self) -> dict[str, Simulated]:
+        """Simulations of each model."""
+        return {name: j.simulated for name, j in self.judged.items()}
+
+    @property
+    def asserted(self) -> Judged:
+        """The model that the verdict is about."""
+        return self.judged[asserted(self.judged, bool(self.diagnosis.refitted))]
 
 
 class Diagnoser:
@@ -155,7 +171,7 @@ class Diagnoser:
         final = fitted = found.current
         joint = None
         if rows:
-            theta, fitted, joint = self._together(problem, found, rows)
+            found, rows, (theta, fitted, joint) = supported(found, nuisance, rows, self._together)
             final = problem.evaluate(theta)
         self.progress(0.78, "laws of the disturbance")
         least = self._least_gain(found)
@@ -164,21 +180,28 @@ class Diagnoser:
         causes = reported_causes(found, nuisance, structures, final, joint, self.progress)
         of_laws, random_effects = law_causes(groups, laws, least, final, problem)
         causes += of_laws
-        gain, simulated = self._validate(
+        gain, judged = self._validate(
             problem, found, fitted, rows, groups, random_effects, bool(causes)
         )
         residual = reported.residual(problem, final)
         left = reported.left_over(residual, causes, problem, final, least)
         if not self.driven:
             left.insert(0, "commands never change, so their effects are not identifiable")
+        coefficients = [] if joint is None else reported.refitted(problem, final, nuisance, joint)
+        found_ratios = ratios(problem, fitted, rows) if config.refit == "all" else []
+        judgement = Judgement(judged, gain, config.horizon, problem.data.dt, config.seed)
+        claim = judgement.of(bool(nuisance), final.noise.estimated)
+        told = conclude(causes, left, claim, self.faults, coefficients, found_ratios)
         d = problem.data
         diagnosis = result.Diagnosis(
             version=result.VERSION,
-            verdict=reported.verdict(causes, left),
-            sentence=reported.sentence(causes, self.faults, bool(nuisance), left),
-            causes=causes,
-            refitted=[] if joint is None else reported.refitted(problem, final, nuisance, joint),
-            ratios=ratios(problem, fitted, rows) if config.refit == "all" else [],
+            verdict=told.verdict,
+            sentence=told.sentence,
+            explained=claim.explained,
+            left=told.left,
+            causes=told.causes,
+            refitted=coefficients,
+            ratios=found_ratios,
             residual=residual,
             gain=gain,
             left_out=d.left_out if len(np.unique(d.fold)) > 1 else "nothing",
@@ -192,7 +215,7 @@ class Diagnoser:
         extended = Extended.create(problem.model.base, effects, problem.vehicle.thrusters())
         return Finding(
             diagnosis, extended.for_steps_of(_FINEST), problem.library, final.theta, d, base, final,
-            found.fits, laws, simulated,
+            found.fits, laws, judged,
         )  # fmt: skip
 
     def _least_gain(self, found: Selection) -> float:
@@ -238,9 +261,12 @@ class Diagnoser:
         return problem.evaluate(problem.polish(problem.believed, rows)[0])
 
     def _together(
-        self, problem: DiagnosisProblem, found: Selection, rows: list[int]
-    ) -> tuple[np.ndarray, Evaluation, Fit]:
+        self, found: Selection, rows: list[int]
+    ) -> tuple[np.ndarray, Evaluation, Fit | None]:
         """Joint fit of all causes and nuisance parameters."""
+        problem = found.problem
+        if not rows:
+            return found.current.theta, found.current, None
         if self.config.refit != "all":
             return problem.polish(found.current.theta, rows)
         causes = parameters_of(problem.library, found.hypotheses)
@@ -263,7 +289,7 @@ class Diagnoser:
         groups: list[list[Law]],
         random_effects: tuple[Effect, ...],
         extended: bool,
-    ) -> tuple[dict[str, result.ModelGain], dict[str, Simulated]]:
+    ) -> tuple[dict[str, result.ModelGain], dict[str, Judged]]:
         """Base, base refitted, extended model and black box on data left out of their fits.
 
         `fitted` is the evaluation of the final fit, with sensitivities to the parameters of `rows`.
@@ -308,7 +334,7 @@ class Diagnoser:
             name: model_gain(j, judged["base"], problem, horizon, np.random.default_rng(seed))
             for name, j in judged.items()
         }
-        return gain, {name: j.simulated for name, j in judged.items()}
+        return gain, judged
 
 
 def diagnose(
@@ -346,28 +372,13 @@ def _diagnose(
     diagnoser = Diagnoser(recording, vehicle, base, config, progress)
     found = diagnoser.run()
     first = found.diagnosis
-    if config.refit != "auto" or not diagnoser.driven or not coefficients_are_off(first):
+    if config.refit != "auto" or not diagnoser.driven or not first.left:
         progress(1.0, "done")
         return found
-    progress(0.0, "again with all coefficients fitted, for most are off")
+    progress(0.0, "again with all coefficients fitted, for left-out data speak against the verdict")
     again = Diagnoser(recording, vehicle, base, replace(config, refit="all"), progress).run()
     progress(1.0, "done")
     second = again.diagnosis
-    if best_gain(second) < best_gain(first) + _CLEARLY:
+    if not clearly_better(again.asserted, found.asserted, config.seed):
         return found
-    corrected = reported.with_coefficients_off(second)
-    return replace(again, diagnosis=replace(corrected, seconds=first.seconds + second.seconds))
-
-
-def coefficients_are_off(diagnosis: result.Diagnosis) -> bool:
-    """Whether refitted coefficients win clearly more than the causes, or the causes are many."""
-    causes = diagnosis.gain.get("extended")
-    won = 0.0 if causes is None else max(causes.log_score_gain.value, 0.0)
-    refitted = diagnosis.gain["refitted"].log_score_gain
-    return refitted.interval95[0] > won + _CLEARLY or len(diagnosis.causes) > _MANY
-
-
-def best_gain(diagnosis: result.Diagnosis) -> float:
-    """Nats a sample that the better of refit and extended model wins on data left out."""
-    models = (diagnosis.gain.get(name) for name in ("refitted", "extended"))
-    return max(m.log_score_gain.value for m in models if m is not None)
+    return replace(again, diagnosis=replace(second, seconds=first.seconds + second.seconds))

@@ -12,7 +12,7 @@ from ..filter.problem import DiagnosisProblem, Evaluation
 from ..filter.sensitivities import whitened_sensitivities
 from ..findings import result
 from ..selection.hypotheses import Design, Fit
-from ..selection.model_selection import Choice, admissible, parameters_of
+from ..selection.model_selection import Choice, Hypothesis, admissible, parameters_of
 from ..selection.state import Fits, Selection
 from .groups import described, groups, refined
 from .structures import Matched, Screen
@@ -79,10 +79,19 @@ def screened(
 
 
 def _best_name(problem: DiagnosisProblem, evaluation: Evaluation, fits: Fits) -> float:
+    return max([0.0, *(gain for _, gain in _admissible(problem, evaluation, fits))])
+
+
+def _admissible(
+    problem: DiagnosisProblem, evaluation: Evaluation, fits: Fits
+) -> list[tuple[Hypothesis, float]]:
+    """Names with estimates in their ranges, and their held-out gains, largest first."""
     gains = [
-        f.heldout_gain for f in fits.values() if admissible(problem.library, evaluation.theta, f)
+        (h, f.heldout_gain)
+        for h, f in fits.items()
+        if admissible(problem.library, evaluation.theta, f)
     ]
-    return max([0.0, *gains])
+    return sorted(gains, key=lambda item: -item[1])
 
 
 def find_structure(
@@ -125,7 +134,7 @@ def add_structure(
     """Add the structure to the model's effects and refit it with all that was accepted."""
     problem, rng, matched = state.problem, state.generator(), structure.matched
     effect = refined(structure.screen, matched, rng)
-    rivals = sorted(state.left.items(), key=lambda item: -item[1].heldout_gain)[:5]
+    rivals = _admissible(problem, state.current, state.left)[:5]
     wider = problem.with_effect(effect)
     theta = wider.moved(state.current.theta, problem.library)
     hypothesis = (Unknown.name, effect.acts_on)
@@ -136,8 +145,7 @@ def add_structure(
     heldout = matched.heldout * structure.gain / max(matched.gain, 1e-300)
     p, errors = matched.p_value, joint.errors[: len(own)]
     fit = Fit(tuple(own), theta[own], {}, errors, structure.gain, heldout, p)
-    ranked = tuple((h, f.heldout_gain) for h, f in rivals)
-    accepted = (*state.accepted, Choice(hypothesis, fit, (), ranked, p))
+    accepted = (*state.accepted, Choice(hypothesis, fit, (), tuple(rivals), p))
     return state.drawn(rng).at(wider.evaluate(theta), problem=wider, accepted=accepted)
 
 
@@ -146,9 +154,8 @@ def described_structure(state: Selection, structure: FoundStructure) -> result.S
     library, (name, where) = state.problem.library, state.hypotheses[-1]
     effect = next(e for e in library.effects if isinstance(e, Unknown) and e.places == (where,))
     words = described(effect, state.current.theta[library.at(name, where)], state.problem)
-    return result.Structure(
-        **words, heldout_gain=structure.gain, best_name_gain=structure.name_gain
-    )
+    best = max([structure.name_gain, *(gain for _, gain in state.accepted[-1].rivals)])
+    return result.Structure(**words, heldout_gain=structure.gain, best_name_gain=best)
 
 
 def _key(entry: tuple) -> tuple[str, str, str]:

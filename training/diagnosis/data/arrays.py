@@ -98,10 +98,14 @@ class Data:
 
     @property
     def left_out(self) -> Literal["scenario", "run", "block"]:
-        """What folds are: scenarios, runs of a single scenario, or blocks of a single run."""
-        if len(np.unique(self.scenario)) > 1:
-            return "scenario"
-        return "run" if len(np.unique(self.run)) > 1 else "block"
+        """What folds are: scenarios, runs of a single scenario, or blocks of few runs.
+
+        A few long runs are too few to be left out in turn: they differ in what the vehicle does,
+        so each would be judged by data of other motions, and intervals would rest on a handful.
+        """
+        if self.few:
+            return "block"
+        return "scenario" if len(np.unique(self.scenario)) > 1 else "run"
 
     @property
     def fold(self) -> Int[np.ndarray, " R"]:
@@ -117,8 +121,12 @@ class Data:
 
         A test between clusters needs more of them than a handful.
         """
-        few = len(np.unique(self.run)) < _FEW_RUNS
-        return np.arange(len(self.run)) if few else self.run
+        return np.arange(len(self.run)) if self.few else self.run
+
+    @property
+    def few(self) -> bool:
+        """Whether there are few runs."""
+        return len(np.unique(self.run)) < _FEW_RUNS
 
     @property
     def even(self) -> bool:

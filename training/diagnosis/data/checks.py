@@ -305,6 +305,6 @@ def limits(
         )
     if data.left_out == "block":
         found.append(
-            "there is one run: blocks of it were left out in turn, so other runs stay unknown"
+            "there are few runs: blocks of them were left out in turn, so other runs stay unknown"
         )
     return found

@@ -20,6 +20,7 @@ from ..filter.problem import DiagnosisProblem, Evaluation
 from ..filter.transition import Transition
 from ..selection.model_selection import margin
 from ..validation.validation import white_part
+from .estimator import is_estimators
 from .laws import Law, estimated, find_laws, growth_alone, run_constants
 from .levels import LEVEL, find_levels, levels_with_slow_noise, process_share
 from .waves import are_waves, find_current, find_waves
@@ -74,8 +75,13 @@ def best_law(problem: DiagnosisProblem, evaluation: Evaluation) -> float:
 
 
 def all_laws(problem: DiagnosisProblem, evaluation: Evaluation, least: float) -> list[Law]:
-    """Disturbance laws of the residual, waves and level included, largest gain first."""
-    found = laws_of(problem, evaluation)
+    """Disturbance laws of the residual, waves and level included, largest gain first.
+
+    Slow laws that an estimator's errors imitate are left out.
+    """
+    found = [
+        law for law in laws_of(problem, evaluation) if not is_estimators(law, problem, evaluation)
+    ]
     alike = repeating(evaluation.z, problem.data)
     slow = [law for law in found if law.name == DisturbanceColour.name]
     if max((law.heldout_gain for law in slow), default=0.0) > least:

@@ -28,6 +28,14 @@ _SMOOTH, _SMOOTH_OF_ALL, _NEAR, _ALIKE = 4, 8, 3.0, 0.1
 `_SMOOTH_OF_ALL` of pose and twist have errors within `_NEAR` times `FLOOR`, if neighbouring
 one-step errors of these axes correlate by more than `_ALIKE`. Those of exact states, and of states
 with dominant white noise, do not."""
+_INDEPENDENT = -0.15
+"""Correlation of neighbouring kinematic errors below which a pose has independent errors (−0.5 for
+them alone), and does not slip."""
+_OVER = 4.0
+"""Time (s) over which slip is measured: an estimator's errors last for seconds."""
+_DRIFTS = 3e-4
+"""Slip of an attitude (rad/√s) above which the poses are an estimator's. Exact states have a tenth
+of it, by the integration of their rates; the angle random walk of a gyro is 1e-4 at most."""
 _LONGEST = 0.98
 """Upper limit of the correlation of neighbouring errors."""
 _DEAF = 10.0
@@ -178,7 +186,33 @@ def estimate(
     found, errors = most_likely(error, weight, transition, units, start, bounds, fixed)
     b = np.sqrt(found[12:])
     record = np.maximum(np.sqrt(found[:12]), FLOOR)
-    return Noise(record, b, error=errors / (2 * b), silent=silent)
+    slip = slip_of(error, weight, dt)
+    if not (np.any(record[6:] > _NEAR * FLOOR[6:]) or np.any(slip[3:] > _DRIFTS)):
+        slip = np.zeros(6)  # exact states
+    return Noise(record, b, slip, error=errors / (2 * b), silent=silent)
+
+
+def slip_of(
+    error: Float[np.ndarray, "N 12 R"], weight: Float[np.ndarray, "N R"], dt: float
+) -> Float[np.ndarray, "6"]:
+    """Slip of each pose against the integrated twist (m/√s, rad/√s), 0 with independent errors.
+
+    A pose's one-step error less dt/2 times that of its velocity is that of kinematics alone: no
+    force is in it. An attitude that an estimator has filtered drifts against the rates, and a
+    position that it has dead-reckoned follows the velocity's own errors. Slip is the variance, a
+    second, of the sum over a step or, if larger, over some seconds: it covers errors that last.
+    """
+    k = (error[:, :6] - dt / 2 * error[:, 6:]) * weight[:, None]
+    square = np.maximum((k**2).sum(axis=(0, 2)), 1e-300)
+    independent = (k[1:] * k[:-1]).sum(axis=(0, 2)) < _INDEPENDENT * square
+    length = max(1, min(round(_OVER / dt), len(k)))
+    whole = len(k) // length * length
+    sums = k[:whole].reshape(-1, length, *k.shape[1:]).sum(axis=1)
+    there = weight[:whole].sum() * dt
+    slip = np.sqrt(
+        np.maximum((sums**2).sum(axis=(0, 2)) / max(there, dt), square / (weight.sum() * dt))
+    )
+    return np.where(independent, 0.0, slip)
 
 
 def _of_estimates(

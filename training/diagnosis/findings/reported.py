@@ -1,7 +1,6 @@
 """A diagnosis in words and numbers: causes with intervals, residuals, refitted coefficients."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from ....models.effects.unknown import Unknown
 from ....models.effects.water import CurrentVarying
 from ....models.se3 import AXES, CHANNELS
 from ..data.repeats import repeating
+from ..disturbance.estimator import colour_size, unit_responses
 from ..disturbance.laws import Law, estimated, run_constants
 from ..filter.problem import DiagnosisProblem, Evaluation
 from ..selection.hypotheses import Fit
@@ -150,7 +150,7 @@ def left_over(
         )
     gain, std = thrust_by_run(problem, evaluation)
     if gain > max(least, *(c.evidence.heldout_gain for c in causes if _is_random(c.name)), 0.0):
-        when = "within the run" if problem.data.left_out == "block" else "from run to run"
+        when = "within runs" if problem.data.left_out == "block" else "from run to run"
         left.append(
             f"thrust differs {when} (by {100 * std:.1f} %, standard deviation), as with a supply "
             "voltage that was not recorded or a thruster that fails"
@@ -239,7 +239,7 @@ def _law_values(
     if law.loss is not None and len(law.heldout) != len(cluster):
         cluster = np.arange(len(law.heldout))
     at, covariance = estimated(law, cluster)
-    once, steady = _unit_responses(problem, evaluation, law.where)
+    once, _ = unit_responses(problem, evaluation, law.where)
 
     def physical(x: np.ndarray) -> np.ndarray:
         v = np.exp(x)
@@ -247,10 +247,7 @@ def _law_values(
             share, size, rest = v[:3]
             return np.array([np.sqrt(max(size**2 - rest**2, 1e-12)) / once, share / data.dt])
         if law.name == DisturbanceColour.name:
-            tau, kappa = v[0], min(v[1], 0.99)
-            rho = np.exp(-data.dt / tau)
-            square = (kappa / (1 - kappa) - rho**2 * kappa) / (1 - rho**2)
-            return np.array([np.sqrt(square) / steady, tau])
+            return np.array([colour_size(v[0], v[1], problem, evaluation, law.where), v[0]])
         return v
 
     values, D = physical(at), []
@@ -267,88 +264,6 @@ def _law_values(
     return found
 
 
-def _unit_responses(
-    problem: DiagnosisProblem, evaluation: Evaluation, axis: str
-) -> tuple[float, float]:
-    """Whitened innovation on an axis after a unit impulse; its steady state under a unit wrench."""
-    if axis not in AXES:
-        return 1.0, 1.0
-    i, dt = AXES.index(axis), problem.data.dt
-    a = np.linalg.inv(problem.mass(evaluation.theta))[:, i]
-    d = np.concatenate([dt * dt / 2 * a, dt * a])
-    w = problem.data.weight
-    A = np.einsum("nijr,nr->ij", np.asarray(evaluation.predictions.jacobian), w) / w.sum()
-    white, keep = (k[-1].mean(axis=-1) for k in (evaluation.kalman.whiten, evaluation.kalman.keep))
-    lasting = np.linalg.solve(np.eye(12) - A @ keep, d)
-    return abs(float((white @ d)[6 + i])) / dt, abs(float((white @ lasting)[6 + i]))
-
-
-# -------------------------------------------------------------------------------- sentences
-
-
-def verdict(causes: Sequence[result.Cause], left: Sequence[str] = ()) -> result.Verdict:
-    """The verdict on causes and on the residuals that they leave (`left_over`)."""
-    unknown = [c.name == Unknown.name for c in causes]
-    if not causes:
-        return "unexplained" if left else "adequate"
-    if not any(unknown):
-        return "partly_explained" if left else "explained"
-    return "unexplained" if all(unknown) else "partly_explained"
-
-
-def sentence(
-    causes: Sequence[result.Cause],
-    problems: Sequence[str],
-    refitted: bool = False,
-    left: Sequence[str] = (),
-) -> str:
-    """The diagnosis in a line or two; `refitted` if coefficients were fitted first."""
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    first = f"The data have faults: {problems[0]}{more}. " if problems else ""
-    if not causes and left:
-        return first + f"No name explains the data: {left[0]}."
-    if not causes and refitted:
-        return first + "With its coefficients refitted, your model is adequate at this noise."
-    if not causes:
-        return first + "Your model is adequate at this noise."
-    named = ", ".join(f"{c.name} ({c.where})" for c in causes if c.name != Unknown.name)
-    subject = "your model, its coefficients refitted," if refitted else "your model"
-    text = f"The data differ from {subject} by: {named}." if named else ""
-    for c in causes:
-        if c.structure is not None:
-            text += f" No name explains {c.structure.description}."
-    text += "".join(f" But {one}." for one in left)
-    return first + text.strip()
-
-
-def with_coefficients_off(diagnosis: result.Diagnosis) -> result.Diagnosis:
-    """The diagnosis of a model whose errors are explained by its coefficients."""
-
-    def factor(r: result.Ratio) -> float:
-        """Distance from the believed value in logarithms; infinite for the wrong sign."""
-        share = r.found.value / r.believed
-        return abs(np.log(share)) if share > 0 else np.inf
-
-    off: dict[str, result.Ratio] = {}  # the one with the largest factor, by kind
-    for r in diagnosis.ratios:
-        low, high = r.found.interval95
-        turned = r.believed * r.found.value < 0 and not low <= 0 <= high
-        if turned or (r.believed * r.found.value > 0 and not low <= r.believed <= high):
-            off[r.name] = max(off.get(r.name, r), r, key=factor)
-    units = {"1": ""}
-    listed = "; ".join(
-        f"{r.name} of {r.where} {r.found.value:.3g} {units.get(r.found.unit, r.found.unit + ' ')}"
-        f"(believed: {r.believed:.3g})"
-        for r in sorted(off.values(), key=factor, reverse=True)
-    )
-    most = f" Over inertia, of each kind the most: {listed}." if listed else ""
-    return replace(
-        diagnosis,
-        sentence=f"Your model is wrong in most of its coefficients.{most} {diagnosis.sentence}",
-        verdict="explained" if diagnosis.verdict == "adequate" else diagnosis.verdict,
-    )
-
-
 def noise_levels(problem: DiagnosisProblem, evaluation: Evaluation) -> dict[str, float]:
     """Levels of noise, mean over the axes of a sensor."""
     groups = ("position_m", "attitude_rad", "velocity_m_s", "rate_rad_s")
@@ -357,6 +272,11 @@ def noise_levels(problem: DiagnosisProblem, evaluation: Evaluation) -> dict[str,
     }
     if problem.data.unmeasured:
         del found["position_m"]
+    for name, slip in zip(
+        ("position", "attitude"), np.split(evaluation.noise.slip, 2), strict=True
+    ):
+        if np.any(slip > 0):
+            found[f"slip_{name}"] = float(np.mean(slip))
     return found | {
         f"diffusion_{a}": float(b) for a, b in zip(AXES, evaluation.noise.diffusion, strict=True)
     }

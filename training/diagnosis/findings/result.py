@@ -99,10 +99,12 @@ class Cause:
         parameters: estimates by name, each with its unit.
         evidence: p value and held-out gain.
         rivals: causes that would have won most in its place, best first.
-        indistinguishable_from: causes that these data do not distinguish from it; of the same name
-            with the place.
+        indistinguishable_from: causes that these data do not distinguish from it and that are not
+            named; of the same name with the place.
         next_experiment: what would distinguish it from these, or measure it better, in words.
-        experiments: expected nats a minute of each maneuver; empty where maneuvers don't matter.
+        experiments: expected information of each maneuver beyond the data's (nats a minute): the
+            logarithm by which the standard error of what the rival can't explain shrinks; empty
+            where maneuvers don't matter.
         structure: what is known of the structure of an `unknown`; null for a named cause.
     """
 
@@ -221,8 +223,10 @@ class DataSummary:
         problems: faults of the data, a sentence each.
         limits: what is not identifiable from these data, a sentence each.
         noise: estimated levels: standard deviations of the records, mean over axes (`position_m`,
-            `attitude_rad`, `velocity_m_s` in m/s, `rate_rad_s` in rad/s), and the diffusion of
-            the disturbance (`diffusion_surge`, sway, heave in N√s; roll, pitch, yaw in N·m√s).
+            `attitude_rad`, `velocity_m_s` in m/s, `rate_rad_s` in rad/s), the slip of an
+            estimator's pose (`slip_position` in m/√s, `slip_attitude` in rad/√s) where it slips,
+            and the diffusion of the disturbance (`diffusion_surge`, sway, heave in N√s; roll,
+            pitch, yaw in N·m√s).
     """
 
     scenarios: list[str]
@@ -241,8 +245,9 @@ class Diagnosis:
 
     Attributes:
         version: of this format.
-        verdict: adequate (no cause), explained (all by named causes, or by coefficients),
-            partly_explained (named causes and `unknown`), unexplained (`unknown` alone).
+        verdict: adequate (no cause, and left-out data show none), explained (all by named causes,
+            or by coefficients), partly_explained (named causes or coefficients, and `unknown` or
+            what is in `left`), unexplained (`unknown` or `left` alone).
         sentence: the verdict in words.
         causes: those found, first found first.
         refitted: coefficients fitted before any cause was named.
@@ -256,6 +261,10 @@ class Diagnosis:
         threshold: gain that noise exceeds over all causes with probability `alpha` (nats, in all).
         alpha: rate of false alarms over all causes together.
         seconds: computing time (s).
+        explained: by horizon, share of the belief's forecast error on left-out data (root sum of
+            squares over position, rotation and velocity, m, rad and m/s counted alike) that causes
+            and refitted coefficients explain; empty where there are none.
+        left: what data speak against the claim that only noise is left, a sentence each.
     """
 
     version: int
@@ -272,6 +281,8 @@ class Diagnosis:
     threshold: float
     alpha: float
     seconds: float = field(default=0.0)
+    explained: dict[str, Interval] = field(default_factory=dict)
+    left: list[str] = field(default_factory=list)
 
     def as_json(self) -> str:
         """Text of `diagnosis.json`; numbers that are not finite become null."""

@@ -1,7 +1,7 @@
 """Model selection among causes: vetoes, nesting, echoes, ties."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -33,6 +33,11 @@ class Choice:
     ties: tuple[Hypothesis, ...]
     rivals: tuple[tuple[Hypothesis, float], ...]
     p_value: float = 1.0
+
+    def apart_from(self, named: Sequence[Hypothesis]) -> "Choice":
+        """Without ties to causes that are named themselves, or to other places of these."""
+        taken = {h[0] for h in named if h != self.hypothesis}
+        return replace(self, ties=tuple(h for h in self.ties if h[0] not in taken))
 
 
 def admissible(library: Library, theta: Float[np.ndarray, " p"], fit: Fit) -> bool:
@@ -79,7 +84,7 @@ def choose(
     admissible estimates, and an essential parameter that differs from zero.
     Echoes of causes accepted before must win one per cent of their gains (`accepted`). The largest
     held-out gain is chosen; a simpler cause replaces it unless clearly beaten. Ties are
-    causes within two standard errors of the difference, clustered by run.
+    causes within two standard errors of the difference, clustered by run, and a few nats.
     """
     accepted = accepted or {}
     passing: dict[Hypothesis, Fit] = {}
@@ -132,7 +137,7 @@ def _is_simpler(a: Hypothesis, b: Hypothesis) -> bool:
 def _tied(a: Fit, b: Fit) -> bool:
     difference = a.heldout - b.heldout
     error = np.sqrt(len(difference)) * difference.std()
-    return bool(difference.sum() < 2 * error)
+    return bool(difference.sum() < min(2 * error, MARGIN_NATS))
 
 
 def parameters_of(library: Library, hypotheses: Sequence[Hypothesis]) -> list[int]:

@@ -56,7 +56,7 @@ class Simulated(NamedTuple):
 def simulate(
     problem: DiagnosisProblem,
     contender: Contender,
-    levels: tuple[Float[np.ndarray, "12 K"], Float[np.ndarray, "6 K"]],
+    levels: tuple[Float[np.ndarray, "12 K"], Float[np.ndarray, "6 K"], Float[np.ndarray, "6 K"]],
     pieces: Int[np.ndarray, " K"],
     horizon: float,
     seed: int,
@@ -64,7 +64,7 @@ def simulate(
 ) -> Simulated:
     """Simulations of some pieces over `horizon` s at most, with effects of these causes and places.
 
-    `levels` are the noise of the records and the diffusion.
+    `levels` are the noise of the records, the diffusion and the slip of the poses.
     """
     data = problem.data
     every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))
@@ -75,7 +75,8 @@ def simulate(
         box = eqx.tree_at(lambda b: b.weights, box, box.weights[..., pieces])
     e = _errors(
         problem.model, used, contender.random_effects, Records.of(data, pieces), box,
-        (jnp.asarray(levels[0]), jnp.asarray(levels[1])), jax.random.key(seed), every,
+        (jnp.asarray(levels[0]), jnp.asarray(levels[1]), jnp.asarray(levels[2])),
+        jax.random.key(seed), every,
         max(1, substeps(data.longest) // _COARSER),
     )  # fmt: skip
     return Simulated(np.asarray(e), pieces, every)
@@ -88,11 +89,16 @@ class _Noise(eqx.Module):
     on: Float[Array, "1 S 1"]
     record: Float[Array, "12 S R"]
     b: Float[Array, "6 S R"]
+    slip: Float[Array, "6 S R"]
 
     @property
     def size(self) -> int:
-        """Unit Gaussians of a step: b dW, two readings, each law twice."""
-        return 18 + 2 * self.laws.noise_size
+        """Unit Gaussians of a step: b dW, two readings, each law twice, slip."""
+        return 24 + 2 * self.laws.noise_size
+
+    def slipped(self, X: Array, dW: Float[Array, "6 S R"]) -> Array:
+        """The pose after its slip."""
+        return se3.retract(X, self.slip * dW)
 
     def read(self, X: Array, V: Array, w: Float[Array, "12 S R"]) -> tuple[Array, Array]:
         """A record of pose and twist."""
@@ -126,7 +132,7 @@ def _errors(
     random_effects: tuple[Effect, ...],
     records: Records,
     box: BlackBox | None,
-    levels: tuple[Float[Array, "12 R"], Float[Array, "6 R"]],
+    levels: tuple[Float[Array, "12 R"], Float[Array, "6 R"], Float[Array, "6 R"]],
     key: Array,
     every: int,
     count: int,
@@ -151,12 +157,13 @@ def _errors(
             push = times(along.inertia.matrix, lacking)
         if random_effects:
             # laws leave six of w for b dW
-            random, wrench = noise.after_laws(state, given, restarts, w[24:])
+            random, wrench = noise.after_laws(state, given, restarts, w[24:-6])
             state = state._replace(random=random)
             push = wrench if push is None else push + wrench
         state = along.step(state, given, push)
-        dW = jnp.sqrt(given.length) * w[12:18]
-        state = state._replace(V=noise.diffused(along.inertia, state.V, dW))
+        root = jnp.sqrt(given.length)
+        V = noise.diffused(along.inertia, state.V, root * w[12:18])
+        state = state._replace(X=noise.slipped(state.X, root * w[-6:]), V=V)
         read = noise.read(*along.observe(state), w[18:30])
         e = difference(*read, given.X_next, given.V_next)
         return state, e.astype(jnp.float32)

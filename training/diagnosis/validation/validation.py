@@ -52,12 +52,14 @@ class Scores(NamedTuple):
 
     Attributes:
         density: log density of the innovations (nats) (R,).
-        record, diffusion: noise of the records, and of the disturbance (12, R), (6, R).
+        record, diffusion, slip: noise of the records, of the disturbance, and slip of the poses
+            (12, R), (6, R), (6, R).
     """
 
     density: Float[np.ndarray, " R"]
     record: Float[np.ndarray, "12 R"]
     diffusion: Float[np.ndarray, "6 R"]
+    slip: Float[np.ndarray, "6 R"]
 
 
 def scores(problem: DiagnosisProblem, contender: Contender, estimated: bool) -> Scores:
@@ -71,16 +73,18 @@ def scores(problem: DiagnosisProblem, contender: Contender, estimated: bool) -> 
         error = error - np.concatenate([a * h / 2, a], axis=1) * data.measured[:, None]
     mass = problem.mass(theta.mean(axis=1))
     density = np.zeros(len(data.fold))
-    record, diffusion = np.zeros((12, len(density))), np.zeros((6, len(density)))
+    record = np.zeros((12, len(density)))
+    diffusion, slip = np.zeros((2, 6, len(density)))
     for label in np.unique(data.fold):
         own = data.fold == label
         rest = data.weight * (~own if not own.all() else 1)
         steps = Transition.along(jacobian, rest, p.late)
         noise = estimate(error, rest, steps, mass, data.dt, estimated=estimated)
         record[:, own], diffusion[:, own] = noise.record[:, None], noise.diffusion[:, None]
+        slip[:, own] = noise.slip[:, None]
         given = np.linalg.inv(mass), data.dt, data.step[:, own], data.weight[:, own]
         density[own] = score_of(error[:, :, own], jacobian[..., own], noise, steps, *given)
-    return Scores(density, record, diffusion)
+    return Scores(density, record, diffusion, slip)
 
 
 def judge(
@@ -98,9 +102,9 @@ def judge(
     the same for all folds and contenders.
     """
     data, theta = problem.data, contender.theta
-    density, record, diffusion = scores(problem, contender, estimated)
+    density, record, diffusion, slip = scores(problem, contender, estimated)
     kept = _spread(data.fold, _PIECES)
-    levels = record[:, kept], diffusion[:, kept] * contender.white_share[:, None]
+    levels = record[:, kept], diffusion[:, kept] * contender.white_share[:, None], slip[:, kept]
     kinds = {problem.library.entries[i][:2] for i in in_use}
     kinds |= {problem.library.entries[i][:2] for i in np.flatnonzero(np.any(theta != 0, axis=1))}
     simulated = simulate(problem, contender, levels, kept, horizon, seed, kinds)

@@ -3,7 +3,7 @@
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tyro.conf import Positional
 
@@ -12,6 +12,9 @@ from ...models.config.errors import UserError
 from ...models.files.interrupts import interrupts_held
 from ...models.files.owned import FolderKind, run_folder
 from ..progress import console, progress_bar
+
+if TYPE_CHECKING:
+    from ...training.diagnosis.findings.result import Diagnosis
 
 DIAGNOSIS = FolderKind(
     "diagnosis", ("diagnosis.json", "diagnosis.schema.json", "extended/model.spinn", "report.html")
@@ -118,14 +121,8 @@ class Diagnose:
                 {"vehicle": stated, "source": str(self.data), "dt": recording.dt},
             )
             page.write(partial / "report.html")
-        shown = console()
-        shown.print(finding.diagnosis.sentence)
-        for cause in finding.diagnosis.causes:
-            told = ", ".join(f"{k} {v.value:.4g} {v.unit}" for k, v in cause.parameters.items())
-            if cause.structure is not None:  # its coefficients are in diagnosis.json
-                told = cause.structure.description
-            shown.print(f"  {cause.name} ({cause.where}): {told}")
-        shown.print(f"wrote {self.out}")
+        _print(finding.diagnosis)
+        console().print(f"wrote {self.out}")
 
     def _check(self) -> None:
         """Check for contradicting options, before anything is read."""
@@ -143,3 +140,14 @@ class Diagnose:
 
     def _is_log(self) -> bool:
         return self.data.is_file() and self.data.suffix.lower() not in _STATE_VEHICLES
+
+
+def _print(diagnosis: "Diagnosis") -> None:
+    """The verdict and the causes."""
+    shown = console()
+    shown.print(diagnosis.sentence)
+    for cause in diagnosis.causes:
+        told = ", ".join(f"{k} {v.value:.4g} {v.unit}" for k, v in cause.parameters.items())
+        if cause.structure is not None:  # its coefficients are in diagnosis.json
+            told = cause.structure.description
+        shown.print(f"  {cause.name} ({cause.where}): {told}")

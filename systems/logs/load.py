@@ -47,7 +47,7 @@ class LogOptions:
     system: int | None = None
 
 
-def import_log(
+def import_log(  # long: a third of it says what it takes and refuses
     path: str | os.PathLike[str],
     *,
     rate: float | None = RATES[-1],
@@ -126,7 +126,7 @@ def own_rate(signals: Signals) -> float:
     return next((rate for rate in RATES if rate <= 1.05 * slowest), RATES[-1])
 
 
-def load_data(
+def load_data(  # long: half of it says what it takes and refuses
     path: str | os.PathLike[str],
     *,
     rate: float | None = None,

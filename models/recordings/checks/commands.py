@@ -341,9 +341,7 @@ def _silent(data: _Data, axis: int) -> Finding:
 
 
 def _exchanged(moved: Sequence[tuple[int, int, int]]) -> Finding:
-    names = [
-        name for name, order in _ORDERS.items() if all(_in_order(i, j, order) for i, j, _ in moved)
-    ]
+    names = [n for n, order in _ORDERS.items() if all(order[j] == i for i, j, _ in moved)]
     parts = [f"`{WRENCH[j]}` drives {AXES[i]}{' backwards' * (s < 0)}" for i, j, s in moved]
     look = f": columns X…N stand {names[0]}" if names else ""
     return Finding(
@@ -352,11 +350,6 @@ def _exchanged(moved: Sequence[tuple[int, int, int]]) -> Finding:
         f"the motion says that {', '.join(parts)}{look}",
         "give X,Y,Z,K,M,N in this order, forces first",
     )
-
-
-def _in_order(axis: int, column: int, order: Sequence[int]) -> bool:
-    """Whether a column of that number holds the axis' command in an order of axes."""
-    return order[column] == axis
 
 
 def _reversed_axes(data: _Data, moved: Sequence[tuple[int, int, int]], wrench: bool) -> Finding:

@@ -150,7 +150,7 @@ class Diagnoser:
         self.furthest = max(self.furthest, fraction)
         self.report(self.furthest, remark)
 
-    def run(self) -> Finding:
+    def run(self) -> Finding:  # long: the order of the stages, one call each
         """The whole diagnosis."""
         started = time.monotonic()
         config, problem = self.config, self.problem

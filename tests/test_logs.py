@@ -224,7 +224,7 @@ LIGHTS = {"SERVO7_FUNCTION": 0.0, "SERVO8_FUNCTION": 7.0}  # nothing, camera til
 @pytest.mark.parametrize(
     ("parameters", "vehicle", "count"),
     [
-        (PARAMETERS | {"FRAME_CONFIG": 1.0}, "bluerov2", 6),
+        (SIX | {"FRAME_CONFIG": 1.0}, "bluerov2", 6),
         (SIX | LIGHTS, "bluerov2", 6),
         (SIX | LIGHTS | {"FRAME_CONFIG": 2.0}, "bluerov2_heavy", 8),
         (SIX, "bluerov2_heavy", 8),  # what 7 and 8 do is not in the log
@@ -238,12 +238,12 @@ def test_thrusters_are_those_of_the_frame_and_of_the_outputs(tmp_path, parameter
     (run,) = recording.trajectories()
     t = run.start + recording.dt * (np.arange(len(run)) + 0.5)
     expected = outputs(t)[:count]
-    stopped = [7] if parameters.get("SERVO8_FUNCTION") and count == 8 else []
+    stopped = [6, 7] if parameters.get("SERVO8_FUNCTION") == 7 and count == 8 else []
     expected[stopped] = 1500
     assert np.abs(run.commands["pwm"].T - expected).max() < 2.0
     told = [line for line in report.done if "thrusters, read as those of bluerov2" in line]
     assert len(told) == (count == 6)
-    assert any("thrusters 8; they are taken as stopped" in line for line in report.done) == (
+    assert any("thrusters 7, 8; they are taken as stopped" in line for line in report.done) == (
         stopped != []
     )
 

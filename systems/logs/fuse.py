@@ -24,10 +24,16 @@ from ...models.recordings.resample import (
 from .segments import Segment, segments
 from .signals import Series, Signals
 from .signals_tlog import UNAIDED
+from .streams import DEAD_RECKONING
 
 _FAST_HZ, _MEAN_S = 200.0, 0.01
 _LONGEST_S = 300.0
-_STATES = {"disarmed": "disarmed", "pass-through": "passthrough", "outputs off": "outputs-off"}
+_STATES = {
+    "disarmed": "disarmed",
+    "pass-through": "passthrough",
+    "outputs off": "outputs-off",
+    DEAD_RECKONING: DEAD_RECKONING,
+}
 
 
 def fuse(

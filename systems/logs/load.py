@@ -12,14 +12,15 @@ from ...models.recordings.schema import check_plausible
 from ...models.recordings.store import Recording
 from ...models.vehicles.vehicle import load_vehicle
 from .dataflash import read_bin
+from .frame import settled
 from .fuse import fuse
 from .log_bytes import LogBytes, Progress, no_progress, read_log_bytes
 from .report import ImportReport, tell
 from .signals import Signals
 from .signals_dataflash import WANTED as BIN_WANTED
 from .signals_dataflash import signals_from_bin
+from .signals_tlog import AIDS, signals_from_tlog
 from .signals_tlog import WANTED as TLOG_WANTED
-from .signals_tlog import signals_from_tlog
 from .tlog import read_tlog
 
 RATES = (50.0, 40.0, 25.0, 20.0)
@@ -115,7 +116,8 @@ def import_log(  # long: a third of it says what it takes and refuses
         raise UserError(f"{path}: {error}") from error
     period = 1.0 / signals.outputs.rate
     progress(1.0)
-    dataset = with_findings(recording.dataset, signals.findings)
+    recording, settled_ = settled(recording, signals.turned)
+    dataset = with_findings(recording.dataset, [*signals.findings, *settled_])
     return Recording(dataset.assign_attrs(command_period=period)), report
 
 
@@ -198,7 +200,7 @@ def _signals(
     if raw.kind == "bin":
         read = read_bin(raw.data, BIN_WANTED, progress)
         return signals_from_bin(read, vehicle, options.water_density)
-    log = read_tlog(raw.data, TLOG_WANTED, options.system, progress)
+    log = read_tlog(raw.data, TLOG_WANTED, options.system, progress, AIDS)
     return signals_from_tlog(log, vehicle, options.water_density)
 
 

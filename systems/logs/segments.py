@@ -10,6 +10,8 @@ from ...models.recordings.resample import rotations
 from .signals import Series, Signals, Spans
 
 _GUARD_S = 0.1
+_NOISE_STEPS = 10.0
+"""Times the median step, above which a step is not of the noise: 6.7 σ of normal noise."""
 _SLOWEST_S = 60.0
 """s: longest period of a signal that still describes a motion."""
 
@@ -64,7 +66,8 @@ def segments(signals: Signals, gap: float) -> tuple[list[Segment], list[str]]:
 def jumps(signals: Signals) -> list[tuple[float, str]]:
     """Times at which the estimate jumps faster than a vehicle moves: filter resets, lane switches.
 
-    A position step is compared with the velocity estimate, an attitude step with the body rates.
+    A position step is compared with the velocity estimate, an attitude step with the body rates,
+    and each of them with the usual ones of the signal.
     """
     found = []
     q, omega = signals.attitude, signals.rates
@@ -74,7 +77,7 @@ def jumps(signals: Signals) -> list[tuple[float, str]]:
     rate = np.stack([np.interp(middle, omega.t, omega.x[i]) for i in range(3)])
     turn = Rotation.from_rotvec(np.nan_to_num(rate * step).T)
     off = (turn.inv() * R[:-1].inv() * R[1:]).magnitude()
-    times = middle[np.isfinite(rate).all(axis=0) & (off > 0.06 + 1.5 * step)]
+    times = middle[np.isfinite(rate).all(axis=0) & _outliers(off, 0.06 + 1.5 * step)]
     found += [(float(t), "attitude reset of the estimator") for t in times]
     if signals.position is None or signals.velocity is None:
         return found
@@ -83,13 +86,22 @@ def jumps(signals: Signals) -> list[tuple[float, str]]:
     speed = np.stack([np.interp(p.t, v.t, v.x[i]) for i in range(3)])
     moved = np.diff(p.x, axis=1) - 0.5 * (speed[:, 1:] + speed[:, :-1]) * step
     off = np.linalg.norm(np.nan_to_num(moved), axis=0)
-    times = p.t[1:][off > 0.25 + 1.0 * step**2]
+    times = p.t[1:][_outliers(off, 0.25 + 1.0 * step**2)]
     found += [(float(t), "position reset of the estimator") for t in times]
     step = np.diff(v.t)
     off = np.linalg.norm(np.nan_to_num(np.diff(v.x, axis=1)), axis=0)
-    times = v.t[1:][off > 0.5 + 5.0 * step]
+    times = v.t[1:][_outliers(off, 0.5 + 5.0 * step)]
     found += [(float(t), "velocity reset of the estimator") for t in times]
     return found
+
+
+def _outliers(off: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Steps that are larger than a vehicle's, and than those of the signal's own noise.
+
+    Without a horizontal aid an autopilot reports as height the barometer's, with its noise of
+    0.1 to 0.3 m: no estimator was reset there.
+    """
+    return off > np.maximum(least, _NOISE_STEPS * np.median(off)) if off.size else off > least
 
 
 def _without_gaps(one: Series, gap: float) -> Spans:

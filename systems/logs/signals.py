@@ -58,6 +58,7 @@ class Signals:
         spans: armed, mode, aiding, wiring: the states that are constant within a segment.
         cuts: times at which a segment must end: resets, reboots.
         findings: what is wrong with the log.
+        turned: thrusters (from 1) whose output was mirrored for SERVOn_REVERSED.
     """
 
     attitude: Series
@@ -76,6 +77,7 @@ class Signals:
     lacks: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
+    turned: tuple[int, ...] = ()
 
 
 def series(t: np.ndarray, x: ArrayLike, source: str, quantity: str) -> Series | None:
@@ -146,6 +148,7 @@ class Parameter:
 _RANGES = (
     (r"SERVO\d+_FUNCTION", -1.0, 255.0),
     (r"FRAME_CONFIG", 0.0, 20.0),
+    (r"SERVO\d+_REVERSED", 0.0, 1.0),
     (r"MOT_\d+_DIRECTION", -1.0, 1.0),
     (r"INS_(GYRO|ACCEL)_FILTER", 0.0, 1000.0),
     (r"BARO_SPEC_GRAV", 0.9, 1.2),

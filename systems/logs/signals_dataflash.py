@@ -6,10 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from ...models.config.errors import UserError
+from ...models.recordings.checks.finding import Finding
 from ...models.recordings.resample import linear
 from ..mavlink import codec
 from .dataflash import BinLog
 from .depth import in_water
+from .frame import firmware_findings, frame_findings
 from .signals import (
     Series,
     Signals,
@@ -21,9 +23,13 @@ from .signals import (
     undelayed,
 )
 from .signals_tlog import UNAIDED
+from .streams import aid_spans, missing_states
 from .table import Table, whole
-from .wiring import Wiring, thruster_outputs, wiring
+from .wiring import DIRECTION_CHANGED, Wiring, direction_findings, thruster_outputs, wiring
 
+EKF2_NAMES = {"NKF1": "XKF1", "NKF4": "XKF4", "NKQ": "XKQ", "NKQ1": "XKQ", "XKQ1": "XKQ"}
+"""Records of EKF2, and of versions that name each core's records: the names of today's EKF3."""
+_EKF2 = 2  # AHRS_EKF_TYPE
 WANTED = (
     "ACC",
     "ARM",
@@ -34,6 +40,8 @@ WANTED = (
     "GYR",
     "IMU",
     "MODE",
+    "MSG",
+    *EKF2_NAMES,
     "PARM",
     "RATE",
     "RCIN",
@@ -47,6 +55,7 @@ WANTED = (
 )
 _HORIZ_VEL, _HORIZ_POS, _CONST_POS = 1 << 1, 1 << 3 | 1 << 4, 1 << 7
 _ARMED_EVENT, _DISARMED_EVENT = 10, 11
+_AIDS = ("VISO", "VISP", "VISV")
 _LATEST_S = 1e9  # of a clock that counts from the boot
 
 
@@ -60,7 +69,7 @@ def signals_from_bin(
             another.
     """
     usable = {name: _usable(table) for name, table in log.tables.items()}
-    tables = {name: table for name, table in usable.items() if table["t"].size}
+    tables = _as_ekf3({name: table for name, table in usable.items() if table["t"].size})
     core = _primary_core(tables)
     attitude = _attitude(tables, core)
     first, last = float(attitude.t[0]), float(attitude.t[-1])
@@ -70,7 +79,7 @@ def signals_from_bin(
     )
     known = {p.name: p.value for p in parameters}
     wired = wiring(parameters, first, last, vehicle)
-    outputs, notes = _outputs(tables, wired)
+    outputs, notes, frame = _outputs(tables, wired, vehicle is not None)
     position, velocity = _motion(tables, core, known, density)
     rates, rate_notes = _rates(tables, core)
     force = _imu(tables, core, "ACC", ("AccX", "AccY", "AccZ"), "specific force")
@@ -80,7 +89,14 @@ def signals_from_bin(
     if force is not None and force.source != "ACC":
         force, delay = undelayed(force, known, "INS_ACCEL_FILTER")
         rate_notes = (*rate_notes, *delay)
-    aids = [name for name in ("VISO", "VISP", "VISV") if name in tables]
+    aids = [name for name in _AIDS if name in tables]
+    no_aid, stops = aid_spans(tables, aids, last)
+    spans = {"wiring": wired.spans, **_states(tables, first, last), **_aiding(tables, core)}
+    voltage = _voltage(tables)
+    batteries = [name for name in ("BAT",) if name in tables]
+    texts = [] if "MSG" not in tables else [m.decode("ascii", "replace") for m in _messages(tables)]
+    findings = [*firmware_findings("MSG", texts), *frame, *stops]
+    findings += [*missing_states(spans, voltage, batteries), *direction_findings(wired)]
     return Signals(
         attitude=attitude,
         rates=rates,
@@ -90,20 +106,41 @@ def signals_from_bin(
         velocity=velocity,
         specific_force=force,
         pressure_depth=_pressure_depth(tables, known, density),
-        voltage=_voltage(tables),
+        voltage=voltage,
         rc=_rc(tables),
-        spans={"wiring": wired.spans, **_states(tables, first, last), **_aiding(tables, core)},
+        spans={**spans, **no_aid},
+        cuts=tuple((t, DIRECTION_CHANGED) for t in wired.changes),
         has=(f"Horizontal aid: {', '.join(aids)}.",) if aids else (),
         lacks=() if aids else ("No DVL, odometry or vision record in the log.",),
         notes=(*log.notes, *strange, *wired.notes, *notes, *rate_notes),
+        findings=tuple(findings),
+        turned=wired.turned,
     )
+
+
+def _messages(tables: Mapping[str, Table]) -> list[bytes]:
+    return [bytes(text).strip(b"\0") for text in tables["MSG"]["Message"]]
+
+
+def _as_ekf3(tables: dict[str, Table]) -> dict[str, Table]:
+    """The tables with EKF2's records under EKF3's names, if there are no others or it flew."""
+    parameters = tables.get("PARM")
+    flew = np.zeros(0)
+    if parameters is not None:
+        flew = parameters["Value"][parameters["Name"] == b"AHRS_EKF_TYPE"]
+    preferred = flew.size > 0 and flew[-1] == _EKF2
+    found = dict(tables)
+    for old, new in EKF2_NAMES.items():
+        if old in tables and (new not in tables or (preferred and old.startswith("N"))):
+            found[new] = tables[old]
+    return found
 
 
 def _usable(table: Table) -> Table:
     """Messages with a valid time, in time order; numeric columns only (and the names of PARM)."""
     kept = Table(table.name)
     for column, values in table.items():
-        text = (table.name, column) == ("PARM", "Name")
+        text = (table.name, column) in (("PARM", "Name"), ("MSG", "Message"))
         if values.ndim == 1 and values.dtype.kind == ("S" if text else "f"):
             kept[column] = values
     kept["t"] = kept["SampleUS" if "SampleUS" in kept else "TimeUS"] * 1e-6
@@ -227,14 +264,16 @@ def _states(tables: Mapping[str, Table], first: float, last: float) -> dict[str,
     return spans
 
 
-def _outputs(tables: Mapping[str, Table], wired: Wiring) -> tuple[Series, list[str]]:
+def _outputs(
+    tables: Mapping[str, Table], wired: Wiring, named: bool
+) -> tuple[Series, list[str], list[Finding]]:
     if "RCOU" not in tables:
         raise UserError(
             "no RCOU in this log, so nothing tells what the thrusters did; "
             "set LOG_BITMASK to its default"
         )
     table = tables["RCOU"]
-    channels = np.zeros((16, table["t"].size))
+    channels = np.zeros((32, table["t"].size))
     for n in range(1, 15):
         if f"C{n}" in table:
             channels[n - 1] = table[f"C{n}"]
@@ -246,7 +285,7 @@ def _outputs(tables: Mapping[str, Table], wired: Wiring) -> tuple[Series, list[s
     )
     if outputs is None:
         raise UserError("RCOU: a single record is no record of the thrusters")
-    return outputs, notes
+    return outputs, notes, frame_findings(wired.frame, wired.motors, channels, named)
 
 
 def _pressure_depth(

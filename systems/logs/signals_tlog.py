@@ -5,12 +5,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...models.config.errors import UserError
+from ...models.recordings.checks.finding import Finding
 from ..mavlink import codec
 from .depth import in_water
+from .frame import firmware_findings, frame_findings, kind_findings
 from .signals import Series, Signals, Spans, parameters_of, sampled_spans, series, undelayed
+from .streams import aid_spans, missing_states
 from .table import Table
 from .tlog import TlogLog
-from .wiring import Wiring, thruster_outputs, wiring
+from .wiring import DIRECTION_CHANGED, Wiring, direction_findings, thruster_outputs, wiring
 
 WANTED = (
     "ATTITUDE",
@@ -28,11 +31,12 @@ WANTED = (
     "SCALED_PRESSURE",
     "SCALED_PRESSURE2",
     "SERVO_OUTPUT_RAW",
+    "STATUSTEXT",
     "SYSTEM_TIME",
     "SYS_STATUS",
 )
 UNAIDED = "unaided"
-_AIDS = ("VISION_POSITION_DELTA", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE", "ODOMETRY")
+AIDS = ("VISION_POSITION_DELTA", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE", "ODOMETRY")
 _FIX_3D = 3
 _VELOCITY_HORIZ, _POS_HORIZ, _CONST_POS = 2, 8 | 16, 128
 
@@ -62,16 +66,23 @@ def signals_from_tlog(
     )
     wired = wiring(parameters, first, last, vehicle)
     known = {p.name: p.value for p in parameters}
-    outputs, notes = _outputs(outputs_table, wired)
+    outputs, notes, frame = _outputs(outputs_table, wired, vehicle is not None)
     aiding = _aiding(tables)
     position, velocity = _motion(tables, known, density)
     rates, bias_note = _rates(tables, attitude)
     rates, rate_delay = undelayed(rates, known, "INS_GYRO_FILTER")
     force, force_delay = _specific_force(tables, known)
-    aids = sorted({name for name, _, _ in log.heard if name in _AIDS})
+    aids = sorted({name for name, _, _ in log.heard if name in AIDS})
     fixes = tables.get("GPS_RAW_INT")
     if fixes is not None and np.median(fixes["fix_type"]) >= _FIX_3D:
         aids.append("GPS")
+    no_aid, stops = ({}, []) if "GPS" in aids else aid_spans(tables, AIDS, last)
+    spans = {"wiring": wired.spans, **_states(tables), **aiding, **no_aid}
+    voltage = _voltage(tables)
+    batteries = [name for name in ("BATTERY_STATUS", "SYS_STATUS") if name in tables]
+    texts = [] if "STATUSTEXT" not in tables else _texts(tables["STATUSTEXT"]["text"])
+    findings = kind_findings(*log.kind) or firmware_findings("STATUSTEXT", texts)
+    findings += [*frame, *stops, *missing_states(spans, voltage, batteries)]
     has = [f"Horizontal aid: {', '.join(aids)}."] if aids else []
     return Signals(
         attitude=attitude,
@@ -82,13 +93,18 @@ def signals_from_tlog(
         velocity=velocity,
         specific_force=force,
         pressure_depth=_pressure_depth(tables, known, density),
-        voltage=_voltage(tables),
+        voltage=voltage,
         rc=_rc(tables),
-        spans={"wiring": wired.spans, **_states(tables), **aiding},
-        cuts=tuple((t, "reboot of the autopilot") for t in log.boots),
+        spans=spans,
+        cuts=(
+            *((t, "reboot of the autopilot") for t in log.boots),
+            *((t, DIRECTION_CHANGED) for t in wired.changes),
+        ),
         has=tuple(has),
         lacks=() if aids else ("No DVL, odometry, vision or GPS message in the log.",),
         notes=(*log.notes, *strange, *wired.notes, *notes, *bias_note, *rate_delay, *force_delay),
+        findings=(*findings, *direction_findings(wired)),
+        turned=wired.turned,
     )
 
 
@@ -177,18 +193,47 @@ def _states(tables: Mapping[str, Table]) -> dict[str, Spans]:
     }
 
 
-def _outputs(table: Table, wired: Wiring) -> tuple[Series, list[str]]:
-    main = table["port"] == 0
-    channels = np.stack([table[f"servo{n}_raw"][main] for n in range(1, 17)])
-    outputs, notes = thruster_outputs(
-        table["t"][main],
-        channels,
-        wired,
-        "SERVO_OUTPUT_RAW",
+def _texts(column: np.ndarray) -> list[str]:
+    return [bytes(text).decode("ascii", "replace").strip("\0") for text in column]
+
+
+def _outputs(table: Table, wired: Wiring, named: bool) -> tuple[Series, list[str], list[Finding]]:
+    """The thrusters' PWM, by the outputs' functions whatever their port.
+
+    Port 1 has outputs 17 to 32, or 9 to 16 of an autopilot with eight outputs a port: the functions
+    tell which.
+    """
+    ports = {int(port): table.rows(table["port"] == port) for port in np.unique(table["port"])}
+    first = 17 if any(channel > 16 for channel in wired.channels) else 9
+    starts = {0: 1, 1: first}
+    wanted = {channel for channel in wired.channels if channel}
+    driving = [p for p, start in starts.items() if wanted & set(range(start, start + 16))]
+    main = max(
+        (p for p in ports if p in starts),
+        key=lambda p: (p in driving and (p == 1 or not _silent(ports[p], wanted)), -p),
+        default=None,
     )
+    if main is None:
+        raise UserError("SERVO_OUTPUT_RAW: no port 0 or 1 in the log; log the thrusters' outputs")
+    t = ports[main]["t"]
+    channels = np.zeros((32, t.size))
+    for port in (p for p in (0, 1) if p in ports):
+        rows = ports[port]
+        at = np.clip(np.searchsorted(rows["t"], t, side="right") - 1, 0, None)
+        for n in range(1, 17):
+            place = starts[port] + n - 2
+            pulses = rows[f"servo{n}_raw"][at]
+            if place < 32 and (port == main or not channels[place].any()):
+                channels[place] = np.where(pulses > 0, pulses, channels[place])
+    outputs, notes = thruster_outputs(t, channels, wired, "SERVO_OUTPUT_RAW")
     if outputs is None:
         raise UserError("SERVO_OUTPUT_RAW: a single message is no record of the thrusters")
-    return outputs, notes
+    return outputs, notes, frame_findings(wired.frame, wired.motors, channels, named)
+
+
+def _silent(rows: Table, wanted: set[int]) -> bool:
+    """Whether port 0 never has a pulse on the outputs of thrusters."""
+    return not any(rows[f"servo{c}_raw"].any() for c in wanted if c <= 16)
 
 
 def _pressure_depth(
@@ -211,7 +256,7 @@ def _pressure_depth(
 
 def _voltage(tables: Mapping[str, Table]) -> Series | None:
     if (battery := tables.get("BATTERY_STATUS")) is not None:
-        main = battery["id"] == 0
+        main = battery["id"] == battery["id"].min()  # 0, unless the monitor has another number
         volts = np.asarray(codec.pack_voltage(battery["voltages"][main].T.astype(float)))
         known = np.isfinite(volts)
         found = series(battery["t"][main][known], volts[known], "BATTERY_STATUS", "voltage")

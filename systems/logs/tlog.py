@@ -20,7 +20,7 @@ from .log_bytes import Progress, no_progress
 from .packets import Packets, message_id, message_name, rows_of, scan
 from .table import Table, numbers
 
-_GROUND_STATION, _NO_AUTOPILOT, _SUBMARINE, _ARDUPILOT = 6, 8, 12, 3
+_GROUND_STATION, _NO_AUTOPILOT, _SUBMARINE = 6, 8, 12
 _CLOCKS = ("ATTITUDE", "ATTITUDE_QUATERNION", "SYSTEM_TIME")
 _REBOOT_S = 5.0
 _BETWEEN_BOOTS_S = 10.0
@@ -34,12 +34,14 @@ System = tuple[int, int]
 class TlogLog:
     """Tables of one vehicle's messages by name, each with `t` (s since first boot) and its fields.
 
+    `kind` are MAV_TYPE and MAV_AUTOPILOT of its heartbeat, -1 without one.
     `boots` are the times at which a later boot starts (none for a log of one boot), `heard` counts
     all messages of all systems by (name, system, component).
     """
 
     tables: Mapping[str, Table]
     system: System
+    kind: tuple[int, int]
     boots: tuple[float, ...]
     heard: Mapping[tuple[str, int, int], int]
     notes: tuple[str, ...]
@@ -50,22 +52,26 @@ def read_tlog(
     wanted: Collection[str],
     system: int | None = None,
     progress: Progress = no_progress,
+    anyone: Collection[str] = (),
 ) -> TlogLog:
     """Decode the wanted messages of one autopilot: of `system` if given, else of the busiest.
+
+    Those of `anyone` are taken whoever sent them.
 
     Raises:
         UserError: if the log has no messages of an autopilot, or none of the chosen system.
     """
     packets = scan(data, progress)
     heard = _heard(packets)
-    chosen, notes = _choose(data, packets, heard, system)
+    chosen, kind, notes = _choose(data, packets, heard, system)
     own = (packets.system == chosen[0]) & (packets.component == chosen[1])
     tables: dict[str, Table] = {}
     index: dict[str, np.ndarray] = {}
     broken = 0
-    names = sorted(set(wanted) | set(_CLOCKS))
+    names = sorted(set(wanted) | set(_CLOCKS) | set(anyone))
     for n, name in enumerate(names):
-        candidates = np.flatnonzero(own & (packets.message == message_id(name)))
+        from_it = own | (name in anyone)
+        candidates = np.flatnonzero(from_it & (packets.message == message_id(name)))
         if candidates.size:
             rows, good = rows_of(data, packets, candidates, name)
             broken += int(candidates.size - good.size)
@@ -81,7 +87,7 @@ def read_tlog(
     if broken:
         notes.append(f"{broken} messages with a wrong checksum were left out.")
     notes.extend(clock_note)
-    return TlogLog(tables, chosen, boots, heard, tuple(notes))
+    return TlogLog(tables, chosen, kind, boots, heard, tuple(notes))
 
 
 def _heard(packets: Packets) -> dict[tuple[str, int, int], int]:
@@ -98,7 +104,7 @@ def _choose(
     packets: Packets,
     heard: Mapping[tuple[str, int, int], int],
     system: int | None,
-) -> tuple[System, list[str]]:
+) -> tuple[System, tuple[int, int], list[str]]:
     autopilots: dict[System, tuple[int, int]] = {}
     beats = np.flatnonzero(packets.message == message_id("HEARTBEAT"))
     rows, good = rows_of(data, packets, beats, "HEARTBEAT")
@@ -131,15 +137,7 @@ def _choose(
             f"Several autopilots in the log ({sorted(s for s, _ in autopilots)}): "
             f"system {chosen[0]} was taken."
         )
-    kind, maker = autopilots[chosen]
-    if maker not in (_ARDUPILOT, -1):
-        notes.append(
-            f"The autopilot is not ArduPilot (MAV_AUTOPILOT {maker}): mode names and thruster "
-            "order are ArduSub's and may be wrong."
-        )
-    elif kind not in (_SUBMARINE, -1):
-        notes.append(f"The vehicle calls itself MAV_TYPE {kind}, not a submarine (12).")
-    return chosen, notes
+    return chosen, autopilots[chosen], notes
 
 
 def _put_on_vehicle_clock(

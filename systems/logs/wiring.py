@@ -2,11 +2,12 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ...models.config.errors import UserError
+from ...models.recordings.checks.finding import Finding
 from ...models.vehicles.vehicle import load_vehicle
 from ..mavlink.codec import FRAME_THRUSTERS, MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS, thruster_pwm
 from .signals import Parameter, Series, Spans, series
@@ -22,17 +23,30 @@ class Wiring:
     Attributes:
         vehicle: preset or file.
         channels: output of each thruster (1-based), 0 where none drives it.
-        mirrored: those that turn the other way than in the vehicle's file.
+        mirrored: those that turn the other way than in the vehicle's file, by time: from each
+            time on (s).
         spans: of reassigned outputs.
+        frame: FRAME_CONFIG, if the log has it.
+        motors: motor of each output channel (from 1) that has one.
+        turned: thrusters (from 1) whose output has SERVOn_REVERSED.
     """
 
     vehicle: str
     channels: tuple[int, ...]
-    mirrored: tuple[bool, ...]
+    mirrored: tuple[tuple[float, tuple[bool, ...]], ...]
     spans: Spans
     notes: tuple[str, ...]
+    frame: int | None = None
+    motors: Mapping[int, int] = field(default_factory=dict)
+    turned: tuple[int, ...] = ()
+
+    @property
+    def changes(self) -> tuple[float, ...]:
+        """Times (s) at which a thruster's direction changed."""
+        return tuple(t for t, _ in self.mirrored[1:])
 
 
+DIRECTION_CHANGED = "change of a thruster's direction"
 _SETTLING_S = 1.3  # an output's new function is in force by then
 
 
@@ -49,15 +63,19 @@ def wiring(
         UserError: the log's frame has another number of thrusters than the named vehicle.
     """
     functions: dict[int, list[tuple[float, int]]] = {}
-    directions: dict[int, int] = {}
+    directions: list[tuple[float, int, int]] = []
+    reverse: dict[int, bool] = {}
     frame = None
     for p in parameters:
-        servo = re.fullmatch(r"SERVO([1-9]|1[0-6])_FUNCTION", p.name)
+        servo = re.fullmatch(r"SERVO([1-9]|[12][0-9]|3[0-2])_FUNCTION", p.name)
+        turned = re.fullmatch(r"SERVO([1-9]|[12][0-9]|3[0-2])_REVERSED", p.name)
         motor = re.fullmatch(r"MOT_([1-8])_DIRECTION", p.name)
         if servo:
             functions.setdefault(int(servo[1]), []).append((p.t, round(p.value)))
         elif motor:
-            directions[int(motor[1])] = -1 if p.value < 0 else 1
+            directions.append((p.t, int(motor[1]), -1 if p.value < 0 else 1))
+        elif turned:
+            reverse[int(turned[1])] = p.value > 0
         elif p.name == "FRAME_CONFIG":
             frame = round(p.value)
     motor_of = {
@@ -71,12 +89,36 @@ def wiring(
     if not directions:
         told.append("No MOT_n_DIRECTION in the log: all directions are taken as +1.")
     changes = _label_changes({c: functions[c] for c in channel_of.values()})
+    motors = {channel: motor for channel, motor in motor_of.items() if motor is not None}
+    turned = tuple(k for k, c in enumerate(channels, 1) if c in motors and reverse.get(c, False))
+    own = [(mount.motor < 0) != (k in turned) for k, mount in enumerate(mounts, 1)]
     return Wiring(
         name,
         tuple(channels),
-        tuple(mount.motor * directions.get(i, 1) < 0 for i, mount in enumerate(mounts, 1)),
+        _mirrored(own, directions),
         _settled(changes, first, last),
         (*notes, *told),
+        frame,
+        motors,
+        turned,
+    )
+
+
+def _mirrored(
+    own: Sequence[bool], directions: Sequence[tuple[float, int, int]]
+) -> tuple[tuple[float, tuple[bool, ...]], ...]:
+    """Which thrusters are mirrored from when on; a value's first report holds before it too."""
+    now: dict[int, int] = {}
+    for _, motor, sign in directions:
+        now.setdefault(motor, sign)
+    found = [(-np.inf, now.copy())]
+    for t, motor, sign in directions:
+        if now[motor] != sign:
+            now[motor] = sign
+            found.append((t, now.copy()))
+    return tuple(
+        (t, tuple(is_ != (signs.get(k, 1) < 0) for k, is_ in enumerate(own, 1)))
+        for t, signs in found
     )
 
 
@@ -118,7 +160,12 @@ def _channels(
 ) -> tuple[list[int], list[str]]:
     """The outputs of all thrusters; one without an own output has that of its number if free."""
     numbers = range(1, count + 1)
-    other = {n for n, history in functions.items() if not _drives(history) and _used(history)}
+    assigned = bool(channel_of)  # then an output without a function is no thruster's
+    other = {
+        n
+        for n, history in functions.items()
+        if not _drives(history) and (assigned or _used(history))
+    }
     free = set(numbers) - other - set(channel_of.values())
     channels = [channel_of.get(n, n if n in free else 0) for n in numbers]
     if not channel_of:
@@ -132,6 +179,19 @@ def _channels(
         if absent:
             notes.append(f"No output is assigned to thrusters {', '.join(absent)}; {said}.")
     return channels, notes
+
+
+def direction_findings(wired: Wiring) -> list[Finding]:
+    """A finding for each change of MOT_n_DIRECTION during the log."""
+    return [
+        Finding(
+            "output-direction",
+            f"{t:.1f} s on the vehicle's clock",
+            "MOT_n_DIRECTION changed: the log is cut there, and each part has its own signs",
+            "leave the parameter alone during a dive",
+        )
+        for t in wired.changes
+    ]
 
 
 def _label_changes(functions: Mapping[int, Sequence[tuple[float, int]]]) -> list[tuple[float, str]]:
@@ -168,16 +228,19 @@ def _settled(changes: Sequence[tuple[float, str]], first: float, last: float) ->
 def thruster_outputs(
     t: np.ndarray, channels_us: np.ndarray, wired: Wiring, source: str
 ) -> tuple[Series | None, list[str]]:
-    """PWM of the thrusters from output channels (16, n), with the signs of the vehicle's file.
+    """PWM of the thrusters from output channels (32, n), with the signs of the vehicle's file.
 
     Where the log's MOT_n_DIRECTION differs from it, the value is mirrored about 1500.
     """
     notes = []
     index = np.array(wired.channels)[:, None]
     raw = np.where(index > 0, channels_us[index[:, 0] - 1], 0)
-    mirrored = np.array(wired.mirrored)
-    if mirrored.any():
-        which = ", ".join(str(i + 1) for i in np.flatnonzero(mirrored))
+    since = np.searchsorted([start for start, _ in wired.mirrored[1:]], t, side="right")
+    mirrored = np.array([signs for _, signs in wired.mirrored])[since].T
+    by_direction = mirrored[:, -1:] if t.size else mirrored
+    named = [i for i in np.flatnonzero(by_direction) if i + 1 not in wired.turned]
+    if named:
+        which = ", ".join(str(i + 1) for i in named)
         notes.append(
             f"Thrusters {which} run the other way than in the vehicle's description "
             "(MOT_n_DIRECTION); their PWM is mirrored about 1500."
@@ -186,5 +249,5 @@ def thruster_outputs(
     if dead.any():
         which = ", ".join(str(i + 1) for i in np.flatnonzero(dead))
         notes.append(f"Thrusters {which} never got a pulse; they are taken as stopped.")
-    signs = np.where(mirrored, -1, 1)[:, None]
+    signs = np.where(mirrored, -1, 1)
     return series(t, thruster_pwm(raw, signs), source, "pwm"), notes

@@ -1,0 +1,141 @@
+"""What kind of vehicle a log is of, and whether its frame fits its outputs."""
+
+import re
+from collections.abc import Collection, Iterable, Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from ...models.recordings.checks.commands import command_findings
+from ...models.recordings.checks.finding import Finding
+from ...models.recordings.store import Recording
+from ...models.vehicles.vehicle import load_vehicle
+from ..mavlink.codec import FRAME_THRUSTERS, NEUTRAL_US
+
+_FRAMES = {
+    0: ("BLUEROV1", 6),
+    1: ("VECTORED", 6),
+    2: ("VECTORED_6DOF", 8),
+    3: ("VECTORED_6DOF_90DEG", 8),
+    4: ("SIMPLEROV_3", 3),
+    5: ("SIMPLEROV_4", 4),
+    6: ("SIMPLEROV_5", 5),
+    7: ("CUSTOM", 8),
+}
+"""Name and number of motors by FRAME_CONFIG (ArduPilot, AP_Motors6DOF)."""
+_KINDS = {
+    1: "a fixed-wing aeroplane", 2: "a quadrotor", 3: "a coaxial helicopter", 4: "a helicopter",
+    10: "a rover", 11: "a boat", 13: "a hexarotor", 14: "an octorotor", 15: "a tricopter",
+}  # fmt: skip
+_MAKERS = {12: "PX4"}
+_SUBMARINE, _ARDUPILOT = 12, 3
+_FIRMWARE = re.compile(r"(Ardu(?:Copter|Plane|Rover)|APM:(?:Copter|Plane|Rover)|PX4|Rover|Blimp)\b")
+_MOVES_US = 20.0
+
+
+def kind_findings(kind: int, maker: int) -> list[Finding]:
+    """What a heartbeat's MAV_TYPE and MAV_AUTOPILOT say; -1 is unknown."""
+    said = []
+    if maker not in (_ARDUPILOT, -1):
+        said.append(
+            f"its autopilot is {_MAKERS.get(maker, 'not ArduPilot')} (MAV_AUTOPILOT {maker})"
+        )
+    if kind not in (_SUBMARINE, -1):
+        said.append(f"it is {_KINDS.get(kind, 'no submarine')} (MAV_TYPE {kind})")
+    return [_not_a_submarine("HEARTBEAT", said)] if said else []
+
+
+def firmware_findings(place: str, texts: Iterable[str]) -> list[Finding]:
+    """What the autopilot's messages say of its firmware."""
+    for text in texts:
+        found = _FIRMWARE.match(text.strip())
+        if found is not None:
+            return [_not_a_submarine(place, [f"its firmware is {text.strip()}"])]
+    return []
+
+
+def _not_a_submarine(place: str, said: list[str]) -> Finding:
+    return Finding(
+        "not-a-submarine",
+        place,
+        f"the log is not ArduSub's: {' and '.join(said)}",
+        "give a log of ArduSub, or its data as CSV (docs/recording.md)",
+    )
+
+
+def frame_findings(
+    frame: int | None,
+    motors: Mapping[int, int],
+    outputs_us: Float[np.ndarray, "32 n"],
+    named: bool,
+) -> list[Finding]:
+    """Contradictions of FRAME_CONFIG; `motors` are those of the output channels (from 1).
+
+    `named` tells whether the user named a vehicle.
+    """
+    if frame not in _FRAMES:
+        return []
+    name, count = _FRAMES[frame]
+    extra = [
+        c for c, motor in sorted(motors.items()) if motor > count and _moves(outputs_us[c - 1])
+    ]
+    if extra:
+        which = ", ".join(str(c) for c in extra)
+        return [
+            Finding(
+                "frame-contradiction",
+                f"FRAME_CONFIG {frame}",
+                f"frame {name} has {count} thrusters, and outputs {which} drive more of them",
+                "correct FRAME_CONFIG or SERVOn_FUNCTION in the log's parameters",
+            )
+        ]
+    if frame not in FRAME_THRUSTERS and not named:
+        return [
+            Finding(
+                "frame-without-preset",
+                f"FRAME_CONFIG {frame}",
+                f"no preset has the thrusters of frame {name}",
+                "name the vehicle (--vehicle FILE)",
+            )
+        ]
+    return []
+
+
+def _moves(pulses: np.ndarray) -> bool:
+    known = pulses[pulses > 0]
+    return known.size > 0 and bool(np.ptp(known) > _MOVES_US)
+
+
+def settled(recording: Recording, turned: Collection[int]) -> tuple[Recording, list[Finding]]:
+    """Decide by the motion whether outputs with SERVOn_REVERSED are mirrored.
+
+    `turned` are the thrusters (from 1) whose PWM was mirrored for it. ArduSub's mixer writes
+    pulses that the parameter does not touch, pass-through and other firmware do: where the
+    mirrored output contradicts the motion, the recorded one is restored.
+    """
+    if not turned:
+        return recording, []
+    against = {
+        int(f.place.rsplit("pwm", 1)[1])
+        for f in command_findings(recording, load_vehicle(recording.vehicle))
+        if f.word == "thruster-reversed"
+    }
+    found = []
+    for k in sorted(turned):
+        kept = k in against
+        told = (
+            "but the motion says that it is not" if kept else "and its PWM is mirrored about 1500"
+        )
+        found.append(
+            Finding(
+                "output-reversed",
+                f"SERVOn_REVERSED of thruster {k}",
+                f"the output of thruster {k} is set to be reversed, {told}",
+            )
+        )
+    back = [k - 1 for k in turned if k in against]
+    pwm = recording.dataset["pwm"]
+    values = pwm.to_numpy().copy()
+    values[..., back] = 2 * NEUTRAL_US - values[..., back]
+    dataset = recording.dataset.assign(pwm=(pwm.dims, values, pwm.attrs))
+    return Recording(dataset), found

@@ -108,7 +108,7 @@ def test_steps_of_integrate_and_of_diffrax_use_the_models_own_displacement():
 
     path = diffrax.UnsafeBrownianPath((6,), jax.random.key(0))
 
-    @quick
+    @eqx.filter_jit
     def both(m, X, V):
         terms = integrate.sde_terms(m, lambda t: F, path)
         solution = diffrax.diffeqsolve(
@@ -167,7 +167,7 @@ def test_the_rollout_in_coordinates_is_that_of_poses_where_nothing_wraps():
     F = jnp.asarray(5 * rng.normal(size=(10, 6, 4)))
     dW = jnp.asarray(0.2 * rng.normal(size=(10, 6, 4)))
 
-    @quick
+    @eqx.filter_jit
     def both(m, q, V):
         Xs, twists = integrate.rollout(m, euclidean.pose(q), V, F, 0.05, dW[:, None])
         return m.rollout(q, V, F, 0.05, dW), (jax.vmap(coordinates)(Xs), twists)

@@ -25,31 +25,36 @@ class CurrentSteady(Effect):
         return jnp.stack(jnp.broadcast_arrays(east, north, jnp.zeros_like(X_WB[6])))
 
 
-class CurrentVarying(Effect):
-    """A varying horizontal current: each component is a Gauss–Markov process in W."""
+class _MovingWater(Effect):
+    """Water that moves at random: two velocities are its state, with noise of their own."""
 
-    name: ClassVar[str] = "current_varying"
     family: ClassVar = "environment"
-    parameters: ClassVar = (
-        Parameter("std", "m/s", (0.05,), 0.0, 1.0),
-        Parameter("time_constant", "s", (10.0,), 0.0, 1e4),
-    )
     places: ClassVar = ("W",)
-    simpler: ClassVar = ("current_steady",)
     absorber: ClassVar[bool] = True
     random: ClassVar[bool] = True
     slow: ClassVar[bool] = True
-    source: ClassVar[str] = "0 to 0.3 m/s over 10 s to minutes"
 
     @property
     def pushes(self) -> int:
-        """East and north velocity."""
+        """Two velocities."""
         return 2
 
     @property
     def noise_size(self) -> int:
-        """One for each component."""
+        """One for each velocity."""
         return 2
+
+
+class CurrentVarying(_MovingWater):
+    """A varying horizontal current: each component is a Gauss–Markov process in W."""
+
+    name: ClassVar[str] = "current_varying"
+    parameters: ClassVar = (
+        Parameter("std", "m/s", (0.05,), 0.0, 1.0),
+        Parameter("time_constant", "s", (10.0,), 0.0, 1e4),
+    )
+    simpler: ClassVar = ("current_steady",)
+    source: ClassVar[str] = "0 to 0.3 m/s over 10 s to minutes"
 
     def advance(
         self, state: Float[Array, "s *#batch"], w: Float[Array, "w *#batch"], dt: Float[Array, ""]
@@ -64,7 +69,7 @@ class CurrentVarying(Effect):
         return jnp.concatenate([state, jnp.zeros_like(state[:1])])
 
 
-class Waves(Effect):
+class Waves(_MovingWater):
     """Orbital motion of long-crested swell: a narrow-band velocity with the depth's decay.
 
     Waves of `amplitude` a and `frequency` ω run towards `direction`; water moves by aω cos along it
@@ -74,27 +79,12 @@ class Waves(Effect):
     """
 
     name: ClassVar[str] = "waves"
-    family: ClassVar = "environment"
     parameters: ClassVar = (
         Parameter("amplitude", "m", (0.02,), 0.0, 20.0),
         Parameter("frequency", "rad/s", (1.0,), 0.0, 10.0),
         Parameter("direction", "rad", (0.0,), -7.0, 7.0),
     )
-    places: ClassVar = ("W",)
-    absorber: ClassVar[bool] = True
-    random: ClassVar[bool] = True
-    slow: ClassVar[bool] = True
     source: ClassVar[str] = "wind sea of 3 to 8 s, swell of 8 to 16 s"
-
-    @property
-    def pushes(self) -> int:
-        """In-phase and quadrature velocity at the surface."""
-        return 2
-
-    @property
-    def noise_size(self) -> int:
-        """One for each quadrature."""
-        return 2
 
     def advance(
         self, state: Float[Array, "s *#batch"], w: Float[Array, "w *#batch"], dt: Float[Array, ""]

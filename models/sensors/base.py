@@ -180,6 +180,29 @@ class Sensor(abc.ABC):
         station.measure(name, self)
 
 
+class Gauge(Sensor):
+    """A sensor of one value with a slow error. State: the slow error, then the reading."""
+
+    @property
+    def state_size(self) -> int:
+        """Slow error and reading."""
+        return 2
+
+    @property
+    def initial_noise_size(self) -> int:
+        """The slow error."""
+        return 1
+
+    @property
+    def reading_size(self) -> int:
+        """One value."""
+        return 1
+
+    def initial(self, w: Float[Array, "1 *batch"]) -> Float[Array, "2 *batch"]:
+        """Draw the slow error from its stationary law."""
+        return jnp.concatenate([self.slow_error[0] * w, jnp.zeros_like(w)])
+
+
 def along_pose(h: Callable[[Array], Array], X_WB: Float[Array, "7"]) -> tuple[Array, Array]:
     """Value of h at a pose and its Jacobian in the pose's error, by forward differentiation."""
     value, slope = jax.linearize(h, X_WB)

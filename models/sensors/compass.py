@@ -10,11 +10,11 @@ from jaxtyping import Array, Float
 from .. import se3
 from ..config.checks import require
 from ..randomness import Scalar, column, gauss_markov
-from .base import Innovation, Sensor, along_pose
+from .base import Gauge, Innovation, along_pose
 
 
 @dataclass(frozen=True)
-class Compass(Sensor):
+class Compass(Gauge):
     """A tilt-compensated compass with white noise and a slow first-order Gauss–Markov error.
 
     Reading (1): yaw (rad), counter-clockwise from W's x axis, in [−π, π). State: the slow error,
@@ -44,24 +44,9 @@ class Compass(Sensor):
         require(self.wander_time > 0, self, "wander_time", "give a time above zero")
 
     @property
-    def state_size(self) -> int:
-        """Slow error and reading."""
-        return 2
-
-    @property
     def noise_size(self) -> int:
         """White noise and the slow error's noise."""
         return 2
-
-    @property
-    def initial_noise_size(self) -> int:
-        """The slow error."""
-        return 1
-
-    @property
-    def reading_size(self) -> int:
-        """Yaw."""
-        return 1
 
     @property
     def slow_error(self) -> tuple[float, float]:
@@ -95,10 +80,6 @@ class Compass(Sensor):
     def expected(self, X_WB: Float[Array, "7 *batch"]) -> Float[Array, "1 *batch"]:
         """Noise-free reading: the yaw of B."""
         return se3.yaw(X_WB)[None]
-
-    def initial(self, w: Float[Array, "1 *batch"]) -> Float[Array, "2 *batch"]:
-        """Draw the slow error from its stationary law."""
-        return jnp.concatenate([self.wander * w, jnp.zeros_like(w)])
 
     def measure(
         self,

@@ -10,11 +10,11 @@ from jaxtyping import Array, Float
 from .. import se3
 from ..config.checks import Vector3, require
 from ..randomness import Scalar, column
-from .base import Innovation, Sensor, along_pose
+from .base import Gauge, Innovation, along_pose
 
 
 @dataclass(frozen=True)
-class DepthSensor(Sensor):
+class DepthSensor(Gauge):
     """A pressure sensor that converts pressure to depth with an assumed density.
 
     Reading (1): depth of the sensor, positive down (m), in still water (wave pressure is
@@ -49,23 +49,8 @@ class DepthSensor(Sensor):
             require(getattr(self, field) > 0, self, field, "give a density above zero")
 
     @property
-    def state_size(self) -> int:
-        """Offset and reading."""
-        return 2
-
-    @property
     def noise_size(self) -> int:
         """White noise."""
-        return 1
-
-    @property
-    def initial_noise_size(self) -> int:
-        """The offset."""
-        return 1
-
-    @property
-    def reading_size(self) -> int:
-        """Depth."""
         return 1
 
     @property
@@ -88,10 +73,6 @@ class DepthSensor(Sensor):
         """Noise-free reading: −z of the sensor times the ratio of the densities."""
         z = se3.act(X_WB, column(self.position, X_WB))[2:]
         return -(self.water_density / self.assumed_density) * z
-
-    def initial(self, w: Float[Array, "1 *batch"]) -> Float[Array, "2 *batch"]:
-        """Draw the offset."""
-        return jnp.concatenate([self.offset_std * w, jnp.zeros_like(w)])
 
     def measure(
         self,

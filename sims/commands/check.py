@@ -1,7 +1,6 @@
 """`spinndrift check`: the accuracy of this package on cases with a known answer."""
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -9,10 +8,10 @@ from typing import Annotated, ClassVar
 from tyro.conf import OmitArgPrefixes, subcommand
 
 from ...models.config.checks import RATE_OF_ALARMS, WORKERS
-from ...models.config.errors import UserError
 from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar
 from .check_estimator import CheckEstimator
+from .check_outputs import check_page, held_outputs, refuse_given_up
 
 
 @dataclass(frozen=True)
@@ -39,19 +38,12 @@ class CheckDiagnosis:
     docs: Path | None = None
     """Markdown file to write the tables into, such as docs/diagnosis.md."""
 
-    @contextmanager
-    def place(self) -> Iterator[None]:
+    def place(self) -> AbstractContextManager[None]:
         """Check and lock the outputs."""
         with interrupts_held():
-            from ...models.files.owned import run_folder
             from ..diagnosis_benchmark.run import CHECK
-            from ..reports.marked_page import held_page
 
-        with ExitStack() as held:
-            if self.docs is not None:
-                held.enter_context(held_page(self.docs))
-            held.enter_context(run_folder(self.out, CHECK))
-            yield
+        return held_outputs(self.out, CHECK, self.docs)
 
     def run(self) -> None:
         """Diagnose, judge, report."""
@@ -61,8 +53,7 @@ class CheckDiagnosis:
             from ..diagnosis_benchmark.run import run_cases
             from ..diagnosis_benchmark.tables import print_tables, tables
 
-        if self.docs is not None and self.docs.suffix != ".md":
-            raise UserError(f"--docs {self.docs}: end the name in .md")
+        check_page(self.docs)
         cases = find_cases(self.cases, self.only)
         with progress_bar(f"{len(cases)} cases") as update:
             rows, failed = run_cases(cases, self.out, self.alpha, update, self.rivals, self.workers)
@@ -72,12 +63,7 @@ class CheckDiagnosis:
         if self.docs is not None:
             write_page(self.docs, rows, cases)
         shown.print(f"wrote {self.docs or self.out / 'diagnosis.md'}")
-        for one in failed:
-            shown.print(f"{one.task} was given up: {one.reason}")
-        if failed:
-            raise UserError(
-                f"{len(failed)} cases were given up (see above); the same command tries them again"
-            )
+        refuse_given_up(failed, "cases")
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,14 @@
 """`spinndrift check estimator`: consistency of the filter, with and without sensor faults."""
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from ...models.config.checks import WORKERS, Within
-from ...models.config.errors import UserError
 from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar
+from .check_outputs import check_page, held_outputs, refuse_given_up
 
 if TYPE_CHECKING:
     from ..estimator_check.settings import Setting
@@ -44,19 +43,12 @@ class CheckEstimator:
     docs: Path | None = None
     """Markdown file to write the tables into, such as docs/estimator.md."""
 
-    @contextmanager
-    def place(self) -> Iterator[None]:
+    def place(self) -> AbstractContextManager[None]:
         """Check and lock the outputs."""
         with interrupts_held():
-            from ...models.files.owned import run_folder
             from ..estimator_check.run import ESTIMATOR
-            from ..reports.marked_page import held_page
 
-        with ExitStack() as held:
-            if self.docs is not None:
-                held.enter_context(held_page(self.docs))
-            held.enter_context(run_folder(self.out, ESTIMATOR))
-            yield
+        return held_outputs(self.out, ESTIMATOR, self.docs)
 
     def run(self) -> None:
         """Simulate, judge, report."""
@@ -67,7 +59,7 @@ class CheckEstimator:
             from ..estimator_check.tables import tables
             from ..reports.marked_page import write_measured
 
-        self._check_options()
+        check_page(self.docs)
         settings = self._settings()
         runs = {"consistency": self.runs, "faults": self.fault_runs}
         with progress_bar(f"{len(settings)} settings") as update:
@@ -78,17 +70,7 @@ class CheckEstimator:
         for page in pages:
             write_measured(page, page_text(results))
         shown.print(f"wrote {pages[-1]}")
-        for one in failed:
-            shown.print(f"{one.task} was given up: {one.reason}")
-        if failed:
-            raise UserError(
-                f"{len(failed)} settings were given up (see above); the same command tries them "
-                "again"
-            )
-
-    def _check_options(self) -> None:
-        if self.docs is not None and self.docs.suffix != ".md":
-            raise UserError(f"--docs {self.docs}: end the name in .md")
+        refuse_given_up(failed, "settings")
 
     def _settings(self) -> list["Setting"]:
         """The settings to simulate; the model is trained first if it is needed but not given."""

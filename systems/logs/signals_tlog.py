@@ -59,11 +59,8 @@ def signals_from_tlog(
         )
     first, last = float(attitude.t[0]), float(attitude.t[-1])
     table = tables.get("PARAM_VALUE")
-    parameters, strange = (
-        ([], [])
-        if table is None
-        else parameters_of(table["t"], table["param_id"], table["param_value"])
-    )
+    columns = None if table is None else (table[c] for c in ("t", "param_id", "param_value"))
+    parameters, strange = ([], []) if columns is None else parameters_of(*columns)
     wired = wiring(parameters, first, last, vehicle)
     known = {p.name: p.value for p in parameters}
     outputs, notes, frame = _outputs(outputs_table, wired, vehicle is not None)
@@ -72,10 +69,7 @@ def signals_from_tlog(
     rates, bias_note = _rates(tables, attitude)
     rates, rate_delay = undelayed(rates, known, "INS_GYRO_FILTER")
     force, force_delay = _specific_force(tables, known)
-    aids = sorted({name for name, _, _ in log.heard if name in AIDS})
-    fixes = tables.get("GPS_RAW_INT")
-    if fixes is not None and np.median(fixes["fix_type"]) >= _FIX_3D:
-        aids.append("GPS")
+    aids = _aids(log)
     no_aid, stops = ({}, []) if "GPS" in aids else aid_spans(tables, AIDS, last)
     spans = {"wiring": wired.spans, **_states(tables), **aiding, **no_aid}
     voltage = _voltage(tables)
@@ -106,6 +100,14 @@ def signals_from_tlog(
         findings=(*findings, *direction_findings(wired)),
         turned=wired.turned,
     )
+
+
+def _aids(log: TlogLog) -> list[str]:
+    """Names of the sources of horizontal position and velocity that were heard."""
+    aids = sorted({name for name, _, _ in log.heard if name in AIDS})
+    fixes = log.tables.get("GPS_RAW_INT")
+    gps = fixes is not None and np.median(fixes["fix_type"]) >= _FIX_3D
+    return [*aids, "GPS"] if gps else aids
 
 
 def _attitude(tables: Mapping[str, Table]) -> Series:

@@ -15,6 +15,7 @@ from spinndrift.models.recordings.checks.finding import (
     findings_of,
     with_findings,
 )
+from spinndrift.models.recordings.checks.velocity import lag_findings
 from spinndrift.models.recordings.resample import rotations
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.vehicles.vehicle import load_vehicle
@@ -139,3 +140,16 @@ def test_the_page_lists_every_word():
     page = (ROOT / "docs/checks.md").read_text(encoding="utf-8")
     for word, (severity, meaning) in WORDS.items():
         assert f"| `{word}` | {severity} | {meaning}" in page
+
+
+@pytest.mark.parametrize("shift", [4, -6])
+def test_velocities_shifted_in_time_are_named_with_the_shift(dive, shift):
+    late = changed(dive, "V_WB_B", lambda V: np.concatenate(
+        [np.roll(V[..., :3], shift, axis=2), V[..., 3:]], axis=-1
+    ))  # fmt: skip
+    inside = late.cut(0.5, 19.5)
+    (finding,) = lag_findings(inside)
+    how = "after" if shift > 0 else "before"
+    assert (finding.word, finding.place) == ("velocity-lag", "u,v,w")
+    assert f"{abs(shift) * dive.dt:.2g} s {how}" in finding.text
+    assert lag_findings(dive) == []

@@ -10,6 +10,7 @@ from motion import smooth_motion
 from helpers import ROOT, shared_data
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.recordings.build import Trajectory
+from spinndrift.models.recordings.checks.finding import findings_of
 from spinndrift.models.recordings.csv import read_csv, write_csv
 from spinndrift.models.recordings.store import Recording
 from spinndrift.training.data.windows import make_windows
@@ -352,3 +353,36 @@ def test_the_example_of_the_page_can_be_read(tmp_path):
     assert made.scenarios == ("surge", "yaw")
     assert made.lengths.tolist() == [[2, 2], [2, 0]]
     assert made.commands == ("F_Bo_B",)
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"), [((8,), "u seems to have the wrong sign"), ((13,), "r seems to have")]
+)
+def test_one_axis_with_the_wrong_sign_is_named(tmp_path, rows, said):
+    columns = motion_columns()
+    columns[list(rows)] *= -1
+    with pytest.raises(UserError, match=said):
+        read_csv(write(tmp_path / "one", columns))
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds")])
+def test_times_in_another_unit_are_named(tmp_path, scale, unit):
+    columns = motion_columns()
+    columns[0] *= scale
+    with pytest.raises(UserError, match=f"t looks like {unit}; give seconds"):
+        read_csv(write(tmp_path / "one", columns))
+
+
+def test_files_beside_are_told_and_the_vehicle_is_found_beside(tmp_path):
+    (tmp_path / "one").mkdir()
+    preset = (ROOT / "models/vehicles/bluerov2.yaml").read_text(encoding="utf-8")
+    (tmp_path / "one/mine.yaml").write_text(preset)
+    meta = "frames: ENU/FLU\nvehicle: mine.yaml\nfiles: {run.csv: a}\n"
+    folder = write(tmp_path / "one", meta=meta)
+    (folder / "run_2.csv").write_text((folder / "run.csv").read_text())
+    recording = read_csv(folder)
+    assert recording.scenarios == ("a",)
+    assert [(f.word, f.place) for f in findings_of(recording.dataset)] == [
+        ("unlisted-file", "run_2.csv")
+    ]
+    assert recording.vehicle == str(folder / "mine.yaml")

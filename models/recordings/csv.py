@@ -20,6 +20,7 @@ from ..config.typed_yaml import dump, load
 from ..frames import pose_to_enu, twist_frd_to_flu
 from ..se3 import TWIST, WRENCH, XYZ
 from .build import Trajectory
+from .checks.finding import Finding, with_findings
 from .csv_columns import METADATA, STATE, STEMS, checked_groups, unit_quaternions
 from .csv_runs import Run, as_recorded, common_step, cut, on_grid
 from .csv_table import Table, read_table
@@ -81,7 +82,9 @@ def read_csv(
             "`vehicle: bluerov2_heavy` and `files: {run_1.csv: surge}` (see docs/recording.md)"
         )
     meta = load(CsvFolder, metadata)
-    files = meta.files or {p.name: p.stem for p in sorted(folder.glob("*.csv"))}
+    there = {p.name: p.stem for p in sorted(folder.glob("*.csv"))}
+    files = meta.files or there
+    findings = [_unlisted(name) for name in there if name not in files]
     if not files:
         raise UserError(f"{folder}: no .csv file in it; put one a trajectory beside {METADATA}")
     notes = list(meta.notes)
@@ -92,13 +95,33 @@ def read_csv(
     dt = common_step(folder, [run.t for run in runs], rate or meta.rate, notes, resample)
     trajectories = [on_grid(run, dt) if resample else as_recorded(run, dt) for run in runs]
     try:
-        return Recording.from_trajectories(
-            trajectories, dt, vehicle=meta.vehicle, source=meta.source or folder.name, notes=notes
+        recording = Recording.from_trajectories(
+            trajectories,
+            dt,
+            vehicle=_vehicle(folder, meta.vehicle),
+            source=meta.source or folder.name,
+            notes=notes,
         )
+        return Recording(with_findings(recording.dataset, findings))
     except UserError:
         raise
     except ValueError as error:
         raise UserError(f"{folder}: {error}") from error
+
+
+def _vehicle(folder: Path, named: str) -> str:
+    """A preset's name unchanged, a file's path from the folder of the recording."""
+    beside = folder / named
+    return str(beside) if Path(named).suffix and beside.is_file() else named
+
+
+def _unlisted(name: str) -> Finding:
+    return Finding(
+        "unlisted-file",
+        name,
+        f"{name} is not under `files` in {METADATA} and is not read",
+        "list it, or move it out of the folder",
+    )
 
 
 def _run(table: Table, scenario: str, meta: CsvFolder, notes: list[str]) -> Run:

@@ -18,6 +18,7 @@ _MOVES_M, _TURNS_RAD = 0.02, 0.02  # rms displacement in a window below which no
 _AGREED, _EXPLAINED, _DOUBTFUL, _CONTRADICTED = 0.98, 0.9, 0.8, 0.5
 _SHORT = (0.1, 5.0)  # m/s, rad/s: largest second difference that is not an outlier
 _MOST = 0.5  # share of the windows that must contradict; fewer are faults of an instrument
+_LONG_STEP_S = 1.0
 _SPIKE, _FEW = 20.0, 8  # factor on the median second difference; samples needed for a median
 _SEVERAL = 4  # windows needed to separate noise from an unnamed wrong convention
 _BETTER = 0.3  # a convention that leaves less than this share of the residual is the right one
@@ -45,7 +46,7 @@ def agreement(
     window: float = _WINDOW_S,
 ) -> tuple[Agreement, Agreement]:
     """Compare poses and body twists; return the linear and the angular agreement."""
-    moved, integrated = _increments(t, X_WB, V_WB_B, window)
+    moved, integrated = increments(t, X_WB, V_WB_B, window)
     return (
         _agree(moved[:3], integrated[:3], _MOVES_M),
         _agree(moved[3:], integrated[3:], _TURNS_RAD),
@@ -62,18 +63,27 @@ def _agree(moved: np.ndarray, integrated: np.ndarray, least: float) -> Agreement
     return Agreement(slope, float(1 - np.sum((moved - integrated) ** 2) / size))
 
 
-def _increments(
-    t: np.ndarray, X_WB: np.ndarray, V: np.ndarray, length: float = _WINDOW_S
-) -> Arrays:
-    """Displacements in B (m, rad) and integrals of the twist over windows, (6, windows)."""
+def increments(t: np.ndarray, X_WB: np.ndarray, V: np.ndarray, length: float = _WINDOW_S) -> Arrays:
+    """Displacements in B (m, rad) and integrals of the twist over windows of `length` (s).
+
+    Both (6, windows).
+    """
     q = continuous(X_WB[:4])
     R, middle = rotations(q), rotations(q[:, 1:] + q[:, :-1])
     steps = middle.inv().apply(np.diff(X_WB[4:]).T), (R[:-1].inv() * R[1:]).as_rotvec()
     moved = np.concatenate(steps, axis=1).T
-    integrated = 0.5 * (V[:, 1:] + V[:, :-1]) * np.diff(t)
+    return np.add.reduceat(moved, _edges(t, length), axis=1), integrals(t, V, length)
+
+
+def integrals(t: np.ndarray, V: np.ndarray, length: float = _WINDOW_S) -> np.ndarray:
+    """Integrals of the twist over windows of `length` (s), (6, windows)."""
+    steps = 0.5 * (V[:, 1:] + V[:, :-1]) * np.diff(t)
+    return np.add.reduceat(steps, _edges(t, length), axis=1)
+
+
+def _edges(t: np.ndarray, length: float) -> np.ndarray:
     window = np.floor((t[1:] - t[0]) / length - 1e-9).astype(int)
-    edges = np.flatnonzero(np.concatenate([[True], np.diff(window) > 0]))
-    return np.add.reduceat(moved, edges, axis=1), np.add.reduceat(integrated, edges, axis=1)
+    return np.flatnonzero(np.concatenate([[True], np.diff(window) > 0]))
 
 
 def dead_reckoned(
@@ -117,6 +127,8 @@ _LINEAR: list[tuple[str, Callable[[np.ndarray, np.ndarray], Arrays]]] = [
         "give all in one convention",
         lambda X, V: (X, _flip(V, (1, 2))),
     ),
+    ("u seems to have the wrong sign; give forward as positive", lambda X, V: (X, _flip(V, (0,)))),
+    ("v seems to have the wrong sign; give left as positive", lambda X, V: (X, _flip(V, (1,)))),
     (
         "z seems to have the wrong sign against w; give all in one convention",
         lambda X, V: (_flip(X, (6,)), V),
@@ -128,6 +140,9 @@ _LINEAR: list[tuple[str, Callable[[np.ndarray, np.ndarray], Arrays]]] = [
 ]
 _ANGULAR: list[tuple[str, Callable[[np.ndarray, np.ndarray], Arrays]]] = [
     ("p,q,r look like deg/s; give rad/s", lambda X, V: (X, np.deg2rad(V))),
+    ("p seems to have the wrong sign", lambda X, V: (X, _flip(V, (3,)))),
+    ("q seems to have the wrong sign", lambda X, V: (X, _flip(V, (4,)))),
+    ("r seems to have the wrong sign", lambda X, V: (X, _flip(V, (5,)))),
     (
         "the quaternion's columns look like x,y,z,w; give w first",
         lambda X, V: (np.concatenate([X[[3, 0, 1, 2]], X[4:]]), V),
@@ -150,7 +165,7 @@ _ANGULAR: list[tuple[str, Callable[[np.ndarray, np.ndarray], Arrays]]] = [
 
 def _mostly(t: np.ndarray, X_WB: np.ndarray, V: np.ndarray, rows: slice) -> float:
     """Explained share in the half of the windows that agrees best."""
-    moved, integrated = (a[rows] for a in _increments(t, X_WB, V))
+    moved, integrated = (a[rows] for a in increments(t, X_WB, V))
     off = np.sum((moved - integrated) ** 2, axis=0)
     kept = np.argsort(off)[: max(round(_MOST * off.size), 1)]
     size = np.sum(moved[:, kept] ** 2)
@@ -178,6 +193,19 @@ def _without(V: np.ndarray, found: np.ndarray) -> np.ndarray:
     return np.where(found, mean, V)
 
 
+def _unit_of_time(t: np.ndarray, X_WB: np.ndarray, V: np.ndarray) -> str:
+    """The unit of t that makes poses and twists agree where seconds do not; empty if none does."""
+    if np.median(np.diff(t)) < _LONG_STEP_S or _agreed(t, X_WB, V):
+        return ""
+    units = {"milliseconds": 1e-3, "microseconds": 1e-6}
+    return next((u for u, scale in units.items() if _agreed(scale * t, X_WB, V)), "")
+
+
+def _agreed(t: np.ndarray, X_WB: np.ndarray, V: np.ndarray) -> bool:
+    known = [a.explained for a in agreement(t, X_WB, V) if np.isfinite(a.explained)]
+    return bool(known) and min(known) > _EXPLAINED
+
+
 def contradictions(
     t: Float[np.ndarray, " N"], X_WB: Float[np.ndarray, "7 N"], V_WB_B: Float[np.ndarray, "6 N"]
 ) -> tuple[list[str], list[str]]:
@@ -192,6 +220,8 @@ def contradictions(
     errors, doubts = [], []
     outliers = spikes(V_WB_B)
     V_WB_B = _without(V_WB_B, outliers)
+    if unit := _unit_of_time(t, X_WB, V_WB_B):
+        return [f"t looks like {unit}; give seconds"], []
     if outliers.any():
         count = int(outliers.any(axis=0).sum())
         doubts.append(f"{count} single velocities lie far from both their neighbours.")

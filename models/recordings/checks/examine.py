@@ -11,7 +11,7 @@ from ..schema import UNEVEN
 from ..store import Recording
 from .commands import command_findings
 from .finding import Finding, check_accepted, enforce, findings_of, with_findings
-from .velocity import held_finding, unmeasured
+from .velocity import held_finding, lag_findings, unmeasured
 
 _SHORTEST_S = 1.0
 """A shorter piece beside a cut is left out too."""
@@ -33,7 +33,8 @@ def examine(
     """
     check_accepted(accept)
     recording, cut = _without_unmeasured(recording, source)
-    found = [*findings_of(recording.dataset), *cut, *command_findings(recording, vehicle)]
+    found = [*findings_of(recording.dataset), *cut, *lag_findings(recording)]
+    found += command_findings(recording, vehicle)
     enforce(source, found, accept)
     return type(recording)(with_findings(recording.dataset, found))
 

@@ -7,7 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..build import Trajectory
+from ..kinematics import increments, integrals
 from ..resample import rotations
+from ..store import Recording
 from .finding import Finding
 
 FASTEST = 15.0
@@ -18,6 +20,10 @@ _SAME, _STEP = 1e-9, 0.03
 """m/s: rounding of a held value, and the least jump with which a held zero begins or ends."""
 _TURNS = 1e-3
 """rad/s: spread of the rates above which the vehicle moves."""
+_SHIFTS, _LEAST_SHIFT = 10, 2
+"""Samples of the shifts that are tried, and of the least that is told."""
+_CLEAR, _LESS = 0.9, 0.3
+"""Share of the poses' change that shifted velocities explain; what they may leave of the rest."""
 _SPREAD = 2
 """Samples beside an impossible one that resampling may have mixed with it."""
 
@@ -76,6 +82,37 @@ def _jumps(v: np.ndarray, start: int, stop: int) -> bool:
     """Whether a stretch of zeros begins or ends with a jump, within two samples of it."""
     before, after = v[max(start - 2, 0) : start], v[stop : stop + 2]
     return any(part.size > 0 and bool(np.abs(part).max() > _STEP) for part in (before, after))
+
+
+def lag_findings(recording: Recording) -> list[Finding]:
+    """Velocities or rates that are shifted in time against the change of the pose."""
+    lags = np.arange(-_SHIFTS, _SHIFTS + 1)
+    left, size = np.zeros((2, lags.size)), np.zeros(2)
+    for j, k in np.argwhere(recording.lengths > 4 * _SHIFTS).tolist():
+        t, length = recording.elapsed(j, k), int(recording.lengths[j, k])
+        X, V = (recording.dataset[n].to_numpy()[j, k, :length].T for n in ("X_WB", "V_WB_B"))
+        inner = slice(_SHIFTS, length - _SHIFTS)
+        moved, _ = increments(t[inner], X[:, inner], V[:, inner])
+        size += np.sum(moved.reshape(2, -1) ** 2, axis=1)
+        for n, lag in enumerate(lags.tolist()):
+            shifted = integrals(t[inner], V[:, inner.start + lag : inner.stop + lag])
+            left[:, n] += np.sum((moved - shifted).reshape(2, -1) ** 2, axis=1)
+    found = []
+    for what, rest, whole in zip(("u,v,w", "p,q,r"), left, size, strict=True):
+        if not np.isfinite(rest).all() or whole <= 0 or rest.min() > (1 - _CLEAR) * whole:
+            continue
+        lag = int(lags[rest.argmin()])
+        if abs(lag) >= _LEAST_SHIFT and rest.min() < _LESS * rest[_SHIFTS]:
+            seconds, how = abs(lag) * recording.dt, "after" if lag > 0 else "before"
+            found.append(
+                Finding(
+                    "velocity-lag",
+                    what,
+                    f"{what} come {seconds:.2g} s {how} the motion that the poses show",
+                    "align the clocks of the instruments",
+                )
+            )
+    return found
 
 
 def held_finding(word: str, place: str, columns: str) -> Finding:

@@ -235,11 +235,22 @@ def test_a_poisoned_parameter_is_named_and_restored(windows):
 def test_a_motion_that_runs_away_is_named_and_skipped(windows):
     far = poisoned(windows, 4, 1.0)
     far.V[0, :, 4] = 1e30  # finite, but its square is not
+    far.V[0, :, 21] = 1e30
     result = fit(replace(CONFIG, steps=8), START, far)
-    assert result.events
-    assert all("scenario 'first', run 4" in e["text"] for e in result.events)
-    assert "rate × 0.5" in result.events[0]["text"]
+    (event,) = result.events  # both are left out at once, and the rate stays
+    assert "scenario 'first', run 4" in event["text"] or "run 1" in event["text"]
+    assert "left out from now on, with 1 more that run away" in event["text"]
+    reference = fit(replace(CONFIG, steps=8), START, windows)
+    np.testing.assert_array_equal(result.metrics["rate"], reference.metrics["rate"])
     assert all(np.isfinite(a).all() for a in leaves(result.model))
+
+
+def test_a_rate_that_was_cut_recovers(windows):
+    run = Run(replace(CONFIG, steps=60, schedule="constant"), START, windows, None, None, None)
+    run.state.rate_scale = 1 / 64
+    result = run.go(None, resume=False)
+    late = result.metrics["rate"][-1] / CONFIG.learning_rate
+    np.testing.assert_allclose(late, 2.0 ** (-6 + 59 / 50))
 
 
 def test_a_start_that_runs_away_everywhere_is_refused(windows):

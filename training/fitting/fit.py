@@ -21,7 +21,7 @@ from ..data.groups import group_labels, members, step_indices, whole_groups
 from ..data.provenance import fingerprint, provenance
 from ..data.windows import Windows
 from ..losses.base import Batch, Objective
-from .guard import Diagnosis, TrainingError, explain_non_finite, not_finite
+from .guard import Diagnosis, TrainingError, explain_non_finite, few_running_away, not_finite
 from .run_folder import RunFolder, TrainState
 from .step import (
     Report,
@@ -39,6 +39,8 @@ Progress = Callable[[int, int, float], None]
 
 _log = logging.getLogger(__name__)
 _VALIDATION_WINDOWS = 96
+_REGROWTH = 2.0 ** (1 / 50)
+"""Factor by which a rate that was cut grows after every good step, up to the schedule's."""
 _FLUSH_EVERY = 20
 
 
@@ -207,6 +209,7 @@ class Run:
         state.params, state.moments = params, moments
         if bool(report.ok):
             self.bad_in_a_row = 0
+            state.rate_scale = min(1.0, state.rate_scale * _REGROWTH)
         else:
             self._recover(indices, number)
         state.step = number + 1
@@ -229,7 +232,11 @@ class Run:
         return stopped
 
     def _recover(self, indices: np.ndarray, number: int) -> None:
-        """Explain a non-finite step; exclude the faulty windows, or halve the rate and restore."""
+        """Explain a non-finite step; exclude the faulty windows, or halve the rate and restore.
+
+        Windows are at fault if their data are not finite, or if they alone run away: a model that
+        runs away in many of them is at fault itself.
+        """
         state = self.state
         self.bad_in_a_row += 1
         key = jax.random.fold_in(jax.random.key(np.uint32(self.config.seed)), np.uint32(number))
@@ -237,9 +244,14 @@ class Run:
             self._model(state.params), state.objective, self.windows, indices, key, self.windows.dt
         )
         broken = bool(not_finite(state.params))
-        if found.data:
-            state.excluded = sorted({*state.excluded, *found.data})
+        if faulty := found.data or few_running_away(
+            self._model(state.params), self.windows, state.excluded, found
+        ):
+            new = sorted({*state.excluded, *faulty})
             remedy = "left out from now on"
+            if more := len(new) - len(state.excluded) - len(found.windows):
+                remedy += f", with {more} more that run away"
+            state.excluded = new
         else:
             state.rate_scale *= 0.5
             remedy = f"batch skipped, rate × {state.rate_scale:g}"

@@ -1,5 +1,6 @@
 """Explanation of steps that are not finite."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,9 @@ from ...models.dynamics import Dynamics
 from ..data.windows import Windows
 from ..losses.base import Batch, Objective
 from ..predict import predict_drift
+
+_FEW = 0.25
+"""Share of the windows below which those that run away are at fault, instead of the model."""
 
 
 class TrainingError(RuntimeError):
@@ -67,18 +71,38 @@ def explain_non_finite(
         named = "; ".join(f"{batch.label(i)} ({_where(batch, i)})" for i in bad)
         found = tuple(int(ids[i]) for i in bad)
         return Diagnosis(found, found, (), f"data not finite in {named}")
-    arrays = Batch.of(batch)
-    X, V = eqx.filter_jit(predict_drift)(model, arrays.X[0], arrays.V[0], arrays.F, dt)
-    state = np.concatenate([np.asarray(X), np.asarray(V)], axis=1)
-    finite: np.ndarray = np.asarray(np.isfinite(state).all(axis=1))
-    lost = np.flatnonzero(~finite.all(0))
+    lost, when = runaways(model, batch, dt)
     if lost.size:
-        when = dt * (1 + np.argmin(finite[:, lost], axis=0))
         named = "; ".join(
             f"{batch.label(int(i))} (after {t:.2f} s)" for i, t in zip(lost, when, strict=True)
         )
         return Diagnosis(tuple(int(ids[i]) for i in lost), (), (), f"motion runs away in {named}")
     return _one_by_one(model, objective, windows, indices, key)
+
+
+def runaways(model: Dynamics, windows: Windows, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Windows whose noise-free motion is not finite, and after how many seconds it is not."""
+    arrays = Batch.of(windows)
+    X, V = eqx.filter_jit(predict_drift)(model, arrays.X[0], arrays.V[0], arrays.F, dt)
+    state = np.concatenate([np.asarray(X), np.asarray(V)], axis=1)
+    finite: np.ndarray = np.asarray(np.isfinite(state).all(axis=1))
+    lost = np.flatnonzero(~finite.all(0))
+    return lost, dt * (1 + np.argmin(finite[:, lost], axis=0))
+
+
+def few_running_away(
+    model: Dynamics, windows: Windows, excluded: Sequence[int], found: Diagnosis
+) -> tuple[int, ...]:
+    """All windows that run away, if those of a step do and they are few; else none.
+
+    A model that runs away in many windows is at fault itself. `excluded` windows don't count.
+    """
+    if not found.windows or found.leaves:
+        return ()
+    usable = np.setdiff1d(np.arange(len(windows)), excluded)
+    lost, _ = runaways(model, windows.take(usable), windows.dt)
+    faulty = {*found.windows, *usable[lost].tolist()}
+    return tuple(sorted(faulty)) if len(faulty) < _FEW * usable.size else ()
 
 
 def _one_by_one(

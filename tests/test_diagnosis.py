@@ -20,6 +20,7 @@ from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.reports.diagnosis_report import diagnosis_page
 from spinndrift.sims.reports.figures_simulated import at_ends
 from spinndrift.training.data.generate import GenerateConfig, generate
+from spinndrift.training.diagnosis.causes import unsupported
 from spinndrift.training.diagnosis.data.arrays import Data
 from spinndrift.training.diagnosis.data.checks import limits
 from spinndrift.training.diagnosis.disturbance.laws import find_laws
@@ -47,7 +48,7 @@ from spinndrift.training.diagnosis.selection.hypotheses import Fit
 from spinndrift.training.diagnosis.selection.model_selection import admissible, choose, is_itself
 from spinndrift.training.diagnosis.selection.search import Search
 from spinndrift.training.diagnosis.selection.state import Selection
-from spinndrift.training.diagnosis.validation.claims import clearly_better, vetoes
+from spinndrift.training.diagnosis.validation.claims import LEFT, clearly_better, vetoes
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(runs=2, seconds=6.0)
@@ -244,6 +245,7 @@ def test_a_lag_is_named_measured_and_extended(tmp_path):
     assert finding.asserted is finding.judged["extended"]
     assert clearly_better(finding.judged["extended"], finding.judged["base"], 0)
     at = list(d.explained)
+    assert set(finding.judged) - set(d.gain) == {LEFT}, "a black box on what the cause leaves"
     rivals = {"base": finding.judged["base"], "refitted": finding.judged["extended"]}
     (told,) = vetoes(rivals, "base", at, {}, 0)
     assert told.startswith("refitted coefficients forecast")
@@ -320,6 +322,28 @@ def test_names_follow_the_rules():
     choice = choose(LIBRARY, zero, tied, 8.0, 0.01)
     assert choice is not None
     assert choice.ties == (clock,)
+    assert choice.apart_from([lag, clock]).ties == (), "what is named itself is told apart"
+    assert choice.apart_from([lag]).ties == (clock,)
+    behind = {lag: fit(*lag, 300.0, [0.1], 40.0), clock: fit(*clock, 50.0, [0.01], 40.0, seed=1)}
+    choice = choose(LIBRARY, zero, behind, 8.0, 0.01)
+    assert choice is not None
+    assert choice.ties == (), "hundreds of nats are no tie, however few the runs that show them"
+
+
+def test_names_need_the_support_of_the_joint_fit():
+    """One interval without no effect, and no parameter at a bound of its range."""
+    curve = ("thrust_curve", "all")
+    rows = LIBRARY.at(*curve)
+    for values, errors, kept in (
+        ((0.1, 0.1), (0.01, 0.2), True),
+        ((0.1, 0.1), (0.1, 0.2), False),
+        ((1.0, 0.1), (0.01, 0.02), False),
+    ):
+        theta = np.zeros(LIBRARY.size)
+        theta[rows] = values
+        joint = replace(fit(*curve, 500.0, [0.0, 0.0]), errors=np.array(errors))
+        dropped = unsupported(LIBRARY, [curve], theta, joint)
+        assert dropped == ([] if kept else [curve]), values
 
 
 @pytest.mark.parametrize(

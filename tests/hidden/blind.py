@@ -95,7 +95,8 @@ class Blind:
         if case.plan.idle:
             limits = [AXES[i] for i in case.plan.idle]
         write_folder(folder / "data", runs, rate=case.plan.rate)
-        if case.plan.even and any(has_mean(e) for e in case.effects):
+        measured = not case.plan.dead_reckoned  # the oracle starts from measured positions
+        if measured and case.plan.even and any(has_mean(e) for e in case.effects):
             fewer = replace(case, plan=replace(case.plan, runs=min(case.plan.runs, 2)))
             truth = fewer.simulate(case.seed + FRESH)
             write_folder(

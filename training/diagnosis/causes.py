@@ -4,8 +4,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from ...models.effects.base import Effect
+from ...models.effects.library import Library
 from ...models.effects.unknown import Unknown
 from .candidates.unknowns import (
     FoundStructure,
@@ -140,7 +142,7 @@ def supported(
 ) -> tuple[Selection, list[int], JointFit]:
     """The causes that a joint fit bears out, all parameters, and the fit."""
     problem, fit = found.problem, together(found, rows)
-    while dropped := _unsupported(found, fit):
+    while dropped := unsupported(problem.library, found.hypotheses, fit[0], fit[2]):
         theta = found.current.theta.copy()
         theta[parameters_of(problem.library, dropped)] = 0.0
         kept = tuple(a for a in found.accepted if a.hypothesis not in dropped)
@@ -150,30 +152,28 @@ def supported(
     return found, rows, fit
 
 
-def _unsupported(found: Selection, fit: JointFit) -> list[Hypothesis]:
+def unsupported(
+    library: Library, named: Sequence[Hypothesis], theta: Float[np.ndarray, " p"], joint: Fit | None
+) -> list[Hypothesis]:
     """Causes that the joint fit does not bear out.
 
     Every interval includes no effect, or a parameter lies at a bound of its range other than no
     effect: then it stands for something else.
     """
-    theta, _, joint = fit
     if joint is None:
         return []
-    library, t = found.problem.library, reported.quantile(joint)
-    dropped = []
-    for h in found.hypotheses:
+    t = reported.quantile(joint)
+    dropped: list[Hypothesis] = []
+    for h in named:
         if h[0] == Unknown.name:
             continue
         rows = library.at(*h)
         values = theta[rows]
         errors = np.array([joint.errors[joint.parameters.index(i)] for i in rows])
         ranges = [library.entries[i].parameter for i in rows]
-        ends = [b for p in ranges for b in (p.low, p.high)]
-        of_ends = np.repeat(values, 2)
-        at_end = [
-            b != 0 and np.isclose(v, b, rtol=1e-6) for v, b in zip(of_ends, ends, strict=True)
-        ]
-        if np.all(np.abs(values) < t * errors) or any(at_end):
+        ends = np.array([(p.low, p.high) for p in ranges])
+        at_end = (ends != 0) & np.isclose(values[:, None], ends, rtol=1e-6)
+        if np.all(np.abs(values) < t * errors) or at_end.any():
             dropped.append(h)
     return dropped
 

@@ -39,7 +39,7 @@ from .selection.refit_all import identify, with_coefficients
 from .selection.search import Refit, Search, refitted
 from .selection.state import Fits, Selection
 from .validation.blackbox import train
-from .validation.claims import Judgement, asserted, clearly_better
+from .validation.claims import LEFT, Judgement, asserted, clearly_better
 from .validation.simulation import Contender, Simulated
 from .validation.validation import Judged, judge, model_gain, white_part
 
@@ -325,14 +325,18 @@ class Diagnoser:
         contenders["black_box"] = Contender(
             still, train(found.base.predictions, problem.data, found.generator())
         )
+        if rows:
+            rest = train(fitted.predictions, problem.data, found.generator())
+            contenders[LEFT] = Contender(problem.without_each(fitted, rows), rest)
         judged, estimated = {}, fitted.noise.estimated
         for number, (name, contender) in enumerate(contenders.items()):
-            self.progress(0.84 + 0.04 * number, f"validation: {name.replace('_', ' ')}")
+            self.progress(0.84 + 0.03 * number, f"validation: {name.replace('_', ' ')}")
             in_use = [] if contender.black_box is not None else [*belief, *rows]
             judged[name] = judge(problem, contender, horizon, seed, in_use, estimated)
         gain = {
             name: model_gain(j, judged["base"], problem, horizon, np.random.default_rng(seed))
             for name, j in judged.items()
+            if name != LEFT
         }
         return gain, judged
 

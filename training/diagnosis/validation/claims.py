@@ -23,7 +23,13 @@ PRACTICAL = 0.1
 _LOOSE = 0.1
 """Share of records by which bands may hold fewer than they should."""
 _DRAWS = 400
-_WORDS = {"refitted": "refitted coefficients forecast", "black_box": "a black box forecasts"}
+LEFT = "left"
+"""The model that a verdict is about, with a black box on what it leaves."""
+_WORDS = {
+    "refitted": "refitted coefficients forecast",
+    "black_box": "a black box forecasts",
+    LEFT: "a black box on what it leaves forecasts",
+}
 
 
 class Better(NamedTuple):

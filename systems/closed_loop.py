@@ -12,6 +12,7 @@ from pydrake.systems.primitives import VectorLogSink
 from .compiled.network import Port, flatten, holders
 from .compiled.signal_log import SignalLog, add_log
 from .controllers.kinds import INPUTS, TOLD, Controller, Goal
+from .mavlink.config import Mavlink
 from .station.config import StationConfig
 from .station.ports import CHEATS, default_log_periods
 from .station.simulated import check_stand_in, make_station
@@ -42,6 +43,7 @@ def build_diagram(
     extend: Callable[[DiagramBuilder, System, System], Any] | None = None,
     goal: Goal = None,
     stand_in: System | None = None,
+    link: Mavlink | None = None,
 ) -> Diagram:
     """Close the loop: subsystems `station`, `controller`, and a log `log_<port>` of each port.
 
@@ -58,9 +60,12 @@ def build_diagram(
     `F_Bo_B`, its outputs are `X_WB` and `V_WB_B`; its further outputs of `station_ports` are logged
     as well. The configuration `station` still defines the vehicle and the obstacles.
 
+    With `hardware` the station is a vehicle's, used as `link` says (`systems.station.hardware`),
+    and a planner runs beside the loop; a driver of real time advances the diagram
+    (`sims.run.vehicle_loop`).
+
     Raises:
         UserError: a configuration names what can't be read, or controller or stand-in lack a port.
-        NotImplementedError: `hardware` is true.
 
     Example:
         >>> scenario = load_scenario("trajectory_tracking_calm")
@@ -68,10 +73,12 @@ def build_diagram(
     """
     builder = DiagramBuilder()
     if stand_in is None:
-        plant = builder.AddNamedSystem("station", make_station(station, hardware))
+        plant = builder.AddNamedSystem("station", make_station(station, hardware, link=link))
     else:
         check_stand_in(stand_in, station)
         plant = builder.AddNamedSystem("station", stand_in)
+    if hardware:
+        controller = controller.beside_the_loop()
     control = controller.add_to(builder, station, goal)
     for name in (*INPUTS, *TOLD):
         if name in INPUTS or (plant.HasOutputPort(name) and control.HasInputPort(name)):

@@ -4,7 +4,7 @@ Drake's stubs type the value of a port as `object`, the index of a state group a
 vector by a shape that no array has. What touches them goes through here, and type checks of
 arguments are off in this file alone.
 """
-# pyright: reportArgumentType=false, reportReturnType=false
+# pyright: reportArgumentType=false, reportReturnType=false, reportCallIssue=false
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -50,6 +50,21 @@ def value_or_zeros(port: InputPort, context: Context) -> Float[np.ndarray, "n"]:
 def group(context: Context, index: Group) -> Float[np.ndarray, "n"]:
     """Value of a group of discrete state."""
     return context.get_discrete_state(index).value()
+
+
+def parameter(context: Context, index: int) -> Float[np.ndarray, "n"]:
+    """Value of a numeric parameter."""
+    return context.get_numeric_parameter(index).value()
+
+
+def vector(values: Sequence[float] | Float[np.ndarray, "n"]) -> BasicVector:
+    """A vector, as the default of a parameter."""
+    return BasicVector(np.asarray(values, float))
+
+
+def set_parameter(context: Context, index: int, new: Float[np.ndarray, "n"]) -> None:
+    """Set a numeric parameter."""
+    context.get_mutable_numeric_parameter(index).SetFromVector(new)
 
 
 def set_groups(

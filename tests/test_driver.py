@@ -15,7 +15,8 @@ from served_vehicle import Served
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.systems.mavlink import telemetry
-from spinndrift.systems.mavlink.driver import Acted, Driver, Mavlink
+from spinndrift.systems.mavlink.config import Mavlink
+from spinndrift.systems.mavlink.driver import Acted, Driver
 from spinndrift.systems.mavlink.link import Link
 from spinndrift.systems.mavlink.parameters import Parameters
 from spinndrift.systems.mavlink.transport import Connection
@@ -156,7 +157,8 @@ import numpy as np
 import jax
 jax.config.update("jax_enable_x64", True)
 from spinndrift.models.vehicles.vehicle import load_vehicle
-from spinndrift.systems.mavlink.driver import Driver, Mavlink
+from spinndrift.systems.mavlink.config import Mavlink
+from spinndrift.systems.mavlink.driver import Driver
 config = Mavlink(sys.argv[1], actuation="thruster_passthrough")
 with Driver(config, load_vehicle("bluerov2_heavy").thrusters()) as driver:
     driver.prepare()

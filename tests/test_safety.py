@@ -15,7 +15,8 @@ from spinndrift.systems.mavlink.safety import (
     limited,
 )
 
-AGES = {"vehicle": 0.05, "attitude": 0.05, "depth": 0.1, "aid": 0.2, "plan": 0.3, "dead_man": 0.2}
+AGES = {"vehicle": 0.05, "attitude": 0.05, "depth": 0.1, "aid": 0.2, "plan": 0.3, "loop": 0.1}
+AGES |= {"dead_man": 0.2}
 CONFIG = SafetyConfig(dead_man=1.0)
 START = State("MANUAL", np.array([5.0, -3.0, -1.0]))
 
@@ -37,6 +38,7 @@ FAULTS = {
     "attitude": {"ages": {"attitude": float("inf")}},
     "depth": {"ages": {"depth": 0.6}},
     "aid": {"ages": {"aid": 2.1}},
+    "loop": {"ages": {"loop": 0.6}},
     "estimate": {"health": 2},
     "plan": {"ages": {"plan": 2.5}},
     "dead_man": {"ages": {"dead_man": 1.2}},

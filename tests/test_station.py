@@ -22,12 +22,13 @@ from spinndrift.systems.compiled.simulator import CompiledSimulator
 from spinndrift.systems.controllers.health_gate import HealthGate
 from spinndrift.systems.controllers.kinds import MppiImpedance, Own, Tracking, TrackReference
 from spinndrift.systems.estimation.config import EkfConfig
+from spinndrift.systems.mavlink.config import Mavlink
 from spinndrift.systems.planning.mppi_config import MppiConfig
 from spinndrift.systems.planning.obstacles import BoxHull, Cylinders, Pylon
 from spinndrift.systems.planning.paths import HoldPose, PoseConfig
 from spinndrift.systems.planning.tasks import PylonCrossing
 from spinndrift.systems.station.config import Sensing, StationConfig
-from spinndrift.systems.station.ports import station_ports
+from spinndrift.systems.station.ports import CHEATS, station_ports
 from spinndrift.systems.station.simulated import make_station
 
 START = PoseConfig((0.0, 0.0, -1.5))
@@ -80,9 +81,17 @@ def test_the_simulated_station_has_the_ports_of_the_hardware_and_its_cheats():
     assert ports(make_station(StationConfig())) == (inputs, more)
 
 
-def test_hardware_says_that_it_is_not_there():
-    with pytest.raises(NotImplementedError, match="hardware=False"):
-        make_station(StationConfig(), hardware=True)
+@pytest.mark.parametrize("vehicle", ["bluerov2", "bluerov2_heavy"])
+@pytest.mark.parametrize("estimate", ["own", "autopilot"])
+def test_a_vehicles_station_has_the_ports_of_the_simulated_one_less_the_cheats(vehicle, estimate):
+    config = StationConfig(vehicle)
+    link = Mavlink("udpin:127.0.0.1:0", estimate=estimate)
+    simulated, real = ports(make_station(config)), ports(make_station(config, True, link=link))
+    cheats = {port.name for port in CHEATS}
+    assert real[0] == simulated[0]
+    assert real[1] == {name: n for name, n in simulated[1].items() if name not in cheats}
+    assert real == station_ports(config, hardware=True)
+    assert len(cheats) == 4
 
 
 def test_it_holds_a_pose_in_the_harbour(harbour_hold):

@@ -38,14 +38,31 @@ def interrupt_noted() -> Iterator[threading.Event]:
 
 
 @contextmanager
-def _handled_by(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    before = signal.getsignal(signal.SIGINT)
+def end_noted() -> Iterator[threading.Event]:
+    """Set the event yielded at Ctrl-C or SIGTERM, for what must be left in order.
+
+    Further signals have no effect in the block.
+    """
+    event = threading.Event()
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        event.set()
+
+    with _handled_by(handle), _handled_by(handle, signal.SIGTERM):
+        yield event
+
+
+@contextmanager
+def _handled_by(
+    handler: Callable[[int, FrameType | None], object], number: int = signal.SIGINT
+) -> Iterator[None]:
+    before = signal.getsignal(number)
     main = threading.current_thread() is threading.main_thread()
     if not main or before is signal.SIG_IGN:
         yield
         return
-    signal.signal(signal.SIGINT, handler)
+    signal.signal(number, handler)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
+        signal.signal(number, signal.SIG_DFL if before is None else before)

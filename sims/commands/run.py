@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ...models.config.checks import SECONDS, SEED
+from ...models.config.errors import UserError
 from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar, tell_code
 
@@ -16,12 +17,18 @@ class Run:
     """Simulate a scenario: plant, water, sensors, filter, planner and controller in closed loop.
 
     SCENARIO is the path of a YAML file, or the name of a shipped scenario: station_keeping,
-    trajectory_tracking or pylon_crossing, each with the ending _calm or _harbour.
+    trajectory_tracking or pylon_crossing, each with the ending _calm or _harbour, or
+    pylon_crossing_vehicle.
 
     Writes a folder: report.html (read this first), meshcat.html (3-D replay), log.nc (a Recording
     of the run), metrics.json, and scenario.yaml with every default written out, which can be
     changed and run again. The same scenario and seed give the same run. After Ctrl-C the folder
     holds the run up to then.
+
+    With --arm the scenario is flown on the vehicle of its vehicle_link over MAVLink, after a
+    pre-flight check and in real time; --dry-run computes and logs everything and commands nothing.
+    docs/field.md is the checklist. Ctrl-C stops and disarms the vehicle. The folder then holds
+    telemetry.tlog as well, all that the vehicle said.
 
     A scenario with !Own, !OwnTask or !OwnFilter runs the Python code that it names, which is
     printed before: review that code first if the file is not your own.
@@ -30,6 +37,7 @@ class Run:
     EXAMPLES: ClassVar = (
         "spinndrift run station_keeping_calm --duration 10",
         "spinndrift run pylon_crossing_harbour --model runs/mine/model.spinn --seed 3",
+        "spinndrift run pylon_crossing_vehicle --arm",
     )
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]
@@ -46,6 +54,10 @@ class Run:
     """Engine that steps the diagram: Drake, or one compiled loop, which is faster but needs systems
     with pure functions (no user-defined system without `pure`). `auto` takes the loop for runs of
     10 s and more, unless the planner uses several threads, which only Drake's stepping has."""
+    arm: Annotated[bool, FlagCreatePairsOff] = False
+    """Arm the vehicle of the scenario's vehicle_link and fly."""
+    dry_run: Annotated[bool, FlagCreatePairsOff] = False
+    """Run the loop on the vehicle's telemetry without arming or commanding it."""
     duration: Annotated[float | None, SECONDS] = None
     """Longest simulated time (s); by default that of the scenario."""
     report: bool = True
@@ -62,10 +74,17 @@ class Run:
         scenario = load_scenario(self.scenario, self.scenario_text)
         tell_code(self.scenario, scenario.code)
         scenario = scenario.with_changes(self.seed, self.duration, self.model)
+        if (self.arm or self.dry_run) and scenario.vehicle_link is None:
+            raise UserError(
+                f"{'--arm' if self.arm else '--dry-run'}: scenario {scenario.name} has no "
+                'vehicle_link; add vehicle_link: !Mavlink {connection: "udpin:0.0.0.0:14550"}'
+            )
         if told := scenario.station.load_vehicle().limitation():
             console().print(f"{told} What the controller asks for there has no effect.")
         with new_folder(self.out, scenario) as out:
-            if self.quiet:
+            if scenario.vehicle_link is not None:
+                flown = self._fly(scenario, out)
+            elif self.quiet:
                 flown = simulate(scenario, engine=self.engine)
             else:
                 with progress_bar(f"flying {scenario.name}") as update:
@@ -75,6 +94,20 @@ class Run:
             self._summary(values, out)
         if flown.outcome.reason == "interrupted":
             raise KeyboardInterrupt
+
+    def _fly(self, scenario: Any, out: Path) -> Any:
+        """Fly on the vehicle."""
+        from ..run.flight import fly
+
+        settings = {"arm": self.arm, "dry_run": self.dry_run, "record": out / "telemetry.tlog"}
+        if self.quiet:
+            return fly(scenario, **settings)
+
+        def say(text: str) -> None:
+            console().print(text, markup=False, soft_wrap=True)
+
+        with progress_bar(f"flying {scenario.name}") as update:
+            return fly(scenario, **settings, say=say, progress=update)
 
     def _summary(self, values: dict, out: Path) -> None:
         shown, path, timing = console(), values["path"], values["timing"]

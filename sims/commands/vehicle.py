@@ -1,18 +1,16 @@
 """`spinndrift vehicle`: a simulated vehicle behind a MAVLink server."""
 
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ...models.config.checks import SECONDS, SEED, Within
 from ...models.config.errors import UserError
-from ...models.files.interrupts import interrupts_held
+from ...models.files.interrupts import end_noted, interrupts_held
 from ..progress import console, tell_code
 
 if TYPE_CHECKING:
@@ -81,14 +79,14 @@ class Vehicle:
         tell_code(self.scenario, scenario.code)
         scenario = scenario.with_changes(seed=self.seed)
         serve = self._serve if self.backend == "mavlink" else self._fly
-        with ExitStack() as held, _stopped() as stop:
+        with ExitStack() as held, end_noted() as stop:
             out = held.enter_context(run_folder(self.out, VEHICLE, new=True)) if self.out else None
             truth = serve(scenario, held, stop)
             if out is not None:
                 write_vehicle(truth, scenario, out)
                 self._say(f"wrote {out}")
 
-    def _serve(self, scenario: "Scenario", held: ExitStack, stop: threading.Event) -> "TruthLog":
+    def _serve(self, scenario: "Scenario", held: ExitStack, stop: Event) -> "TruthLog":
         """Serve a simulated autopilot over MAVLink."""
         with interrupts_held():
             from ..vehicle.server import Server, open_all
@@ -107,7 +105,7 @@ class Vehicle:
             self._say(f"{server.behind:.1f} s behind the clock in all: this machine is busy")
         return simulation.truth
 
-    def _fly(self, scenario: "Scenario", held: ExitStack, stop: threading.Event) -> "TruthLog":
+    def _fly(self, scenario: "Scenario", held: ExitStack, stop: Event) -> "TruthLog":
         """Be the physics of a real ArduSub."""
         with interrupts_held():
             from ..vehicle.json_backend import ADDRESS, JsonBackend, open_physics
@@ -141,21 +139,3 @@ class Vehicle:
 def _where(connection: str, port: int) -> str:
     """A connection with the port that it took."""
     return f"{connection.rpartition(':')[0]}:{port}" if port else connection
-
-
-@contextmanager
-def _stopped() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C and SIGTERM set, in the main thread."""
-    event = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield event
-        return
-    former = {
-        number: signal.signal(number, lambda *_: event.set())
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield event
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)

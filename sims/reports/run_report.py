@@ -1,6 +1,7 @@
 """The report of a run: one HTML page."""
 
 import platform
+from collections.abc import Sequence
 from importlib import metadata
 from typing import Any
 
@@ -61,6 +62,7 @@ def run_page(
     limitation: str = "",
     clearance: Float[np.ndarray, " n"] | None = None,
     replay: str = "",
+    checks: Sequence[tuple[str, bool, str]] = (),
 ) -> Page:
     """The page of a run.
 
@@ -75,6 +77,7 @@ def run_page(
         limitation: axes that the thrusters can't actuate, in a sentence.
         clearance: of the hull to the nearest obstacle over the log's time (m).
         replay: address of the 3-D replay.
+        checks: name, result and words of each check of a vehicle's pre-flight.
     """
     outcome = values["outcome"]
     page = Page(title, description).verdict(outcome["words"], outcome["success"])
@@ -94,6 +97,9 @@ def run_page(
     if water is not None:
         page.section("Disturbances", "Filter, planner and controller do not know these signals.")
         page.figure(water, "Velocity of the water at the vehicle, and disturbance wrench in B.")
+    if checks:
+        page.section("Pre-flight", "The checks before arming.")
+        page.table([(name, words) for name, _, words in checks])
     page.section("Numbers")
     for group, block in values.items():
         if isinstance(block, dict) and block:

@@ -26,7 +26,9 @@ from ..scenarios.scenario import Scenario
 from .loop import Run
 from .metrics import clearance, metrics
 
-RUN = FolderKind("run", ("scenario.yaml", "log.nc", "metrics.json", "report.html", "meshcat.html"))
+RUN = FolderKind("run", (
+    "scenario.yaml", "log.nc", "metrics.json", "report.html", "meshcat.html", "telemetry.tlog",
+))  # fmt: skip
 """What `spinndrift run` writes."""
 
 
@@ -73,7 +75,7 @@ def run_metrics(run: Run) -> dict[str, Any]:
     )
     made = {"revision": revision(), **{name: metadata.version(name) for name in PACKAGES}}
     head = {"scenario": scenario.name, "seed": scenario.seed}
-    return {**head, **values, "versions": made, "timing": run.timing.summary()}
+    return {**head, **values, **run.numbers, "versions": made, "timing": run.timing.summary()}
 
 
 def scene(scenario: Scenario) -> Scene:
@@ -105,6 +107,7 @@ def report_page(run: Run, values: dict[str, Any], replay: str = "") -> Page:
         limitation=vehicle.limitation(),
         clearance=clearance(run.log, vehicle, station.obstacles),
         replay=replay,
+        checks=run.checks,
     )
 
 

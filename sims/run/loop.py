@@ -3,7 +3,7 @@
 import gc
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
@@ -74,6 +74,10 @@ class Run(NamedTuple):
     log: RunLog
     outcome: Outcome
     timing: Timing
+    numbers: Mapping[str, Mapping[str, Any]] = {}
+    """Further metrics by group, of a flight on a vehicle."""
+    checks: tuple[tuple[str, bool, str], ...] = ()
+    """Name, result and words of each check of its pre-flight."""
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engine = "auto") -> Run:
@@ -197,7 +201,7 @@ def _one(
         elif not warm:
             _warm_up(diagram, min(scenario.duration, _WARM_UP))
     timing.compilation = time.perf_counter() - started
-    with interrupt_noted() as stopped, _few_collections():
+    with interrupt_noted() as stopped, few_collections():
         outcome = _fly(scenario, diagram, simulator, monitor, tap, timing, tell, stopped)
     if passage is not None and not passage.safe and outcome.reason in ("duration", "no progress"):
         outcome = Outcome("no safe plan", outcome.time, no_safe_plan(scenario, passage))
@@ -317,7 +321,7 @@ def _ticking(tell: Progress, remark: str) -> Iterator[None]:
 
 
 @contextmanager
-def _few_collections() -> Iterator[None]:
+def few_collections() -> Iterator[None]:
     """Exclude existing objects from garbage collection, which would take 5 % of a run's time."""
     gc.freeze()
     try:

@@ -170,7 +170,6 @@ def collect(
     P = P.reshape(n, math.isqrt(P.shape[1]), -1)
     blocks = [P[:, part, part].reshape(-1, 9) for part in (POSITION, ROTATION, VELOCITY)]
     status, fused = signals["status"].value[:n], scenario.station.sensing.fused
-    names = status_names(fused)
     variables = {
         "X_WB": signals["X_WB_cheat"].value[:n],
         "V_WB_B": signals["V_WB_B_cheat"].value[:n],
@@ -180,8 +179,7 @@ def collect(
         "V_WB_B_estimate": signals["V_WB_B"].value[:n],
         "error_std": np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0)),
         "error_covariance": np.concatenate(blocks, axis=1),
-        "nis": status[:, [names.index(f"nis_{name}") for name in fused]],
-        "rejected": status[:, [names.index(f"rejected_{name}") for name in fused]],
+        **nis_and_rejections(status, fused),
         "F_disturbance_Bo_B": signals["F_disturbance_cheat"].value[:n],
         "flow_W": signals["flow_cheat"].value[:n],
     }
@@ -198,6 +196,17 @@ def collect(
         least_risk=None if passage is None else passage.risk,
         fused=fused,
     )
+
+
+def nis_and_rejections(
+    status: Float[np.ndarray, "n size"], fused: tuple[str, ...]
+) -> dict[str, np.ndarray]:
+    """The last NIS of each fused sensor and its rejections in a row, from the filter's status."""
+    names = status_names(fused)
+    return {
+        kind: status[:, [names.index(f"{kind}_{name}") for name in fused]]
+        for kind in ("nis", "rejected")
+    }
 
 
 def mean_over(

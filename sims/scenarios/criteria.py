@@ -20,7 +20,7 @@ from ...systems.planning.obstacles import BoxHull, Cylinders, Pylon
 
 Reason = Literal[
     "goal", "collision", "spinning", "near goal", "no progress", "not finite", "duration",
-    "interrupted", "no safe plan",
+    "interrupted", "no safe plan", "guard",
 ]  # fmt: skip
 
 

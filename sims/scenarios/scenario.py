@@ -12,6 +12,7 @@ from ...models.config.checks import SECONDS, check_numbers, require
 from ...models.config.errors import UserError
 from ...models.config.yaml_text import parse
 from ...systems.controllers.kinds import ControllerKind, MppiImpedance
+from ...systems.mavlink.config import Mavlink
 from ...systems.own import OwnSystem
 from ...systems.station.config import StationConfig
 from ..vehicle.config import VehicleServer
@@ -52,6 +53,7 @@ class Scenario:
         success: the success criterion.
         safety: limits that end any run.
         log: settings of the log.
+        vehicle_link: the vehicle to fly on with `spinndrift run --arm`; simulated if left out.
         vehicle_server: settings of `spinndrift vehicle`, which serves the station over MAVLink.
 
     Example:
@@ -68,6 +70,7 @@ class Scenario:
     station: StationConfig = field(default_factory=StationConfig)
     safety: Safety = field(default_factory=Safety)
     log: LogSettings = field(default_factory=LogSettings)
+    vehicle_link: Mavlink | None = None
     vehicle_server: VehicleServer | None = None
 
     def __post_init__(self) -> None:

@@ -132,6 +132,10 @@ class VectorFunction:
         size = jax.ShapeDtypeStruct((sum(self._inputs),), np.float64)
         return compiled(self._packed, size, keep=self._keep)
 
+    def compile(self) -> None:
+        """Compile now, so that no call has to wait for it."""
+        _ = self._program
+
     def flat(self, *parts: Float[np.ndarray, "_"]) -> Float[np.ndarray, "m"]:
         """Call with one array for each input and return all results in one (read-only) array."""
         return np.asarray(self._program.call(np.concatenate(parts)))

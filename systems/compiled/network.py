@@ -11,6 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, InputPortIndex, OutputPortIndex, System
 from pydrake.systems.primitives import ConstantVectorSource, RandomSource, VectorLogSink
 
+from .jit import VectorFunction
 from .pure import Event, HasPure, Pure, State
 from .signal_log import SignalLog
 
@@ -209,6 +210,14 @@ def flatten(system: System, wires: dict[Port, Port]) -> Flat:
         part, i = system.get_output_port_locator(OutputPortIndex(k))
         shown.append(inner[part].shown[int(i)])
     return Flat([leaf for part in inner.values() for leaf in part.leaves], feeds, shown)
+
+
+def compile_functions(system: System) -> None:
+    """Compile every `VectorFunction` of a system's leaves, so that no event has to wait for it."""
+    for leaf in flatten(system, {}).leaves:
+        for part in vars(leaf).values():
+            if isinstance(part, VectorFunction):
+                part.compile()
 
 
 def holders(port: Port, wires: Mapping[Port, Port]) -> set[System]:

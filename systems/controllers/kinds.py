@@ -8,7 +8,7 @@ wrench while it is lost (`systems.controllers.health_gate`).
 
 import abc
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from ...models.spinn import Spinn
 from ...models.vehicles.vehicle import load_vehicle
 from ..estimation.disturbance_observer import DisturbanceObserver, MomentumObserver
 from ..own import OwnSystem, check_ports, port_sizes
+from ..planning.beside import MppiBeside
 from ..planning.mppi import Mppi
 from ..planning.mppi_config import MppiConfig
 from ..planning.mppi_core import MppiPlanner
@@ -33,8 +34,8 @@ from ..planning.reference import Reference
 from ..planning.tasks import PylonCrossing, TaskKind
 from ..plant.wrench_limits import ThrusterLimits
 from ..station.config import StationConfig
+from ..station.parts import add_noise
 from ..station.ports import station_ports
-from ..station.simulated import add_noise
 from .health_gate import HealthGate
 from .impedance import Impedance, ImpedanceGains, ImpedanceLaw
 
@@ -61,6 +62,10 @@ class Controller(abc.ABC):
 
         `goal` is that of the run, for a controller without a goal of its own.
         """
+
+    def beside_the_loop(self) -> "Controller":
+        """The same controller for a loop in real time, which may not wait for its planner."""
+        return self
 
     def add_to(self, builder: DiagramBuilder, station: StationConfig, goal: Goal = None) -> System:
         """Add the system to a diagram under the name `controller`.
@@ -235,7 +240,23 @@ class MppiImpedance(Controller):
             config=c,
             tracking=self.tracking.gains.matrices(model),
         )
-        return self.tracking.build(station, Mppi(planner), c.layout, model, c.period)
+        return self.tracking.build(station, self._source(planner), c.layout, model, c.period)
+
+    def _source(self, planner: MppiPlanner) -> System:
+        return Mppi(planner)
+
+    def beside_the_loop(self) -> "MppiImpedance":
+        return _MppiBesideImpedance(**{f.name: getattr(self, f.name) for f in fields(self)})
+
+
+class _MppiBesideImpedance(MppiImpedance):
+    """Its planner runs in a thread."""
+
+    def _source(self, planner: MppiPlanner) -> System:
+        return MppiBeside(planner, self.tracking.period)
+
+    def beside_the_loop(self) -> "MppiImpedance":
+        return self
 
 
 @dataclass(frozen=True)

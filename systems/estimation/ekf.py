@@ -16,7 +16,7 @@ from ...models.config.errors import UserError
 from ...models.sensors import SHIPPED, Imu, Sensor
 from ..compiled.jit import VectorFunction
 from ..compiled.pure import Event, Inputs, Pure, State, shown
-from ..drake import group, set_groups, value_or_zeros
+from ..drake import group, parameter, set_groups, set_parameter, value_or_zeros, vector
 from ..plant.learned_plant import check_state
 from .config import EkfConfig
 from .delayed import DelayedFilter
@@ -29,14 +29,14 @@ class _Flat:
     """The filter's functions of flat vectors, as which Drake keeps its state."""
 
     def __init__(self, core: DelayedFilter, X_WB: Array, V_WB_B: Array):
-        self.core, self.X_WB, self.V_WB_B = core, X_WB, V_WB_B
+        self.core = core
         self.start, self.unravel = ravel_pytree(core.init(X_WB, V_WB_B))
 
-    def initialise(self, w: Array) -> tuple[Array, ...]:
-        """State and outputs at time 0, with an initial error of the noise `w`."""
+    def initialise(self, w: Array, X_WB: Array, V_WB_B: Array) -> tuple[Array, ...]:
+        """State and outputs at time 0 for a start, with an initial error of the noise `w`."""
         error = self.core.deviations()[:9] * w
-        X = se3.retract(self.X_WB, error[:6])
-        V = self.V_WB_B + jnp.concatenate([error[6:], jnp.zeros(3, w.dtype)])
+        X = se3.retract(X_WB, error[:6])
+        V = V_WB_B + jnp.concatenate([error[6:], jnp.zeros(3, w.dtype)])
         flat = ravel_pytree(self.core.init(X, V))[0]
         return flat, *self.show(flat, jnp.zeros((), w.dtype))
 
@@ -104,8 +104,9 @@ class Ekf(LeafSystem):
     the shipped sensors. `status` has the components `status_names`, `health` those of
     `health_names`.
 
-    The estimate starts at the given pose and twist. With `initial_noise` connected (a simulation)
-    it starts with an error drawn from `config`'s standard deviations: δp, δθ, δv.
+    The estimate starts at the given pose and twist, or those of `set_start`. With `initial_noise`
+    connected (a simulation) it starts with an error drawn from `config`'s standard deviations: δp,
+    δθ, δv.
 
     .. pydrake_system::
 
@@ -158,6 +159,7 @@ class Ekf(LeafSystem):
         self._samples = core.samples_at_once(self._ratio)
         self._filter = self.DeclareDiscreteState(BasicVector(np.asarray(flat.start).tolist()))
         self._outputs = [self.DeclareDiscreteState(size) for size in outputs.values()]
+        self._given = self.DeclareNumericParameter(vector(np.concatenate([X0, V0])))
         self._waiting = self.DeclareDiscreteState(6 * (self._samples - 1))
         for name, index in zip(outputs, self._outputs, strict=True):
             self.DeclareStateOutputPort(name, index)
@@ -165,7 +167,7 @@ class Ekf(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(core.period, 0.0, self._update)
 
         n, m, results = flat.start.size, self._samples, list(outputs.values())
-        self._start = VectorFunction(flat.initialise, [9], [n, *results])
+        self._start = VectorFunction(flat.initialise, [9, 7, 6], [n, *results])
         # Several calls: XLA runs small programs inline and larger ones on its thread pool.
         self._take_in = VectorFunction(
             flat.take_in, [n, 6 * (m - 1), *sizes.values(), 1], [n, 1, core.slot * m]
@@ -173,6 +175,14 @@ class Ekf(LeafSystem):
         self._move = VectorFunction(flat.move, [n, core.slot * m, 1], [n, 1])
         self._fuse = VectorFunction(flat.fuse, [n, core.slot, 1], [n])
         self._show = VectorFunction(lambda x, t: flat.show(x, t[0]), [n, 1], results)
+
+    def set_start(self, context: Context, X_WB: ArrayLike, V_WB_B: ArrayLike) -> None:
+        """Start at another pose and twist when the context is initialised.
+
+        Raises:
+            ValueError: they are not a state.
+        """
+        set_parameter(context, self._given, np.concatenate(check_state(X_WB, V_WB_B)))
 
     def filter_state(self, context: Context) -> FilterState:
         """The filter's state at its horizon, for inspection."""
@@ -216,7 +226,8 @@ class Ekf(LeafSystem):
         return Pure((Event(self._period, update),), outputs)
 
     def _initialise(self, context: Context, discrete_state: DiscreteValues) -> None:
-        results = self._start(value_or_zeros(self._initial_noise, context))
+        start = parameter(context, self._given)
+        results = self._start(value_or_zeros(self._initial_noise, context), start[:7], start[7:])
         set_groups(discrete_state, [self._filter, *self._outputs], results)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:

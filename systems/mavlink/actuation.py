@@ -12,7 +12,7 @@ at the battery's present voltage, so SERVO_OUTPUT_RAW shows the outputs that `Co
 
 import abc
 from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,11 +28,10 @@ from .codec import (
     rc_override_fields,
     rc_override_passthrough,
 )
+from .config import Way
 from .dialect import Message, mavlink
 from .link import Peer
 from .mixer import AxisInverse
-
-Way = Literal["manual_control", "rc_override", "thruster_passthrough"]
 
 _RCIN_1 = 51  # SERVOn_FUNCTION that passes RC channel 1 through
 _MOST_CHANNELS = 8  # of overrides, without the extension that old autopilots ignore

@@ -27,11 +27,15 @@ class VehicleClock:
     """Offset of the boot clock, from what the link observes. Times are in seconds.
 
     `offset` is the local time of the vehicle's boot: local = boot + offset. `reboots` counts how
-    often the boot clock began anew.
+    often the boot clock began anew. One thread may observe while others read.
     """
 
     def __init__(self):
         self.reboots = 0
+        self.offset: float | None = None
+        """Local time of the vehicle's boot (s), None before the first observation."""
+        self.uncertainty: float | None = None
+        """Half the round trip of the exchange in use (s); None without TIMESYNC."""
         self._exchanges: deque[Exchange] = deque()
         self._delays: deque[tuple[float, float]] = deque()  # (arrival, arrival - boot)
         self._newest = -float("inf")
@@ -46,6 +50,7 @@ class VehicleClock:
         self._exchanges.append(Exchange(received, middle - vehicle, trip))
         while self._exchanges[0].at < received - _WINDOW:
             self._exchanges.popleft()
+        self._settle()
 
     def arrived(self, boot: float, arrival: float) -> None:
         """Take in a message: its time on the boot clock and the local time of its arrival."""
@@ -56,25 +61,20 @@ class VehicleClock:
         self._delays.append((arrival, delay))
         while self._delays[0][0] < arrival - _WINDOW:
             self._delays.popleft()
-
-    @property
-    def offset(self) -> float | None:
-        """Local time of the vehicle's boot (s), None before the first observation."""
-        best = self._best()
-        if best is not None:
-            return best.offset
-        return self._delays[0][1] if self._delays else None
-
-    @property
-    def uncertainty(self) -> float | None:
-        """Half the round trip of the exchange in use (s); None without TIMESYNC."""
-        best = self._best()
-        return None if best is None else best.round_trip / 2
+        self._settle()
 
     def local(self, boot: float) -> float | None:
         """Local time of a time on the boot clock, None before the first observation."""
         offset = self.offset
         return None if offset is None else boot + offset
+
+    def _settle(self) -> None:
+        best = self._best()
+        if best is not None:
+            self.offset, self.uncertainty = best.offset, best.round_trip / 2
+        else:
+            self.offset = self._delays[0][1] if self._delays else None
+            self.uncertainty = None
 
     def _best(self) -> Exchange | None:
         """The exchange of the shortest round trip; None if all are old and messages go on."""

@@ -9,26 +9,26 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from platformdirs import user_state_path
 
-from ...models.config.checks import check_numbers, require
 from ...models.config.errors import UserError
 from ...models.thrusters import Thrusters
 from . import commands, telemetry
-from .actuation import Command, Way, make_actuation
+from .actuation import Command, make_actuation
+from .config import Mavlink
 from .dialect import mavlink
 from .guard_process import Guard, stop_thrusters
-from .link import GROUND_STATION, Link
+from .link import Link
 from .parameters import Borrowed, Parameters
 from .preflight import FAILSAFES, Facts, Finding, Requirements, preflight
-from .safety import SafetyConfig, Snapshot, State, Supervisor
+from .safety import Snapshot, State, Supervisor
 from .telemetry import Reading
 from .transport import Connection
 
@@ -49,34 +49,6 @@ _ALIKE = 12.0  # µs by which outputs may differ from commanded ones: whole numb
 _DELAY = 0.5  # s: the longest time in which a command shows in SERVO_OUTPUT_RAW
 _HOLD = "ALT_HOLD"
 _FLY = "MANUAL"
-
-
-@dataclass(frozen=True)
-class Mavlink:
-    """A vehicle over MAVLink, in place of the simulated plant.
-
-    Attributes:
-        connection: tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD.
-        actuation: how wrenches are commanded.
-        estimate: `own` filter on the vehicle's sensors, or the `autopilot`'s estimate.
-        imu_rate: inertial samples to ask for (Hz).
-        system: our system id; the vehicle obeys its SYSID_MYGCS.
-        safety: limits and watchdogs.
-    """
-
-    connection: str
-    actuation: Way = "manual_control"
-    estimate: Literal["own", "autopilot"] = "own"
-    imu_rate: float = 100.0
-    system: int = GROUND_STATION
-    safety: SafetyConfig = field(default_factory=SafetyConfig)
-
-    def __post_init__(self) -> None:
-        """Check the connection and the numbers."""
-        check_numbers(self)
-        Connection.parse(self.connection, "vehicle_link.connection")
-        require(1 <= self.imu_rate <= 400, self, "imu_rate", "give a rate from 1 to 400 Hz")
-        require(1 <= self.system <= 255, self, "system", "give a system id from 1 to 255")
 
 
 class Sensed(NamedTuple):
@@ -136,6 +108,7 @@ class Driver:
             self._actuation = make_actuation(config.actuation, thrusters, self.parameters)
             wanted = _STREAMS | {"RAW_IMU": config.imu_rate}
             self.refused = commands.request_rates(self.link, wanted)
+            self.dvl = None if config.dvl is None else config.dvl.open()
         except BaseException:
             self.link.close()
             raise
@@ -276,7 +249,7 @@ class Driver:
         """Send a wrench if the guards allow it, or end the dive; does not wait.
 
         `t` is the time of the dive (s), `p_WBo` and `health` those of the estimate, `ages` those of
-        `aid`, `plan` and `dead_man` where there is one (s).
+        `aid`, `plan`, `loop` and `dead_man` where there is one (s).
         """
         if self._state is None:
             self._state = State(_FLY, np.asarray(p_WBo, float))
@@ -295,7 +268,15 @@ class Driver:
         return Acted(decision.order, decision.F_Bo_B, command.pwm, decision.state.reason)
 
     def _carry_out(self, order: str, command: Command) -> None:
-        if self._dry or order == "yield":
+        status = telemetry.status(self.link, time.monotonic())
+        held = self._ended == "hold_depth" and not self._dry
+        if held and status is not None and not (status.armed and status.mode == _HOLD):
+            order = "yield"  # a pilot has taken the vehicle from its depth
+        if order == "yield" or self._ended == "yield":
+            self._ended = "yield"
+            return
+        if self._dry:
+            self._ended = "" if order in ("fly", "neutral") else order
             return
         if order == "fly":
             self.link.send(command.message)
@@ -306,12 +287,26 @@ class Driver:
             self._ask(mavlink.MAV_CMD_DO_SET_MODE, 1.0, number)
         elif order == "disarm" and self._ended != order:
             self._ask(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, commands.FORCED_DISARM)
-        status = telemetry.status(self.link, time.monotonic())
         if status is not None and (
             (order == "hold_depth" and status.mode == _HOLD)
             or (order == "disarm" and not status.armed)
         ):
             self._ended = order  # seen; until then it is asked for again with every command
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to do: disarmed, or a pilot steers."""
+        return self._ended in (("hold_depth",) if self._dry else ()) + ("yield", "disarm")
+
+    def dvl_state(self) -> tuple[float, bool]:
+        """Age of the newest reading of the DVL (s), infinite without one, and its validity."""
+        if self.dvl is not None:
+            newest = self.dvl.newest
+            return self.dvl.age(), newest is not None and newest.reading.valid
+        found = telemetry.dvl(self.link, self.parameters)
+        if found is None:
+            return float("inf"), False
+        return time.monotonic() - found.arrival, bool(found.value[3])
 
     def _ask(self, command: int, *parameters: float) -> None:
         self.link.send(commands.command_long(self.vehicle, command, *parameters))
@@ -366,6 +361,8 @@ class Driver:
     def stop(self) -> None:
         """Neutral thrusters, disarm, give parameters back, close; may be called twice.
 
+        A vehicle that a pilot has taken gets its parameters back and is left alone otherwise.
+
         Raises:
             UserError: the vehicle did not confirm; the guard process then takes over.
         """
@@ -373,10 +370,12 @@ class Driver:
         if self._guard is not None:
             with suppress(UserError):  # it is gone: stop all the same
                 self._guard.busy()
-            failed = stop_thrusters(self.link, self._borrowed.path)
+            failed = stop_thrusters(self.link, self._borrowed.path, self._ended == "yield")
             if not failed:
                 self._guard.release()
             self._guard = None
+        if self.dvl is not None:
+            self.dvl.close()
         self.link.close()
         if failed:
             raise UserError(f"the vehicle could not be stopped in order: {'; '.join(failed)}")

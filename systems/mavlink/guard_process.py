@@ -106,15 +106,19 @@ def all_neutral(vehicle: Peer) -> list[Message]:
     ]
 
 
-def stop_thrusters(link: Link, borrowed: Path | None) -> list[str]:
-    """Send neutral for a second, disarm, give parameters back; what did not work, in words."""
+def stop_thrusters(link: Link, borrowed: Path | None, leave: bool = False) -> list[str]:
+    """Send neutral for a second, disarm, give parameters back; what did not work, in words.
+
+    With `leave` a pilot steers: parameters are given back, and nothing else is done.
+    """
     vehicle, failed = link.find_vehicle(), []
     end = time.monotonic() + _NEUTRAL_FOR
-    while time.monotonic() < end:
+    while not leave and time.monotonic() < end:
         for message in all_neutral(vehicle):
             link.send(message)
         time.sleep(_PERIOD)
-    for act in (lambda: commands.disarm(link), lambda: _give_back(link, borrowed)):
+    disarm = () if leave else (lambda: commands.disarm(link),)
+    for act in (*disarm, lambda: _give_back(link, borrowed)):
         try:
             act()
         except UserError as error:
@@ -126,17 +130,17 @@ def _give_back(link: Link, borrowed: Path | None) -> Mapping[str, float]:
     return {} if borrowed is None else Borrowed(Parameters(link), borrowed).give_back()
 
 
-def _watch() -> bool:
-    """Wait for the release; false if the words end without it."""
+def _watch() -> str:
+    """Wait for the release; what happened if the words end without it."""
     last = _BUSY
     while True:
         if not select.select([sys.stdin.buffer], [], [], _PATIENCE[last])[0]:
-            return False
+            return f"hung for {_PATIENCE[last]:g} s"
         read = os.read(sys.stdin.fileno(), 4096)
         if _RELEASE in read:
-            return True
+            return ""
         if not read:
-            return False
+            return "died"
         last = read[-1:]
 
 
@@ -152,7 +156,8 @@ def main(arguments: list[str]) -> int:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     sys.stdout.buffer.write(_READY)
     sys.stdout.flush()
-    if _watch():
+    ended = _watch()
+    if not ended:
         return 0
     if os.getppid() == int(parent):  # it hangs, and holds the connection
         os.kill(int(parent), signal.SIGKILL)
@@ -160,7 +165,7 @@ def main(arguments: list[str]) -> int:
         try:
             with Link(connection, system=int(system)) as link:
                 failed = stop_thrusters(link, borrowed)
-            _tell("the commanding process died: thrusters stopped", *failed)
+            _tell(f"the commanding process {ended}: thrusters stopped", *failed)
             return 2 if failed else 1
         except UserError as error:
             _tell(str(error))

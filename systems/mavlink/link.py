@@ -16,16 +16,18 @@ from typing import BinaryIO, NamedTuple
 
 from ...models.config.errors import UserError
 from .clock import MICROSECONDS_32, MILLISECONDS_32, Unwrapped, VehicleClock
+from .config import GROUND_STATION
 from .dialect import Message, Parser, mavlink
 from .transport import Connection, Lost, Transport
 
-GROUND_STATION = 255
-"""The system id that ArduSub obeys by default (SYSID_MYGCS)."""
 _COMPONENT = mavlink.MAV_COMP_ID_MISSIONPLANNER
 _HEARTBEAT, _TIMESYNC, _RETRY = 0.5, 0.5, 1.0  # s between heartbeats, TIMESYNC requests, attempts
 _WAIT = 0.05  # s: longest wait for data
 _RECENT = 2.0  # s over which rates are counted
 _BY_FIELD = {"NAMED_VALUE_FLOAT": "name", "BATTERY_STATUS": "id"}  # kept by that field as well
+_AIDS = ("VISION_POSITION_DELTA", "ODOMETRY", "DISTANCE_SENSOR")
+"""What a companion computer sends to the autopilot about the motion, under any system id."""
+_STEERING = ("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE")
 _BOOT_CLOCKS = {"SERVO_OUTPUT_RAW": MICROSECONDS_32}  # others' time_usec has 64 bits
 
 
@@ -75,7 +77,7 @@ class Link:
     """A connection to one vehicle; a context manager that closes it.
 
     The vehicle is the first sender of a HEARTBEAT with an autopilot's type. Messages of its system
-    are kept by their names, the newest of each.
+    are kept by their names, the newest of each, and so are those of a DVL's driver.
     """
 
     def __init__(
@@ -158,7 +160,11 @@ class Link:
         return [text for text in list(self._texts) if text[0] > since]
 
     def others(self, within: float = 5.0) -> list[Peer]:
-        """Senders with our system id that were heard within some seconds: other ground stations."""
+        """Other ground stations with our system id that were heard within some seconds.
+
+        A bridge that uses our id, as for a DVL's messages, is none: it neither says that it is a
+        ground station nor steers.
+        """
         now = time.monotonic()
         return [peer for peer, last in list(self._others.items()) if now - last < within]
 
@@ -298,12 +304,14 @@ class Link:
 
     def _take_in(self, message: Message, arrival: float) -> None:
         peer, name = Peer(message.get_srcSystem(), message.get_srcComponent()), message.get_type()
-        if peer.system == self._me.system:
+        ours, aid = peer.system == self._me.system, name in _AIDS
+        if ours and (name in _STEERING or (name == "HEARTBEAT" and _is_station(message))):
             self._others[peer] = arrival
+        if ours and not aid:
             return
         if name == "HEARTBEAT" and self.vehicle is None and _is_autopilot(message):
             self.vehicle = peer
-        if self.vehicle is not None and peer.system != self.vehicle.system:
+        if self.vehicle is not None and peer.system != self.vehicle.system and not aid:
             return
         if name == "HEARTBEAT" and peer != self.vehicle:
             return  # a camera's, a companion computer's
@@ -312,12 +320,13 @@ class Link:
         found = Received(message, arrival, self._boot(message, name))
         if name == "TIMESYNC":
             self._exchanged(message, arrival)
-        elif found.boot is not None:
+        elif found.boot is not None and not aid:  # an aid's sender may have another clock
             self.clock.arrived(found.boot, arrival)
         if name == "STATUSTEXT":
             self._texts.append((arrival, message.severity, message.text))
         self._times.setdefault(name, deque(maxlen=1000)).append(arrival)
-        self._last = arrival
+        if not aid:
+            self._last = arrival
         with self._changed:
             self._newest[name] = found
             if name in _BY_FIELD:
@@ -357,6 +366,10 @@ def _heartbeat() -> Message:
         mavlink.MAV_STATE_ACTIVE,
         3,
     )
+
+
+def _is_station(heartbeat: Message) -> bool:
+    return heartbeat.type == mavlink.MAV_TYPE_GCS
 
 
 def _is_autopilot(heartbeat: Message) -> bool:

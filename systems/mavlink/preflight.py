@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from .codec import FRAME_THRUSTERS, MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS
+from .config import GROUND_STATION
 from .dialect import mavlink
-from .link import GROUND_STATION, Statistics
+from .link import Statistics
 from .mixer import FRAMES
 
 FAILSAFES: Mapping[str, float] = {

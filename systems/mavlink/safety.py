@@ -36,12 +36,14 @@ class SafetyConfig:
         stale: longest age of attitude and depth (s).
         stale_aid: longest age of a velocity or position aid, if the estimate needs one (s).
         plan_age: longest age of the plan that is followed (s).
+        late: longest time by which the loop may be late (s): the computer is too busy.
         lost: longest time for which the estimator may be lost (s).
         outputs: longest time for which the vehicle's outputs may differ from the commanded ones
             (s); the verticals' do for half a second after arming.
         min_voltage: least battery voltage under load (V); 0 switches the guard off.
         dead_man: longest time between presses of the dead-man key (s); 0 needs none.
         end: what follows neutral thrusters.
+        hold: longest time for which depth is held before the vehicle is disarmed (s).
     """
 
     max_wrench: Vector6 = (80.0, 80.0, 80.0, 8.0, 8.0, 14.0)
@@ -53,18 +55,21 @@ class SafetyConfig:
     stale: float = 0.5
     stale_aid: float = 2.0
     plan_age: float = 2.0
+    late: float = 0.5
     lost: float = 1.0
     outputs: float = 2.0
     min_voltage: float = 13.2
     dead_man: float = 0.0
     end: Literal["hold_depth", "disarm"] = "hold_depth"
+    hold: float = 60.0
 
     def __post_init__(self) -> None:
         """Check signs."""
         check_numbers(self)
         for name in ("max_wrench", "max_wrench_rate", "fence"):
             require(min(getattr(self, name)) > 0, self, name, "give numbers above zero")
-        for name in ("silence", "stale", "stale_aid", "plan_age", "lost", "outputs"):
+        times = ("silence", "stale", "stale_aid", "plan_age", "late", "lost", "outputs", "hold")
+        for name in times:
             require(getattr(self, name) > 0, self, name, "give a time above zero")
         for name in ("min_voltage", "dead_man"):
             require(getattr(self, name) >= 0, self, name, "give zero or more")
@@ -83,8 +88,8 @@ class Snapshot(NamedTuple):
     health: int
     """Of the estimator: 0 good, 1 degraded, 2 lost."""
     ages: Mapping[str, float]
-    """Of `vehicle` (any message), `attitude`, `depth`; `aid`, `plan`, `dead_man` where there is
-    one."""
+    """Of `vehicle` (any message), `attitude`, `depth`; `aid`, `plan`, `loop`, `dead_man` where
+    there is one."""
     armed: bool
     mode: str
     voltage: float
@@ -214,6 +219,7 @@ GUARDS: dict[str, Guard] = {
     "attitude": _stale("attitude", "stale", "no new attitude came"),
     "depth": _stale("depth", "stale", "no new depth came"),
     "aid": _stale("aid", "stale_aid", "no new velocity or position came"),
+    "loop": _stale("loop", "late", "the loop on this computer has been late"),
     "estimate": _estimate,
     "plan": _stale("plan", "plan_age", "the planner made no new plan"),
     "dead_man": _stale("dead_man", "dead_man", "the dead-man key was not pressed"),
@@ -270,7 +276,8 @@ class Supervisor:
             return "yield" if t - state.since >= _NEUTRAL_FOR else "neutral"
         if t - state.since < _NEUTRAL_FOR:
             return "neutral"
-        if state.tripped in ("depth", "depth_limits", "silence"):
+        blind = state.tripped in ("depth", "depth_limits", "silence")
+        if blind or t - state.since > self.config.hold:
             return "disarm"
         return self.config.end
 

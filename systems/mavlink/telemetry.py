@@ -12,13 +12,18 @@ from jaxtyping import Float
 
 from . import codec
 from .commands import is_armed, mode_of
+from .dialect import mavlink
 from .link import Link, Received
 
 LEAK = "leak"
 _LEAK_SPOKEN = 10.0  # s: the vehicle repeats the warning while it is wet
 _CRITICAL = 5  # MAV_STATE: some failsafe is on, or there has been no pilot input
 _PRESSURES = ("SCALED_PRESSURE2", "SCALED_PRESSURE3", "SCALED_PRESSURE")
-_IMUS = ("RAW_IMU", "SCALED_IMU2", "SCALED_IMU")
+_DOWN = mavlink.MAV_SENSOR_ROTATION_PITCH_270
+_BODY_FRAMES = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_LOCAL_FRD)
+_LATE, _APART = 1.0, 0.05  # s between a time on the vehicle's clock and the arrival
+IMUS = ("RAW_IMU", "SCALED_IMU2", "SCALED_IMU")
+"""Messages with inertial samples, the preferred first."""
 
 
 class Reading(NamedTuple):
@@ -50,6 +55,16 @@ def attitude(link: Link) -> Reading | None:
     return _reading(link, found, codec.attitude_from_euler(m.roll, m.pitch, m.yaw))
 
 
+def turn_rate(link: Link) -> Reading | None:
+    """Angular rate in B (rad/s), with the attitude."""
+    for name in ("ATTITUDE_QUATERNION", "ATTITUDE"):
+        found = link.latest(name)
+        if found is not None:
+            m = found.message
+            return _reading(link, found, codec.body_vector(m.rollspeed, m.pitchspeed, m.yawspeed))
+    return None
+
+
 def heading(link: Link) -> Reading | None:
     """Yaw of B in W (rad), counter-clockwise from the x axis (east)."""
     found = attitude(link)
@@ -59,16 +74,58 @@ def heading(link: Link) -> Reading | None:
     return found._replace(value=np.array([float(yaw)]))
 
 
-def imu(link: Link, streams: Sequence[str] = _IMUS) -> Reading | None:
+def imu(link: Link, streams: Sequence[str] = IMUS) -> Reading | None:
     """Specific force (m/s²) and angular rate (rad/s) in B, from the first stream that comes."""
     for name in streams:
         found = link.latest(name)
         if found is not None:
-            m = found.message
-            force = codec.imu_specific_force(m.xacc, m.yacc, m.zacc)
-            rate = codec.imu_angular_rate(m.xgyro, m.ygyro, m.zgyro)
-            return _reading(link, found, np.concatenate([force, rate]))
+            return inertial(link, found)
     return None
+
+
+def inertial(link: Link, found: Received) -> Reading:
+    """The reading of a message of `IMUS`, as `imu`."""
+    m = found.message
+    force = codec.imu_specific_force(m.xacc, m.yacc, m.zacc)
+    rate = codec.imu_angular_rate(m.xgyro, m.ygyro, m.zgyro)
+    return _reading(link, found, np.concatenate([force, rate]))
+
+
+def dvl(link: Link, parameters: Mapping[str, float]) -> Reading | None:
+    """Velocity of the DVL over the bed (m/s), 1 if valid, altitude (m, NaN if unknown).
+
+    From VISION_POSITION_DELTA, which a DVL's driver sends to the autopilot, else from ODOMETRY; the
+    velocity is in the axes of B at the DVL. The altitude is that of a DISTANCE_SENSOR that looks
+    down. A time that is not the vehicle's counts as arrival less the autopilot's VISO_DELAY_MS.
+    """
+    found = link.latest("VISION_POSITION_DELTA")
+    if found is not None:
+        m = found.message
+        dt = m.time_delta_usec * 1e-6
+        valid = dt > 0 and m.confidence > 0
+        v = codec.body_vector(*m.position_delta) / (dt if valid else 1.0)
+        middle = dt / 2  # the displacement is that of the time before the stamp
+    else:
+        found = link.latest("ODOMETRY")
+        if found is None or found.message.child_frame_id not in _BODY_FRAMES:
+            return None
+        m, middle = found.message, 0.0
+        v, valid = codec.body_vector(m.vx, m.vy, m.vz), m.quality >= 0
+    valid = valid and bool(np.isfinite(v).all())
+    taken = None if found.boot is None else link.clock.local(found.boot)
+    if taken is None or not found.arrival - _LATE <= taken <= found.arrival + _APART:
+        taken = found.arrival - parameters.get("VISO_DELAY_MS", 10.0) * 1e-3
+    value = np.array([*(v if valid else np.zeros(3)), float(valid), _altitude(link)])
+    return Reading(value, min(taken, found.arrival) - min(middle, _LATE), found.arrival)
+
+
+def _altitude(link: Link) -> float:
+    found = link.latest("DISTANCE_SENSOR")
+    if found is None or found.message.orientation != _DOWN:
+        return float("nan")
+    m = found.message
+    inside = m.min_distance < m.current_distance < m.max_distance
+    return m.current_distance * 1e-2 if inside else float("nan")
 
 
 def depth(link: Link, parameters: Mapping[str, float], density: float) -> Reading | None:

@@ -79,8 +79,7 @@ class Mppi(LeafSystem):
         self._V = self.DeclareVectorInputPort("V_WB_B", 6)
         self._bias = self.DeclareVectorInputPort("F_bias_Bo_W", 6)
         self._noise = self.DeclareVectorInputPort("noise", 4, RandomDistribution.kGaussian)
-        first = eqx.filter_jit(MppiPlanner.init)(planner)
-        start: Any = np.asarray(first.F_Bo_B, float).ravel()
+        start: Any = self.first_nominal()
         self._nominal = self.DeclareDiscreteState(start)
         self._plan = self.DeclareDiscreteState(self.layout.size)
         self._samples = self.DeclareDiscreteState(self.samples.size)
@@ -92,6 +91,11 @@ class Mppi(LeafSystem):
         sizes = [start.size, self.layout.size, self.samples.size, len(FIGURES)]
         ends = [0, *accumulate(sizes)]
         self._slices = [slice(a, b) for a, b in pairwise(ends)]
+
+    def first_nominal(self) -> Float[np.ndarray, " n"]:
+        """The nominal wrenches of the first call."""
+        first = eqx.filter_jit(MppiPlanner.init)(self.planner)
+        return np.asarray(first.F_Bo_B, float).ravel()
 
     @cached_property
     def _programs(self) -> tuple[Program, list[Program], Program]:

@@ -1,30 +1,35 @@
 """The simulated station: everything between the commanded wrench and the estimated state."""
 
-import numpy as np
-from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
-from pydrake.systems.primitives import RandomSource
 
 from ...models.disturbances import Combined, Surface
 from ...models.sensors import Sensor
 from ..drake import constant
-from ..estimation.ekf import Ekf
+from ..mavlink.config import Mavlink
 from ..own import check_ports
 from ..plant.allocation import PulseWidths, ThrustAllocation
 from ..plant.disturbance_source import DisturbanceSource
 from ..plant.learned_plant import LearnedPlant
 from ..plant.sensor_suite import SensorSuite
 from .config import Sensing, StationConfig
-from .ports import CHEATS, ESTIMATES, REPORTED, station_ports
+from .hardware import hardware_station
+from .parts import add_noise, check_filter, configured_filter, export_reported
+from .ports import CHEATS, ESTIMATES, station_ports
 
 _NEVER = 1e9  # period (s) of noise that is drawn once
 _WATER = 2  # periods of the plant per step of the water: waves have periods of seconds
 
 
 def make_station(
-    config: StationConfig, hardware: bool = False, estimator: System | None = None
+    config: StationConfig,
+    hardware: bool = False,
+    estimator: System | None = None,
+    link: Mavlink | None = None,
 ) -> Diagram:
     """A diagram with `station_ports(config, hardware)`.
+
+    With `hardware` it is that of a vehicle (`systems.station.hardware`), which `link` says how to
+    use; it connects when it is told to begin.
 
     In simulation: allocation, plant with thrusters, disturbances, sensors and filter, as subsystems
     `allocation`, `plant`, `disturbances`, `sensors` and `ekf`. All noise comes from random sources
@@ -32,7 +37,6 @@ def make_station(
     `systems.own.OwnFilter` lists the ports it may have.
 
     Raises:
-        NotImplementedError: `hardware` is true.
         UserError: a part of the configuration names what can't be read, or the estimator lacks a
             port.
 
@@ -42,9 +46,7 @@ def make_station(
         7
     """
     if hardware:
-        raise NotImplementedError(
-            "this version has no link to a vehicle; build the station with hardware=False"
-        )
+        return hardware_station(config, link, estimator)
     return _simulated(config, estimator)
 
 
@@ -89,16 +91,6 @@ def check_stand_in(system: System, config: StationConfig) -> None:
     needed = {port.name: known.pop(port.name) for port in ESTIMATES}
     del known["pwm"]
     check_ports("station", system, (inputs, needed), ({}, known))
-
-
-def add_noise(builder: DiagramBuilder, system: System, name: str, period: float) -> None:
-    """Feed a system's noise port, unless it is empty, with unit Gaussians every `period` (s)."""
-    port = system.GetInputPort(name)
-    if port.size() == 0:
-        return
-    source = RandomSource(RandomDistribution.kGaussian, port.size(), period)
-    builder.AddNamedSystem(f"{system.get_name()}_{name}", source)
-    builder.Connect(source.get_output_port(), port)
 
 
 class StationBuilder:
@@ -182,11 +174,8 @@ def _simulated(config: StationConfig, estimator: System | None, driven: bool = F
     station, add = StationBuilder(builder), builder.AddNamedSystem
     allocation, plant, water = _add_body(builder, config, driven)
     sensors = station.add_sensors(config.sensing, plant)
-    ekf = add("ekf", estimator or _filter(config))
-    sizes = station_ports(config)[1]
-    needed, reported = ({port.name: sizes[port.name] for port in x} for x in (ESTIMATES, REPORTED))
-    offered = {name: sizes[name] for name in (*sensors, "pwm")}
-    check_ports("filter", ekf, ({}, needed), (offered, reported))
+    ekf = add("ekf", estimator or configured_filter(config))
+    check_filter(ekf, config)
 
     for name, source in (sensors | {"pwm": allocation}).items():
         if ekf.HasInputPort(name):
@@ -195,15 +184,10 @@ def _simulated(config: StationConfig, estimator: System | None, driven: bool = F
 
     command = allocation.get_input_port(0)
     builder.ExportInput(command, command.get_name())
-    for name, source in (dict.fromkeys(needed, ekf) | sensors | {"pwm": allocation}).items():
+    estimates = {port.name: ekf for port in ESTIMATES}
+    for name, source in (estimates | sensors | {"pwm": allocation}).items():
         builder.ExportOutput(source.GetOutputPort(name), name)
-    for name, size in reported.items():
-        if ekf.HasOutputPort(name):
-            builder.ExportOutput(ekf.GetOutputPort(name), name)
-        else:
-            value = [0.0, *[1.0] * (size - 1)] if name == "health" else [np.nan] * size
-            unknown = add(f"no_{name}", constant(value))
-            builder.ExportOutput(unknown.get_output_port(), name)
+    export_reported(builder, ekf, config)
     _export_truth(builder, plant, water)
     diagram = builder.Build()
     diagram.set_name("station")
@@ -230,19 +214,3 @@ def _add_noises(
     for name, system in sensors.items():
         if system is not suite and system.HasInputPort("noise"):
             add_noise(builder, system, "noise", 1 / config.sensing.sensors[name].rate)
-
-
-def _filter(config: StationConfig) -> System:
-    """The configured filter."""
-    s, (X0, V0) = config.sensing, config.initial_state()
-    if s.filter is None:
-        return Ekf(s.sensors, s.ekf, X0, V0)
-    return s.filter.make(
-        {
-            **{name: lambda sensor=sensor: sensor for name, sensor in s.sensors.items()},
-            "vehicle": config.load_vehicle,
-            "X0_WB": lambda: X0,
-            "V0_WB_B": lambda: V0,
-            "station": lambda: config,
-        }
-    )

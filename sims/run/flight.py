@@ -1,0 +1,424 @@
+"""A scenario on a vehicle: pre-flight, the closed loop in real time, an orderly end."""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, Diagram
+
+from ...models.config.errors import UserError
+from ...models.files.interrupts import end_noted
+from ...models.sensors import Dvl
+from ...systems.closed_loop import build_diagram, logged, seeded
+from ...systems.compiled.network import compile_functions
+from ...systems.drake import value
+from ...systems.estimation.ekf import Ekf
+from ...systems.mavlink import telemetry
+from ...systems.mavlink.config import Mavlink
+from ...systems.mavlink.driver import Driver
+from ...systems.mavlink.interface import Anchor, VehicleInterface, unread
+from ...systems.mavlink.link import Statistics
+from ...systems.mavlink.preflight import Finding
+from ...systems.planning.beside import MppiBeside
+from ...systems.station.config import StationConfig
+from ..scenarios.criteria import Monitor, Outcome
+from ..scenarios.scenario import Scenario
+from .flight_log import Journal, collect_flight
+from .loop import Progress, Run, Timing, few_collections
+from .real_time import Clockwork, percentiles, short_turns, tick_of
+from .signals import PlanTap, log_commands, log_periods, plan_source
+from .way import check_free, find_passage, no_safe_plan
+
+_RATES = (200.0, 100.0, 50.0, 40.0, 20.0)  # Hz that the filter may have; their ticks fit the loop's
+_SHADOW = 3.0  # s in which the loop runs without commanding
+_ATTEMPTS = 3  # to get an estimate
+_WARM_UP = 1.0  # s, so that every event has occurred and every sensor was fused
+_START = 3.0  # s to wait for the readings that define the start
+_LOST = 2
+_PATIENCE = 30.0  # s for what passes by itself after the vehicle's start
+_PASSING = {"attitude", "inertial sensors", "link", *telemetry.IMUS, "depth", "compass", "dvl"}
+
+Tell = Callable[[str], None]
+
+
+def fly(
+    scenario: Scenario,
+    *,
+    arm: bool = False,
+    dry_run: bool = False,
+    record: Path | None = None,
+    say: Tell = lambda text: None,
+    progress: Progress = lambda fraction, remark: None,
+) -> Run:
+    """Fly a scenario on the vehicle of its `vehicle_link`; stops and disarms it at the end.
+
+    The order is: connect, pre-flight, compile, run the loop without commanding (shadow), pre-flight
+    again, arm, fly. With `dry_run` nothing is armed, changed or commanded; all is computed and
+    logged. The run's scenario has the rates that the vehicle granted; its log has the estimate in
+    place of the truth. `record` is a telemetry log (.tlog) to write. `say` gets sentences on what
+    is done.
+
+    Raises:
+        UserError: the scenario has no `vehicle_link` or no safe plan, a check of the pre-flight
+            fails, neither `arm` nor `dry_run` is given, or the vehicle refuses a step. The vehicle
+            is disarmed then, with its parameters restored.
+    """
+    link = _checked(scenario)
+    thrusters = scenario.station.load_vehicle().thrusters()
+    say(f"connecting to {link.connection}")
+    with Driver(link, thrusters, dry_run=dry_run, record=record) as driver:
+        checks = preflight(driver, scenario, say)
+        scenario = as_granted(scenario, driver)
+        cockpit = Cockpit(driver, scenario, dry_run)
+        progress(0.0, "compiling")
+        cockpit.warm_up()
+        say("running the loop without commands")
+        cockpit.shadow()
+        if not (arm or dry_run):
+            raise UserError(
+                "all checks are passed, and nothing was armed: add --arm to fly, or --dry-run to "
+                "compute and log without commands"
+            )
+        say("dry run: nothing is armed" if dry_run else "arming")
+        cockpit.compile_monitor()
+        driver.prepare()
+        with short_turns():
+            outcome = cockpit.fly(progress)
+        statistics = driver.link.statistics()
+    return cockpit.flight(outcome, checks, statistics)
+
+
+def _checked(scenario: Scenario) -> Mavlink:
+    """The scenario's link.
+
+    Raises:
+        UserError: it has none, or a sensor that no vehicle has, an obstacle at the start, or no
+            safe plan.
+    """
+    link = scenario.vehicle_link
+    if link is None:
+        raise UserError(
+            f"scenario {scenario.name} has no vehicle_link: add vehicle_link: !Mavlink "
+            '{connection: "udpin:0.0.0.0:14550"} to fly on a vehicle'
+        )
+    for name in unread(scenario.station.sensing.sensors):
+        raise UserError(
+            f"station.sensing.more.{name}: no message of a vehicle measures it; leave it out"
+        )
+    check_free(scenario)
+    passage = find_passage(scenario)
+    if passage is not None and not passage.safe:
+        raise UserError(f"success: {no_safe_plan(scenario, passage)}")
+    return link
+
+
+def preflight(driver: Driver, scenario: Scenario, say: Tell = lambda text: None) -> list[Finding]:
+    """The driver's checks, and whether each sensor of the scenario is there.
+
+    Raises:
+        UserError: a check failed; the sentence names all that did.
+    """
+    end = time.monotonic() + _PATIENCE
+    while True:
+        checks = [*driver.preflight(), *_sensors(driver, scenario)]
+        failed = {check.name for check in checks if not check.passed}
+        if not failed or failed - _PASSING or time.monotonic() > end:
+            break
+    for check in checks:
+        say(f"{'ok    ' if check.passed else 'FAILED'} {check.name}: {check.words}")
+    failed = [f"{check.name}: {check.words}" for check in checks if not check.passed]
+    if failed:
+        raise UserError(f"pre-flight failed, nothing was armed: {'; '.join(failed)}")
+    return checks
+
+
+def _sensors(driver: Driver, scenario: Scenario) -> Iterator[Finding]:
+    """Freshness of the sensors that the station has besides the IMU."""
+    now = time.monotonic()
+    sensing, link = scenario.station.sensing, driver.link
+    found = {"depth": telemetry.depth(link, driver.parameters, 1025.0)} if sensing.depth else {}
+    if sensing.compass:
+        found["compass"] = telemetry.heading(link)
+    for name, reading in found.items():
+        age = math.inf if reading is None else now - reading.arrival
+        yield Finding(name, age < 1.0, _aged(age))
+    if isinstance(sensing.dvl, Dvl):
+        age, valid = driver.dvl_state()
+        words = _aged(age) if valid else f"{_aged(age)}, no bottom lock"
+        remedy = "; check the DVL, or fly without: station: {sensing: {dvl: null}}"
+        yield Finding("dvl", valid and age < 1.5, words + ("" if valid and age < 1.5 else remedy))
+
+
+def _aged(age: float) -> str:
+    return "no reading came" if math.isinf(age) else f"last reading {age:.1f} s ago"
+
+
+def as_granted(scenario: Scenario, driver: Driver) -> Scenario:
+    """The scenario with the rate of inertial samples that the vehicle granted, and its start.
+
+    The filter's rate is the highest it may have up to that, at least 20 Hz; the samples are
+    instantaneous. The start has the vehicle's roll, pitch and depth, and in W the scenario's place
+    and yaw.
+    """
+    rates = driver.link.statistics().rates
+    granted = max((rates.get(name, 0.0) for name in telemetry.IMUS), default=0.0)
+    sensing = scenario.station.sensing
+    outputs = sensing.ekf.output_rate
+    fit = [r for r in _RATES if abs(r / outputs - round(r / outputs)) < 1e-9]
+    rate = next((r for r in fit if r <= 1.1 * granted), fit[-1] if fit else sensing.imu.rate)
+    imu = replace(sensing.imu, rate=rate, integrating=False)
+    late = [each.latencies[1] for each in sensing.sensors.values() if each.late]
+    horizon = max([sensing.ekf.horizon, *(t + 2.5 / rate for t in late)])
+    ekf = replace(sensing.ekf, horizon=horizon)
+    station = replace(scenario.station, sensing=replace(sensing, imu=imu, ekf=ekf))
+    return replace(scenario, station=station)
+
+
+class Cockpit:
+    """The closed loop of a connected vehicle."""
+
+    def __init__(self, driver: Driver, scenario: Scenario, dry_run: bool):
+        """Build the diagram for the vehicle's present place.
+
+        Raises:
+            UserError: the scenario names what can't be read, or no reading of attitude or depth
+                comes.
+        """
+        assert scenario.vehicle_link is not None
+        self.driver, self.scenario, self.dry_run = driver, scenario, dry_run
+        self.anchor = _anchor(driver, scenario.station, scenario.vehicle_link)
+        self.diagram = build_diagram(
+            scenario.station,
+            scenario.controller,
+            hardware=True,
+            log_periods=log_periods(scenario),
+            extend=log_commands(scenario),
+            goal=scenario.goal,
+            link=scenario.vehicle_link,
+        )
+        station: Any = self.diagram.GetSubsystemByName("station")
+        self.station: Diagram = station
+        self.interface: VehicleInterface = station.GetSubsystemByName("vehicle")
+        self.source = plan_source(self.diagram)
+        self.journal = Journal(driver)
+        self.dead_man: Callable[[], float] | None = None
+        period = getattr(getattr(scenario.controller, "tracking", None), "period", 0.02)
+        self.tick = tick_of(self.interface.period, period, 1 / scenario.log.rate)
+
+    # ---------------------------------------------------------------------------- before arming
+
+    def warm_up(self) -> None:
+        """Compile every event's function, on the vehicle's readings: the loop falls behind."""
+        compile_functions(self.diagram)
+        self.interface.commanding = False
+        self._begin().run(_WARM_UP)
+        self._end_planner()
+        self.interface.end()
+
+    def shadow(self) -> None:
+        """Run the loop without commanding, anew a few times until its estimate is good.
+
+        Raises:
+            UserError: the estimate is lost or not finite at the end.
+        """
+        self.interface.commanding = False
+        for attempt in range(_ATTEMPTS):
+            lost = self._shadowed()
+            if not lost:
+                return
+            if attempt == _ATTEMPTS - 1:
+                raise UserError(lost)
+
+    def _shadowed(self) -> str:
+        """What is wrong with the estimate after a run without commands; empty if it is good."""
+        clockwork = self._begin()
+        clockwork.run(_SHADOW)
+        context = clockwork.simulator.get_context()
+        own = self.station.GetMyContextFromRoot(context)
+        X = value(self.station.GetOutputPort("X_WB"), own)
+        health = value(self.station.GetOutputPort("health"), own)
+        self._end_planner()
+        self.interface.end()
+        if np.isfinite(X).all() and health[0] < _LOST:
+            return ""
+        names = ("imu", *self.scenario.station.sensing.fused)
+        doubted = [n for n, trusted in zip(names, health[1:], strict=True) if not trusted]
+        late = percentiles(clockwork.late)["max"]
+        return (
+            f"the estimate is lost after {_SHADOW:g} s without commands, nothing was armed: not "
+            f"trusted are {', '.join(doubted) or 'none of the sensors'}; check their rates and "
+            f"mounts (station.sensing). The loop was {late:.0f} ms late at most"
+        )
+
+    # -------------------------------------------------------------------------------- the flight
+
+    def fly(self, progress: Progress) -> Outcome:
+        """Run from the present place on until monitor, guard, clock or user end the flight."""
+        self.interface.commanding = True
+        self.interface.on_act = self.journal.act
+        try:
+            return self._fly(self._begin(), progress)
+        finally:
+            self._end_planner()
+            self.interface.end()
+
+    def _monitor(self) -> Monitor:
+        s = self.scenario
+        vehicle = s.station.load_vehicle()
+        return Monitor(vehicle, s.station.obstacles, s.success, s.goal, s.safety)
+
+    def compile_monitor(self) -> None:
+        """Compile what the monitor computes."""
+        self._monitor().check(0.0, *self.scenario.station.initial_state())
+
+    def _fly(self, clockwork: Clockwork, progress: Progress) -> Outcome:
+        s, monitor = self.scenario, self._monitor()
+        context = clockwork.simulator.get_mutable_context()
+        own = self.station.GetMyContextFromRoot(context)
+        ports = [self.station.GetOutputPort(name) for name in ("X_WB", "V_WB_B")]
+        self.tap = PlanTap(self.diagram, context, s.log.samples)
+        self.context, self.clockwork = context, clockwork
+        stride = max(1, round(1 / (s.log.rate * clockwork.tick)))
+        ended: list[Outcome] = []
+
+        def each(t: float) -> bool:
+            if stopped.is_set():
+                words = f"The run was interrupted after {t:.1f} s."
+                ended[:] = ended or [Outcome("interrupted", t, words)]
+                return False
+            if reason := self.journal.reason:
+                if not ended:
+                    ended.append(Outcome("guard", t, f"Stopped at {t:.1f} s: {reason}."))
+                return not self.journal.finished
+            if round(t / clockwork.tick) % stride == 0:
+                self.tap.read(t)
+                found = monitor.check(t, *(value(port, own) for port in ports))
+                if found is not None:
+                    ended.append(found)
+                    return False
+                if round(t * s.log.rate) % round(s.log.rate) == 0:
+                    done = max(monitor.progress, t / s.duration)
+                    progress(done, f"{t:.0f} s, {self.journal.words()}")
+            return True
+
+        limit = s.duration + s.vehicle_link.safety.hold if s.vehicle_link else s.duration
+        with end_noted() as stopped, few_collections():
+            clockwork.run(s.duration, each)
+            if ended and ended[0].reason == "guard" and not self.journal.finished:
+                clockwork.run(limit, each)
+        if ended:
+            return ended[0]
+        words = f"The time limit of {s.duration:.1f} s was reached."
+        return Outcome("duration", clockwork.time, words)
+
+    def flight(self, outcome: Outcome, checks: list[Finding], statistics: Statistics) -> Run:
+        """The flight's log and numbers."""
+        signals = logged(self.diagram, self.context)
+        log = collect_flight(self.scenario, signals, self.tap, outcome.time, self.journal)
+        numbers = {
+            "loop": {
+                "period_ms": 1e3 * self.clockwork.tick,
+                **{f"lateness_{k}_ms": v for k, v in percentiles(self.clockwork.late).items()},
+                **{f"duration_{k}_ms": v for k, v in percentiles(self.clockwork.busy).items()},
+                **{f"command_{k}_ms": v for k, v in percentiles(self.journal.late).items()},
+            },
+            "link": {
+                "received": statistics.received,
+                "lost": statistics.lost,
+                "damaged": statistics.damaged,
+                "reconnections": statistics.reconnections,
+                "reboots": statistics.reboots,
+                "round_trip_ms": statistics.round_trip and 1e3 * statistics.round_trip,
+                "imu_rate_Hz": max(statistics.rates.get(n, 0.0) for n in telemetry.IMUS),
+            },
+            "guards": self.journal.summary(),
+        }
+        if isinstance(self.source, MppiBeside):
+            latency = percentiles([call[1] for call in self.source.calls])
+            numbers["plans"] = {
+                "made": len(self.source.calls),
+                **{f"latency_{name}_ms": v for name, v in latency.items()},
+            }
+        timing = Timing("vehicle")
+        return Run(self.scenario, log, outcome, timing, numbers, tuple(checks))
+
+    # ------------------------------------------------------------------------------------ inside
+
+    def _begin(self) -> Clockwork:
+        """A simulator at time 0 with the vehicle's present state, connected to it."""
+        simulator = Simulator(self.diagram)
+        context = simulator.get_mutable_context()
+        self._seed(context)
+        X_WB = start_pose(self.driver, self.anchor, self.scenario.station)
+        if self.station.HasSubsystemNamed("ekf"):
+            ekf: Any = self.station.GetSubsystemByName("ekf")
+            if isinstance(ekf, Ekf):
+                ekf.set_start(ekf.GetMyMutableContextFromRoot(context), X_WB, np.zeros(6))
+        simulator.Initialize()
+        epoch = time.monotonic() + 0.02
+        self.interface.ages = self._ages(context)
+        self.interface.begin(self.driver, epoch, self.anchor)
+        self.journal.epoch = epoch
+        return Clockwork(simulator, self.tick, epoch)
+
+    def _ages(self, context: Context) -> dict[str, Callable[[], float]]:
+        """Ages (s) of the plan that a planner made, and of the dead-man key."""
+        ages: dict[str, Callable[[], float]] = {}
+        if isinstance(self.source, MppiBeside):
+            port, own = self.source.GetOutputPort("plan"), self.source.GetMyContextFromRoot(context)
+
+            def age() -> float:
+                plan, t = value(port, own), context.get_time()
+                there = plan[1:5] @ plan[1:5] > 0.25
+                return float(t - plan[0]) if there else t
+
+            ages["plan"] = age
+        if self.dead_man is not None:
+            ages["dead_man"] = self.dead_man
+        return ages
+
+    def _seed(self, context: Context) -> None:
+        seeded(self.diagram, context, self.scenario.seed)
+
+    def _end_planner(self) -> None:
+        if isinstance(self.source, MppiBeside):
+            self.source.end()
+
+
+def _anchor(driver: Driver, station: StationConfig, link: Mavlink) -> Anchor:
+    """Where W lies for a vehicle at its present place.
+
+    Raises:
+        UserError: no attitude comes.
+    """
+    end = time.monotonic() + _START
+    while telemetry.heading(driver.link) is None and time.monotonic() < end:
+        time.sleep(0.02)
+    heading = telemetry.heading(driver.link)
+    if heading is None:
+        raise UserError("the vehicle sends no attitude; check its streams (SR0_EXTRA1)")
+    position = telemetry.position(driver.link) if link.estimate == "autopilot" else None
+    X0, _ = station.initial_state()
+    yaw = float(heading.value[0])
+    anchor = Anchor.at_start(X0, yaw, None if position is None else position.value[:3])
+    return anchor if link.world == "start" else anchor._replace(yaw=0.0)
+
+
+def start_pose(driver: Driver, anchor: Anchor, station: StationConfig) -> np.ndarray:
+    """X_WB now: attitude and depth as the vehicle measures them, the station's place in x and y."""
+    X_WB, _ = station.initial_state()
+    X_WB = np.array(X_WB, float)
+    attitude = telemetry.attitude(driver.link)
+    if attitude is not None:
+        X_WB[:4] = anchor.attitude(attitude.value)
+    sensor = station.sensing.depth
+    if sensor is not None:
+        depth = telemetry.depth(driver.link, driver.parameters, sensor.assumed_density)
+        if depth is not None:
+            X_WB[6] = -float(depth.value[0])
+    return X_WB

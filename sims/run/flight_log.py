@@ -1,0 +1,150 @@
+"""The log of a flight: the commands and guards of every call, and one Recording of it."""
+
+import math
+import time
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ...systems.closed_loop import Signal
+from ...systems.estimation.error_state import POSITION, ROTATION, VELOCITY
+from ...systems.mavlink import telemetry
+from ...systems.mavlink.driver import Acted, Driver
+from ..scenarios.scenario import Scenario
+from .log import RunLog
+from .signals import PlanTap, mean_over, nis_and_rejections
+
+ORDERS = ("fly", "neutral", "hold_depth", "disarm", "yield")
+"""Orders of the guards, by their number in the log."""
+_NOTES = (
+    "X_WB and V_WB_B are the estimate, flown on a vehicle; there is no truth.",
+    "F_Bo_B is the mean over each step of the wrench that was sent, within the guards' limits. pwm "
+    "is the output that the vehicle showed at the sample; pwm_commanded is what it was to show.",
+)
+
+
+class Entry(NamedTuple):
+    """What was done at one call."""
+
+    t: float
+    order: int
+    F_Bo_B: Float[np.ndarray, "6"]
+    expected: Float[np.ndarray, " n"]
+    shown: Float[np.ndarray, " n"]
+    voltage: float
+    silence: float
+
+
+class Journal:
+    """What was commanded, call by call, and what the vehicle showed."""
+
+    def __init__(self, driver: Driver):
+        self._driver = driver
+        self.entries: list[Entry] = []
+        self.late: list[float] = []
+        """Time from the planned instant of each command to its end (s)."""
+        self.reason = ""
+        """Why the dive has ended; empty while it goes on."""
+        self.epoch: float | None = None
+
+    def act(self, t: float, acted: Acted) -> None:
+        """Take in a command at time t (s)."""
+        driver, now = self._driver, time.monotonic()
+        outputs = telemetry.outputs(driver.link, driver.thrusters)
+        shown = np.full(acted.expected.size, np.nan) if outputs is None else outputs.value
+        order, volts = ORDERS.index(acted.order), telemetry.battery(driver.link)
+        silence = driver.link.silence
+        entry = Entry(t, order, acted.F_Bo_B, acted.expected, shown, volts, silence)
+        self.entries.append(entry)
+        self.reason = acted.reason
+        if self.epoch is not None:
+            self.late.append(now - self.epoch - t)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the end that follows a guard has been reached."""
+        return self._driver.finished
+
+    def words(self) -> str:
+        """The present state in a few words."""
+        if not self.entries:
+            return ""
+        last = self.entries[-1]
+        volts = "" if math.isnan(last.voltage) else f", {last.voltage:.1f} V"
+        return f"{ORDERS[last.order]}{volts}"
+
+    def summary(self) -> dict[str, Any]:
+        """Times in each order (s), the reason, the lowest voltage, the longest silence."""
+        times = np.array([entry.t for entry in self.entries])
+        orders = np.array([entry.order for entry in self.entries], int)
+        spent = np.diff(times, append=times[-1:])
+        found: dict[str, Any] = {
+            f"{name}_s": float(spent[orders == i].sum())
+            for i, name in enumerate(ORDERS)
+            if np.any(orders == i)
+        }
+        volts = np.array([entry.voltage for entry in self.entries])
+        known = volts[np.isfinite(volts)]
+        silences = [entry.silence for entry in self.entries]
+        return found | {
+            "reason": self.reason or None,
+            "lowest_voltage_V": float(known.min()) if known.size else None,
+            "longest_silence_s": max(silences, default=None),
+        }
+
+    def at(self, grid: Float[np.ndarray, " n"]) -> dict[str, np.ndarray]:
+        """Variables of a log over the times of the grid."""
+        times = np.array([entry.t for entry in self.entries])
+        index = np.clip(np.searchsorted(times, grid + 1e-6, side="right") - 1, 0, None)
+        columns = {
+            "pwm": np.stack([entry.shown for entry in self.entries]),
+            "pwm_commanded": np.stack([entry.expected for entry in self.entries]),
+            "guard_order": np.array([[entry.order] for entry in self.entries], float),
+            "voltage": np.array([entry.voltage for entry in self.entries]),
+            "silence": np.array([[entry.silence] for entry in self.entries]),
+        }
+        sent = Signal(times, np.stack([entry.F_Bo_B for entry in self.entries]))
+        dt = float(grid[1] - grid[0]) if grid.size > 1 else 1.0
+        return {"F_Bo_B": mean_over(sent, grid, dt)} | {n: c[index] for n, c in columns.items()}
+
+
+def collect_flight(
+    scenario: Scenario,
+    signals: Mapping[str, Signal],
+    tap: PlanTap,
+    end: float,
+    journal: Journal,
+) -> RunLog:
+    """One log of all signals from 0 to `end` (s)."""
+    dt = 1 / scenario.log.rate
+    n = max(1, min(round(end / dt) + 1, len(signals["X_WB"].time)))
+    grid = dt * np.arange(n)
+    variables = {
+        "X_WB": signals["X_WB"].value[:n],
+        "V_WB_B": signals["V_WB_B"].value[:n],
+        **journal.at(grid),
+        "health": signals["health"].value[:n],
+    }
+    P = signals["covariance"].value[:n]
+    if np.isfinite(P).any():
+        P = P.reshape(n, math.isqrt(P.shape[1]), -1)
+        blocks = [P[:, part, part].reshape(-1, 9) for part in (POSITION, ROTATION, VELOCITY)]
+        fused = scenario.station.sensing.fused
+        variables |= {
+            "error_std": np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0)),
+            "error_covariance": np.concatenate(blocks, axis=1),
+            **nis_and_rejections(signals["status"].value[:n], fused),
+        }
+    link = scenario.vehicle_link
+    return RunLog.create(
+        scenario.name,
+        dt,
+        variables | tap.setpoints(grid),
+        tap.plans(float(grid[-1])),
+        vehicle=scenario.station.vehicle,
+        source=f"scenario {scenario.name} on the vehicle at {link and link.connection}",
+        notes=_NOTES,
+        fused=scenario.station.sensing.fused,
+    )

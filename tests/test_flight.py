@@ -1,0 +1,103 @@
+"""Scenarios flown in real time on a simulated vehicle, which another process serves."""
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from spinndrift.models.config.errors import UserError
+from spinndrift.sims.run.flight import fly
+from spinndrift.sims.run.folder import write_files
+from spinndrift.sims.scenarios.scenario import Scenario, load_scenario
+from spinndrift.systems.mavlink import telemetry
+from spinndrift.systems.mavlink.link import Link
+from spinndrift.systems.mavlink.parameters import Parameters
+from spinndrift.systems.mavlink.transport import Connection
+
+# a loaded machine is late and loses its estimate for a while, which has tests of its own
+PATIENT = "late: 20, lost: 20, silence: 5, stale: 5, stale_aid: 20, outputs: 20, plan_age: 20"
+
+
+@pytest.fixture(scope="module")
+def port() -> Iterator[int]:
+    command = ["-m", "spinndrift", "vehicle", "station_keeping_calm"]
+    served = subprocess.Popen(
+        [sys.executable, *command, "--connection", "tcpin:127.0.0.1:0"],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert served.stderr is not None
+    found = re.search(r"tcpin:127.0.0.1:(\d+)", served.stderr.readline())
+    assert found is not None
+    yield int(found[1])
+    served.send_signal(signal.SIGINT)
+    served.wait(30.0)
+    served.stderr.close()
+
+
+@pytest.fixture(autouse=True)
+def _state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+
+
+def scenario(port: int, duration: float, more: str = "") -> Scenario:
+    link = f'!Mavlink {{connection: "tcp:127.0.0.1:{port}", safety: {{{PATIENT}}}{more}}}'
+    text = f"vehicle_link: {link}\nduration: {duration}"
+    return load_scenario("station_keeping_calm", text)
+
+
+def test_a_flight_holds_its_pose_and_leaves_the_vehicle_as_it_was(port: int, tmp_path: Path):
+    said: list[str] = []
+    wanted = scenario(port, 6.0, ", actuation: thruster_passthrough")
+    run = fly(wanted, arm=True, record=tmp_path / "telemetry.tlog", say=said.append)
+    assert (run.outcome.reason, run.outcome.time) == ("duration", pytest.approx(6.0, abs=0.1))
+    assert "arming" in said
+    assert sum(check[1] for check in run.checks) == len(run.checks) > 20
+    X, F = run.log["X_WB"], run.log["F_Bo_B"]
+    assert np.isfinite(X).all()
+    assert np.linalg.norm(X[:, 4:6], axis=1).max() < 1.5  # W begins at the vehicle's place
+    assert np.abs(F).max() > 1.0
+    assert np.ptp(run.log["pwm"], axis=0).max() > 10  # the outputs moved
+    assert set(run.log["guard_order"].ravel()) == {0}
+    assert run.numbers["loop"]["command_p99_ms"] > 0
+    assert run.scenario.station.sensing.imu.rate in (20, 40, 100)
+    values = write_files(run, tmp_path, report=True)
+    assert values["link"]["damaged"] == 0
+    assert (tmp_path / "telemetry.tlog").stat().st_size > 10_000
+    with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
+        link.find_vehicle(15.0)
+        parameters = Parameters(link)
+        assert [parameters.read(f"SERVO{n}_FUNCTION") for n in range(1, 9)] == [*range(33, 41)]
+        status = telemetry.status(link, time.monotonic())
+        assert status is not None
+        assert not status.armed
+
+
+def test_nothing_is_armed_without_being_asked(port: int):
+    with pytest.raises(UserError, match="add --arm to fly, or --dry-run"):
+        fly(scenario(port, 1.0))
+
+
+def test_a_dry_run_commands_nothing(port: int):
+    run = fly(scenario(port, 1.0, ", estimate: autopilot"), dry_run=True)
+    assert run.outcome.reason == "duration"
+    assert np.abs(run.log["F_Bo_B"]).max() > 0.1  # computed
+    np.testing.assert_array_equal(run.log["pwm"], 1500.0)  # not sent
+    assert "error_std" not in run.log  # an autopilot tells no covariance
+
+
+def test_a_vehicle_with_another_frame_is_refused(port: int):
+    text = f'vehicle_link: !Mavlink {{connection: "tcp:127.0.0.1:{port}"}}'
+    with pytest.raises(UserError, match="has 8 thrusters and the scenario's vehicle 6"):
+        fly(load_scenario("station_keeping_calm", f"station: {{vehicle: bluerov2}}\n{text}"))
+
+
+def test_a_scenario_without_a_vehicle_says_what_to_add():
+    with pytest.raises(UserError, match="has no vehicle_link: add vehicle_link: !Mavlink"):
+        fly(load_scenario("station_keeping_calm"), arm=True)

@@ -56,13 +56,11 @@ def build_diagram(
     built. The diagram has no input ports; its randomness comes from sources inside (`seeded`).
 
     `goal` (m, W) is passed to a user-defined controller (`Own`). `stand_in`, if given, replaces the
-    station: a vehicle's driver, the playback of a recording, another simulator. Its input is
-    `F_Bo_B`, its outputs are `X_WB` and `V_WB_B`; its further outputs of `station_ports` are logged
-    as well. The configuration `station` still defines the vehicle and the obstacles.
+    station: the playback of a recording, another simulator. Its input is `F_Bo_B`, its outputs are
+    `X_WB` and `V_WB_B`; its further outputs of `station_ports` are logged as well.
 
-    With `hardware` the station is a vehicle's, used as `link` says (`systems.station.hardware`),
-    and a planner runs beside the loop; a driver of real time advances the diagram
-    (`sims.run.vehicle_loop`).
+    With `hardware` the station is a vehicle's, used as `link` says, and a planner runs beside the
+    loop (`sims.run.flight`).
 
     Raises:
         UserError: a configuration names what can't be read, or controller or stand-in lack a port.

@@ -37,7 +37,6 @@ class Run:
     EXAMPLES: ClassVar = (
         "spinndrift run station_keeping_calm --duration 10",
         "spinndrift run pylon_crossing_harbour --model runs/mine/model.spinn --seed 3",
-        "spinndrift run pylon_crossing_vehicle --arm",
     )
 
     scenario: Annotated[Positional[str], arg(metavar="SCENARIO")]

@@ -1,9 +1,7 @@
 """A scenario on a vehicle: pre-flight, the closed loop in real time, an orderly end."""
 
-import math
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,6 @@ from pydrake.systems.framework import Context, Diagram
 
 from ...models.config.errors import UserError
 from ...models.files.interrupts import end_noted
-from ...models.sensors import Dvl
 from ...systems.closed_loop import build_diagram, logged, seeded
 from ...systems.compiled.network import compile_functions
 from ...systems.drake import value
@@ -21,29 +18,24 @@ from ...systems.estimation.ekf import Ekf
 from ...systems.mavlink import telemetry
 from ...systems.mavlink.config import Mavlink
 from ...systems.mavlink.driver import Driver
-from ...systems.mavlink.interface import Anchor, VehicleInterface, unread
+from ...systems.mavlink.interface import Anchor, VehicleInterface
 from ...systems.mavlink.link import Statistics
 from ...systems.mavlink.preflight import Finding
 from ...systems.planning.beside import MppiBeside
 from ...systems.station.config import StationConfig
 from ..scenarios.criteria import Monitor, Outcome
 from ..scenarios.scenario import Scenario
+from .before_flight import Tell, as_granted, checked_link, preflight
 from .flight_log import Journal, collect_flight
 from .loop import Progress, Run, Timing, few_collections
 from .real_time import Clockwork, percentiles, short_turns, tick_of
 from .signals import PlanTap, log_commands, log_periods, plan_source
-from .way import check_free, find_passage, no_safe_plan
 
-_RATES = (200.0, 100.0, 50.0, 40.0, 20.0)  # Hz that the filter may have; their ticks fit the loop's
 _SHADOW = 3.0  # s in which the loop runs without commanding
 _ATTEMPTS = 3  # to get an estimate
 _WARM_UP = 1.0  # s, so that every event has occurred and every sensor was fused
 _START = 3.0  # s to wait for the readings that define the start
 _LOST = 2
-_PATIENCE = 30.0  # s for what passes by itself after the vehicle's start
-_PASSING = {"attitude", "inertial sensors", "link", *telemetry.IMUS, "depth", "compass", "dvl"}
-
-Tell = Callable[[str], None]
 
 
 def fly(
@@ -68,7 +60,7 @@ def fly(
             fails, neither `arm` nor `dry_run` is given, or the vehicle refuses a step. The vehicle
             is disarmed then, with its parameters restored.
     """
-    link = _checked(scenario)
+    link = checked_link(scenario)
     thrusters = scenario.station.load_vehicle().thrusters()
     say(f"connecting to {link.connection}")
     with Driver(link, thrusters, dry_run=dry_run, record=record) as driver:
@@ -91,92 +83,6 @@ def fly(
             outcome = cockpit.fly(progress)
         statistics = driver.link.statistics()
     return cockpit.flight(outcome, checks, statistics)
-
-
-def _checked(scenario: Scenario) -> Mavlink:
-    """The scenario's link.
-
-    Raises:
-        UserError: it has none, or a sensor that no vehicle has, an obstacle at the start, or no
-            safe plan.
-    """
-    link = scenario.vehicle_link
-    if link is None:
-        raise UserError(
-            f"scenario {scenario.name} has no vehicle_link: add vehicle_link: !Mavlink "
-            '{connection: "udpin:0.0.0.0:14550"} to fly on a vehicle'
-        )
-    for name in unread(scenario.station.sensing.sensors):
-        raise UserError(
-            f"station.sensing.more.{name}: no message of a vehicle measures it; leave it out"
-        )
-    check_free(scenario)
-    passage = find_passage(scenario)
-    if passage is not None and not passage.safe:
-        raise UserError(f"success: {no_safe_plan(scenario, passage)}")
-    return link
-
-
-def preflight(driver: Driver, scenario: Scenario, say: Tell = lambda text: None) -> list[Finding]:
-    """The driver's checks, and whether each sensor of the scenario is there.
-
-    Raises:
-        UserError: a check failed; the sentence names all that did.
-    """
-    end = time.monotonic() + _PATIENCE
-    while True:
-        checks = [*driver.preflight(), *_sensors(driver, scenario)]
-        failed = {check.name for check in checks if not check.passed}
-        if not failed or failed - _PASSING or time.monotonic() > end:
-            break
-    for check in checks:
-        say(f"{'ok    ' if check.passed else 'FAILED'} {check.name}: {check.words}")
-    failed = [f"{check.name}: {check.words}" for check in checks if not check.passed]
-    if failed:
-        raise UserError(f"pre-flight failed, nothing was armed: {'; '.join(failed)}")
-    return checks
-
-
-def _sensors(driver: Driver, scenario: Scenario) -> Iterator[Finding]:
-    """Freshness of the sensors that the station has besides the IMU."""
-    now = time.monotonic()
-    sensing, link = scenario.station.sensing, driver.link
-    found = {"depth": telemetry.depth(link, driver.parameters, 1025.0)} if sensing.depth else {}
-    if sensing.compass:
-        found["compass"] = telemetry.heading(link)
-    for name, reading in found.items():
-        age = math.inf if reading is None else now - reading.arrival
-        yield Finding(name, age < 1.0, _aged(age))
-    if isinstance(sensing.dvl, Dvl):
-        age, valid = driver.dvl_state()
-        words = _aged(age) if valid else f"{_aged(age)}, no bottom lock"
-        remedy = "; check the DVL, or fly without: station: {sensing: {dvl: null}}"
-        yield Finding("dvl", valid and age < 1.5, words + ("" if valid and age < 1.5 else remedy))
-
-
-def _aged(age: float) -> str:
-    return "no reading came" if math.isinf(age) else f"last reading {age:.1f} s ago"
-
-
-def as_granted(scenario: Scenario, driver: Driver) -> Scenario:
-    """The scenario with the rate of inertial samples that the vehicle granted, and its start.
-
-    The filter's rate is the highest it may have up to that, at least 20 Hz; the samples are
-    instantaneous. The start has the vehicle's roll, pitch and depth, and in W the scenario's place
-    and yaw.
-    """
-    rates = driver.link.statistics().rates
-    granted = max((rates.get(name, 0.0) for name in telemetry.IMUS), default=0.0)
-    sensing = scenario.station.sensing
-    outputs = sensing.ekf.output_rate
-    fit = [r for r in _RATES if abs(r / outputs - round(r / outputs)) < 1e-9]
-    rate = next((r for r in fit if r <= 1.1 * granted), fit[-1] if fit else sensing.imu.rate)
-    imu = replace(sensing.imu, rate=rate, integrating=False)
-    late = [each.latencies[1] for each in sensing.sensors.values() if each.late]
-    horizon = max([sensing.ekf.horizon, *(t + 2.5 / rate for t in late)])
-    ekf = replace(sensing.ekf, horizon=horizon)
-    station = replace(scenario.station, sensing=replace(sensing, imu=imu, ekf=ekf))
-    return replace(scenario, station=station)
 
 
 class Cockpit:

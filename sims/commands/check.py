@@ -11,6 +11,7 @@ from ...models.config.checks import RATE_OF_ALARMS, WORKERS
 from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar
 from .check_estimator import CheckEstimator
+from .check_logs import CheckLogs
 from .check_outputs import check_page, held_outputs, refuse_given_up
 
 
@@ -77,7 +78,8 @@ class Check:
 
     what: Annotated[
         Annotated[CheckDiagnosis, subcommand("diagnosis", prefix_name=False)]
-        | Annotated[CheckEstimator, subcommand("estimator", prefix_name=False)],
+        | Annotated[CheckEstimator, subcommand("estimator", prefix_name=False)]
+        | Annotated[CheckLogs, subcommand("logs", prefix_name=False)],
         OmitArgPrefixes,
     ]
 

@@ -69,6 +69,7 @@ class Import:
             from ...models.recordings.checks.finding import check_accepted
             from ...models.recordings.summary import summarize
             from ...systems.logs.load import LogOptions, load_data
+            from ..acceptance import acceptance
             from ..reports.findings import print_findings
 
         check_accepted(self.accept)
@@ -91,6 +92,9 @@ class Import:
         shown = console()
         shown.print(summarize(recording), markup=False)
         print_findings(shown, recording)
+        shown.print("what the other commands take of it:")
+        for line in acceptance(recording):
+            shown.print(f"  {line}", markup=False, soft_wrap=True)
         shown.print(f"wrote {out}")
 
     def _out(self) -> Path:

@@ -173,7 +173,7 @@ def make_windows(
         >>> make_windows(recording, length_s=1.0).steps
         20
     """
-    steps, places = _places(recording, length_s, stride_s)
+    steps, places = window_places(recording, length_s, stride_s)
     data, lengths = recording.dataset, recording.lengths
     X, V = data["X_WB"].to_numpy(), data["V_WB_B"].to_numpy()
     F = recording.wrench(vehicle).to_numpy()
@@ -204,7 +204,7 @@ def make_windows(
     )
 
 
-def _places(
+def window_places(
     recording: Recording, length_s: float, stride_s: float | None
 ) -> tuple[int, list[tuple[int, int, int]]]:
     """Steps of a window, and scenario, run and first sample of each; refused if there are none."""

@@ -32,6 +32,8 @@ _HARDLY, _SURE = 10.0, 0.9
 """Commanded force over the force that the motion shows, above which no vehicle's numbers explain
 it; the largest share of a force that a command is expected to make up."""
 _DEAD = 0.15
+_NO_FORCE = 1e-3
+"""N or N·m below which nothing is driven; pulses in a thruster's dead band give up to 1e-6 N."""
 _FACTORS = np.round(np.arange(-1.5, 1.51, 0.05), 2)
 _LEAST_COUNT = 20.0
 """Independent windows below which nothing is said of an axis."""
@@ -87,7 +89,7 @@ def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Find
         return []
     forces, weights, names = columns
     mask = recording.mask
-    if not np.abs(forces[mask]).max(initial=0.0) > 1e-9:
+    if not np.abs(forces[mask]).max(initial=0.0) > _NO_FORCE:
         return [_no_commands(recording)]
     axes = {
         i: r

@@ -179,7 +179,7 @@ def make_data(
     Raises:
         UserError: attitude or a channel of the twist is missing, or no run has two samples.
     """
-    unmeasured = _unmeasured(recording)
+    unmeasured = unmeasured_coordinates(recording)
     data, lengths = recording.dataset, recording.lengths
     thrust, volts = recording.thrust(vehicle)
     has_voltage = "voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any())
@@ -232,7 +232,7 @@ def _kept(lengths: np.ndarray, without: Sequence[int]) -> np.ndarray:
     return kept if kept.any() else long
 
 
-def _unmeasured(recording: Recording) -> tuple[str, ...]:
+def unmeasured_coordinates(recording: Recording) -> tuple[str, ...]:
     """Coordinates of the position that were not measured; other channels are refused."""
     lacking = recording.missing
     of_pose = lacking.get("X_WB", ())

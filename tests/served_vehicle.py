@@ -3,6 +3,7 @@
 import threading
 
 from spinndrift.sims.scenarios.scenario import load_scenario
+from spinndrift.sims.vehicle.plant import Plant
 from spinndrift.sims.vehicle.server import Server, open_all
 from spinndrift.sims.vehicle.simulation import Simulation
 
@@ -10,13 +11,18 @@ LIMIT = 60.0  # s of wall time for anything with a server, on a busy machine
 
 
 class Served:
-    """A server in a thread of its own, on free ports."""
+    """A server in a thread of its own, on free ports.
 
-    def __init__(self, *connections: str):
-        scenario = load_scenario("station_keeping_calm")
+    `text` overrides the scenario; a plant that was made for another server may be given.
+    """
+
+    def __init__(self, *connections: str, text: str = "", plant: Plant | None = None):
+        scenario = load_scenario("station_keeping_calm", text)
         self.transports = open_all(connections)
         self.ports = [transport.port for transport in self.transports]
-        self.simulation = Simulation(scenario, len(self.transports))
+        if plant is not None:
+            plant.restart()
+        self.simulation = Simulation(scenario, len(self.transports), plant=plant)
         self.server = Server(self.simulation, self.transports)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.server.run, args=(self._stop,), daemon=True)

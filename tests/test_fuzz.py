@@ -24,7 +24,8 @@ def test_what_is_spoiled_is_read_or_refused(name, tmp_path):
             wrong.append(f"{name} {number}: {verdict.fate}\n{verdict.told}")
     assert not wrong, "\n\n".join(wrong[:5])
     # inputs that are all refused, or all read, would try little
-    assert min(fates["read"], fates["refused"]) >= COUNT / 50, fates
+    if KINDS[name].refuses:
+        assert min(fates["read"], fates["refused"]) >= COUNT / 50, fates
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import pytest
 from spinndrift.systems.mavlink.clock import (
     MICROSECONDS_32,
     MILLISECONDS_32,
-    Unwrapped,
     VehicleClock,
 )
 
@@ -71,13 +70,47 @@ def test_a_reboot_starts_the_offset_anew():
 
 @pytest.mark.parametrize("span", [MICROSECONDS_32, MILLISECONDS_32])
 def test_a_counter_goes_on_where_it_wraps(span: float):
-    unwrapped, rng = Unwrapped(span), np.random.default_rng(2)
+    clock, rng = VehicleClock(), np.random.default_rng(2)
     true = span - 3.0 + 0.05 * np.arange(200)
     order = np.arange(200)
     for i in rng.permutation(198)[:40]:  # neighbours change places
         order[[i, i + 1]] = order[[i + 1, i]]
-    found = [unwrapped(true[i] % span) for i in order]
+    found = []
+    for k, i in enumerate(order):
+        arrival = BOOT + true[k] + 0.1
+        found.append(clock.continued(true[i] % span, span, arrival))
+        clock.arrived(found[-1], arrival)
     np.testing.assert_allclose(found, true[order], atol=1e-6)
+    assert clock.reboots == 0
+
+
+@pytest.mark.parametrize("up", [30.0, 2500.0, 7200.0, 40 * 86400.0])
+def test_clocks_of_any_age_agree_and_a_boot_is_counted_once(up: float):
+    """A narrow and a wide counter of one vehicle, which boots anew after ten seconds."""
+    clock = VehicleClock()
+
+    def hear(boot: float, local: float) -> None:
+        for span in (MICROSECONDS_32, MILLISECONDS_32):
+            clock.arrived(clock.continued(boot % span, span, local), local)
+
+    for k in range(100):
+        hear(up + 0.1 * k, BOOT + 0.1 * k)
+    assert clock.reboots == 0
+    assert clock.local(up) == pytest.approx(BOOT)
+    for k in range(1, 100):
+        hear(0.1 * k, BOOT + 15.0 + 0.1 * k)
+    assert clock.reboots == 1
+    assert clock.local(0.0) == pytest.approx(BOOT + 15.0)
+
+
+def test_a_silent_hour_is_no_boot():
+    clock = VehicleClock()
+    clock.arrived(4200.0, BOOT)
+    wrapped = 4200.0 + 3600.0 - MICROSECONDS_32
+    later = clock.continued(wrapped, MICROSECONDS_32, BOOT + 3600.0)
+    clock.arrived(later, BOOT + 3600.0)
+    assert later == pytest.approx(7800.0)
+    assert clock.reboots == 0
 
 
 def test_spans_are_those_of_the_fields():

@@ -5,6 +5,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from fuzz.mavlink_frames import framed
 
 from spinndrift.sims.vehicle.autopilot.navigation import Motion
 from spinndrift.sims.vehicle.endpoint import dvl_messages
@@ -332,7 +333,7 @@ def test_damaged_and_invented_packets_raise_nothing():
         kind = chance.choice(known if n % 2 else kinds)
         size = kind.unpacker.size
         payload = bytes(chance.choice((0, 1, 255, chance.randrange(256))) for _ in range(size))
-        data = bytearray(_framed(kind, payload, n))
+        data = bytearray(framed(kind, payload, n))
         if n % 5 == 0:
             data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
         client.ports.receive(0, bytes(data))
@@ -356,15 +357,6 @@ HANDLED = {
     "VISION_POSITION_DELTA",
     "ODOMETRY",
 }
-
-
-def _framed(kind, payload: bytes, sequence: int) -> bytes:
-    """A sound packet of MAVLink 2 with any payload."""
-    body = bytes(payload).rstrip(b"\0") or b"\0"
-    head = bytes([len(body), 0, 0, sequence % 256, 255, 190]) + kind.id.to_bytes(3, "little")
-    crc = mavlink.x25crc(head + body)
-    crc.accumulate(bytes([kind.crc_extra]))
-    return b"\xfd" + head + body + crc.crc.to_bytes(2, "little")
 
 
 def test_a_faulty_link_loses_delays_damages_and_reorders_the_share_it_is_told():

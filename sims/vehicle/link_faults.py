@@ -1,4 +1,8 @@
-"""Faults of a link: loss, delay, jitter, reordering and damage of packets, from a seed."""
+"""Faults of a link: loss, delay, jitter, reordering and damage of packets, from a seed.
+
+A stream of bytes is taken apart into MAVLink packets first: what is lost is a packet, whatever the
+chunks that a socket delivers.
+"""
 
 import heapq
 import random
@@ -28,6 +32,11 @@ class LinkFaults:
     reordering: Annotated[float, _SHARE] = 0.0
     delay: Annotated[float, _SECONDS] = 0.0
     jitter: Annotated[float, _SECONDS] = 0.0
+
+    @property
+    def any(self) -> bool:
+        """Whether there is a fault."""
+        return self != LinkFaults()
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -77,3 +86,35 @@ class FaultyLink:
 
 
 _OVERTAKEN = 0.05  # s
+_HEADS = {0xFD: 12, 0xFE: 8}
+"""Bytes of a packet besides its payload, by the first: MAVLink 2 and 1."""
+_SIGNED, _SIGNATURE = 1, 13
+
+
+class Packets:
+    """The packets in a stream of bytes; bytes between packets are pieces of their own."""
+
+    def __init__(self):
+        self._rest = b""
+
+    def split(self, data: bytes) -> list[bytes]:
+        """The packets that end within `data`, which continues what was given before."""
+        stream, found, start = self._rest + data, [], 0
+        while start < len(stream):
+            size = _size(stream[start : start + 3])
+            if size is None or start + size > len(stream):
+                break
+            found.append(stream[start : start + size])
+            start += size
+        self._rest = stream[start:]
+        return found
+
+
+def _size(head: bytes) -> int | None:
+    """Length of the packet that begins so, 1 if none does, None if more bytes are needed."""
+    if head[0] not in _HEADS:
+        return 1
+    if len(head) < 3:
+        return None
+    signed = head[0] == 0xFD and head[2] & _SIGNED
+    return _HEADS[head[0]] + head[1] + (_SIGNATURE if signed else 0)

@@ -34,21 +34,21 @@ class Physics:
         self.vehicle = config.load_vehicle()
         self.thrusters = len(self.vehicle.propulsion.mounts)
         self._diagram = build(config)
-        self._simulator = self._started()
+        self.restart()
         self._simulator.AdvanceTo(_WARM_UP)
-        self._simulator = self._started()
-        self._steps = 0
+        self.restart()
         nominal = self.vehicle.propulsion.voltage
         self._resting_voltage = nominal if config.voltage is None else config.voltage
 
-    def _started(self) -> Simulator:
-        simulator = Simulator(self._diagram)
-        context = simulator.get_mutable_context()
+    def restart(self) -> None:
+        """Go back to the start, with the same random numbers."""
+        self._simulator = Simulator(self._diagram)
+        context = self._simulator.get_mutable_context()
         seeded(self._diagram, context, self.config.seed)
         neutral = np.full(self.thrusters, float(NEUTRAL))
         self._pwm = self._diagram.GetInputPort("pwm").FixValue(context, neutral)
-        simulator.Initialize()
-        return simulator
+        self._simulator.Initialize()
+        self._steps = 0
 
     def parameters(self) -> dict[str, float]:
         """Parameters of an autopilot that knows this vehicle: its frame, its motors' directions."""

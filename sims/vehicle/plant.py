@@ -44,10 +44,14 @@ class Plant(Physics):
             UserError: a part of the configuration names what can't be read.
         """
         super().__init__(config, make_driven_station)
-        self._dvl_time = 0.0
         dvl = config.sensing.dvl
         rpy = jnp.array((0.0, 0.0, 0.0) if dvl is None else dvl.rpy)
         self._q_BD = np.array(from_position_rpy(jnp.zeros(3), rpy)[:4])
+
+    def restart(self) -> None:
+        """Go back to the start, with the same random numbers."""
+        super().restart()
+        self._dvl_time = 0.0
 
     def parameters(self) -> dict[str, float]:
         """Parameters of an autopilot that knows this vehicle: frame, directions, DVL's place."""

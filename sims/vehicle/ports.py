@@ -24,6 +24,7 @@ class Ports:
         self._dvl = Parser(system, DVL_COMPONENT)
         self._heard: list[set[int]] = [set() for _ in range(count)]
         self._waiting: list[list[bytes]] = [[] for _ in range(count)]
+        self._boots = vehicle.boots
 
     def receive(self, port: int, data: bytes) -> None:
         """Take bytes that arrived at a port."""
@@ -52,6 +53,10 @@ class Ports:
     def step(self) -> list[list[bytes]]:
         """The packets that go out now, port by port."""
         vehicle, out = self.vehicle, []
+        if vehicle.boots != self._boots:  # what it counts begins anew, and the network is forgotten
+            self._boots = vehicle.boots
+            self.parsers = [Parser(self._system, COMPONENT) for _ in self.parsers]
+            self._heard = [set() for _ in self._heard]
         told = [
             mavlink.MAVLink_statustext_message(text.severity, text.text[:_LONGEST_TEXT].encode())
             for text in vehicle.autopilot.texts

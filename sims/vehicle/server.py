@@ -7,7 +7,7 @@ from contextlib import suppress
 
 from ...models.config.errors import UserError
 from ...systems.mavlink.transport import FORMS, Connection, Lost, Transport
-from .link_faults import FaultyLink
+from .link_faults import FaultyLink, Packets
 from .simulation import TICK, Simulation
 
 _MOST_TICKS = 40  # between looks at the sockets
@@ -52,6 +52,7 @@ class Server:
         faults = simulation.settings.faults
         n = len(transports)
         self._inward = [FaultyLink(faults, seed + 2 * i) for i in range(n)]
+        self._packets = [Packets() for _ in range(n)] if faults.any else []
         self._outward = [FaultyLink(faults, seed + 2 * i + 1) for i in range(n)]
 
     def run(self, stop: threading.Event, duration: float | None = None) -> None:
@@ -106,7 +107,8 @@ class Server:
                 continue
             wait = 0.0
             if data:
-                self._inward[port].send(self.simulation.time, data)
+                for packet in self._packets[port].split(data) if self._packets else [data]:
+                    self._inward[port].send(self.simulation.time, packet)
 
     def _write(self, port: int, packet: bytes) -> None:
         transport = self._transports.get(port)

@@ -18,8 +18,12 @@ _MOST_MERIT = 0.4  # m/s: figure of merit of a reading without confidence
 class Simulation:
     """What happens in a scenario's water, tick by tick, and what goes over the links."""
 
-    def __init__(self, scenario: Scenario, ports: int, record: bool = True):
-        """Build plant and vehicle; this compiles. `record` is whether to log the truth.
+    def __init__(
+        self, scenario: Scenario, ports: int, record: bool = True, plant: Plant | None = None
+    ):
+        """Build plant and vehicle; this compiles, unless a plant of the scenario is given.
+
+        `record` is whether to log the truth.
 
         Raises:
             UserError: the scenario names what can't be read, or an unknown parameter.
@@ -28,7 +32,7 @@ class Simulation:
         own = dict(self.settings.parameters)
         Vehicle(own)  # these two before the plant, whose building takes long
         frame_for(len(scenario.station.load_vehicle().propulsion.mounts))
-        self.plant = Plant(scenario.station)
+        self.plant = plant or Plant(scenario.station)
         parameters = self.plant.parameters() | own
         self.vehicle = Vehicle(parameters, self.settings.clock)
         self.ports = Ports(self.vehicle, ports)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 _WINDOW = 10.0  # s of observations that are kept: clocks drift by less than 1 ms in it
 _REBOOT = 2.0  # s by which the boot clock runs back when the vehicle boots again
 _FRESH = 5.0  # s for which an answer to TIMESYNC is preferred to the delay of messages
+_APART = 60.0  # s: longest delay of a message; a clock that is farther off began anew
 
 
 class Exchange(NamedTuple):
@@ -39,13 +40,14 @@ class VehicleClock:
         self._exchanges: deque[Exchange] = deque()
         self._delays: deque[tuple[float, float]] = deque()  # (arrival, arrival - boot)
         self._newest = -float("inf")
+        self._newest_at = 0.0
 
     def exchanged(self, sent: float, vehicle: float, received: float) -> None:
         """Take in an answer to TIMESYNC: local times of request and answer, vehicle's in between.
 
         `vehicle` is the answer's time on the boot clock.
         """
-        self._begin_again(vehicle)
+        self._begin_again(vehicle, received)
         middle, trip = (sent + received) / 2, received - sent
         self._exchanges.append(Exchange(received, middle - vehicle, trip))
         while self._exchanges[0].at < received - _WINDOW:
@@ -54,7 +56,7 @@ class VehicleClock:
 
     def arrived(self, boot: float, arrival: float) -> None:
         """Take in a message: its time on the boot clock and the local time of its arrival."""
-        self._begin_again(boot)
+        self._begin_again(boot, arrival)
         delay = arrival - boot
         while self._delays and self._delays[-1][1] >= delay:  # keeps a falling minimum at the front
             self._delays.pop()
@@ -85,35 +87,26 @@ class VehicleClock:
             return None
         return min(self._exchanges, key=lambda exchange: exchange.round_trip)
 
-    def _begin_again(self, boot: float) -> None:
+    def continued(self, value: float, span: float, arrival: float) -> float:
+        """Time on the boot clock of a counter that returns to zero at `span` (s).
+
+        It is the one nearest to where the clock should be on arrival. If none is near, the clock
+        began anew, and the counter with it.
+        """
+        expected = self._newest + arrival - self._newest_at
+        if expected == -float("inf"):
+            return value
+        found = value + span * round((expected - value) / span)
+        return found if abs(found - expected) < _APART else value
+
+    def _begin_again(self, boot: float, arrival: float) -> None:
         if boot < self._newest - _REBOOT:
             self.reboots += 1
             self._exchanges.clear()
             self._delays.clear()
-            self._newest = boot
-        self._newest = max(self._newest, boot)
-
-
-class Unwrapped:
-    """A counter of limited width as one that goes on; each stream has its own.
-
-    A step back by less than half the range is a late message, not a wrap.
-    """
-
-    def __init__(self, span: float):
-        """`span` is the value at which the counter returns to zero, in the counter's unit."""
-        self._span = span
-        self._last: float | None = None
-
-    def __call__(self, value: float) -> float:
-        """The continued value of the counter."""
-        if self._last is None:
-            self._last = value
-            return value
-        step = (value - self._last + self._span / 2) % self._span - self._span / 2
-        found = self._last + step
-        self._last = max(self._last, found)
-        return found
+            self._newest = -float("inf")
+        if boot > self._newest:
+            self._newest, self._newest_at = boot, arrival
 
 
 MILLISECONDS_32 = 2**32 / 1e3

@@ -13,6 +13,7 @@ from .link import Link, Peer
 
 RESULTS = {number: entry.name for number, entry in mavlink.enums["MAV_RESULT"].items()}
 _ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
+_INTERVAL = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
 FORCED_DISARM = 21196.0
 """Parameter 2 of a disarming that is not refused (ArduPilot's magic number)."""
 _SPOKEN = 0.3  # s to wait for the text that gives the reason of a refusal
@@ -119,15 +120,19 @@ def disarm(link: Link, force: bool = True) -> None:
 def request_rates(link: Link, rates: Mapping[str, float]) -> dict[str, str]:
     """Ask for messages at rates (Hz); what was refused, with the vehicle's answer.
 
-    Whether a rate is kept shows in `link.statistics().rates`: a serial line may be too slow.
+    Whether a rate is kept shows in `link.statistics().rates`: a serial line may be too slow. When
+    the vehicle boots anew they are asked for again.
     """
-    refused = {}
+    refused, asked = {}, []
     for name, rate in rates.items():
-        number = getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
+        number = float(getattr(mavlink, f"MAVLINK_MSG_ID_{name}"))
         interval = 1e6 / rate if rate > 0 else -1.0
-        result = command(link, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(number), interval)
+        result = command(link, _INTERVAL, number, interval)
         if result != _ACCEPTED:
             refused[name] = _answer(result)
+        else:
+            asked.append(command_long(link.find_vehicle(), _INTERVAL, number, interval))
+    link.when_booted(lambda: [link.send(message) for message in asked])
     return refused
 
 

@@ -16,7 +16,7 @@ Message = Any
 """A pymavlink message. Its fields are attributes, which its class does not declare."""
 
 _LAST = 255  # sequence numbers count from 0 to this
-_LATE = 32  # places by which a packet can be late
+_LATE = 64  # places by which a packet can be late: 50 ms at a full rate and in a burst
 
 
 class Parser:
@@ -54,9 +54,14 @@ class Parser:
         if not late:
             self._sequence[sender] = number
 
-    def restart(self) -> None:
-        """Begin a new stream: what was sent in between is not counted as lost."""
+    def restart(self, counts: bool = False) -> None:
+        """Begin a new stream: what was sent in between is not counted as lost.
+
+        `counts` is whether the counts begin anew as well.
+        """
         self._sequence.clear()
+        if counts:
+            self.received = self.damaged = self.lost = 0
 
     def packed(self, message: Message) -> bytes:
         """The packet of a message, with the next sequence number."""

@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import BinaryIO, NamedTuple
 
 from ...models.config.errors import UserError
-from .clock import MICROSECONDS_32, MILLISECONDS_32, Unwrapped, VehicleClock
+from .clock import MICROSECONDS_32, MILLISECONDS_32, VehicleClock
 from .config import GROUND_STATION
 from .dialect import Message, Parser, mavlink
 from .transport import Connection, Lost, Transport
@@ -23,6 +23,7 @@ from .transport import Connection, Lost, Transport
 _COMPONENT = mavlink.MAV_COMP_ID_MISSIONPLANNER
 _HEARTBEAT, _TIMESYNC, _RETRY = 0.5, 0.5, 1.0  # s between heartbeats, TIMESYNC requests, attempts
 _WAIT = 0.05  # s: longest wait for data
+_TELLINGS = 5  # calls, a second apart, after a boot
 _RECENT = 2.0  # s over which rates are counted
 _BY_FIELD = {"NAMED_VALUE_FLOAT": "name", "BATTERY_STATUS": "id"}  # kept by that field as well
 _AIDS = ("VISION_POSITION_DELTA", "ODOMETRY", "DISTANCE_SENSOR")
@@ -50,12 +51,12 @@ class Peer(NamedTuple):
 
 @dataclass
 class Statistics:
-    """What came through the link so far.
+    """What came through the link.
 
     Attributes:
-        received: messages, of all senders.
-        lost: gaps in sequence numbers.
-        damaged: packets with a wrong checksum, and bytes in between.
+        received: messages since the vehicle's last boot, of all senders.
+        lost: gaps in sequence numbers since then.
+        damaged: packets with a wrong checksum, and bytes in between, since then.
         reconnections: how often a lost connection was opened again.
         silence: time since the vehicle was last heard (s).
         rates: messages per second of each kind, over the last two seconds.
@@ -101,7 +102,9 @@ class Link:
         self._newest: dict[str, Received] = {}
         self._times: dict[str, deque[float]] = {}
         self._others: dict[Peer, float] = {}
-        self._unwrapped: dict[str, Unwrapped] = {}
+        self._boots = 0
+        self._when_booted: list[Callable[[], object]] = []
+        self._booted_calls = 0
         self._texts: deque[tuple[float, int, str]] = deque(maxlen=200)
         self._readers: list[Callable[[Received], None]] = []
         self._changed = threading.Condition()
@@ -176,6 +179,13 @@ class Link:
             yield
         finally:
             self._readers = [one for one in self._readers if one is not reader]
+
+    def when_booted(self, act: Callable[[], object]) -> None:
+        """Call `act` in the link's thread when the vehicle has booted anew; it must not wait.
+
+        It is called five times in as many seconds: the vehicle may not listen yet.
+        """
+        self._when_booted.append(act)
 
     def statistics(self) -> Statistics:
         """Counts and rates until now."""
@@ -262,7 +272,7 @@ class Link:
     # -------------------------------------------------------------------------------------- thread
 
     def _run(self) -> None:
-        due = {"heartbeat": 0.0, "timesync": 0.0}
+        due = {"heartbeat": 0.0, "timesync": 0.0, "booted": 0.0}
         while not self._closing:
             now = time.monotonic()
             if self._transport is None:
@@ -274,6 +284,10 @@ class Link:
             if now >= due["timesync"]:
                 due["timesync"] = now + _TIMESYNC
                 self.send(mavlink.MAVLink_timesync_message(0, time.monotonic_ns()))
+            if self._booted_calls and now >= due["booted"]:
+                due["booted"], self._booted_calls = now + 1.0, self._booted_calls - 1
+                for act in self._when_booted:
+                    act()
             try:
                 data = self._transport.read(_WAIT)
             except Lost:
@@ -317,11 +331,15 @@ class Link:
             return  # a camera's, a companion computer's
         with self._sending:
             self._keep(message.get_msgbuf())
-        found = Received(message, arrival, self._boot(message, name))
+        found = Received(message, arrival, self._boot(message, name, arrival))
         if name == "TIMESYNC":
             self._exchanged(message, arrival)
-        elif found.boot is not None and not aid:  # an aid's sender may have another clock
+        elif found.boot is not None and peer == self.vehicle:  # others may have other clocks
             self.clock.arrived(found.boot, arrival)
+        if self.clock.reboots != self._boots:  # its sequence began anew, and its requested rates
+            self._boots = self.clock.reboots
+            self._parser.restart(counts=True)
+            self._booted_calls = _TELLINGS
         if name == "STATUSTEXT":
             self._texts.append((arrival, message.severity, message.text))
         self._times.setdefault(name, deque(maxlen=1000)).append(arrival)
@@ -335,7 +353,7 @@ class Link:
         for reader in self._readers:
             reader(found)
 
-    def _boot(self, message: Message, name: str) -> float | None:
+    def _boot(self, message: Message, name: str, arrival: float) -> float | None:
         """The message's time on the boot clock."""
         if (ms := getattr(message, "time_boot_ms", None)) is not None:
             seconds, span = ms * 1e-3, MILLISECONDS_32
@@ -345,7 +363,7 @@ class Link:
             return None
         if span is None:
             return seconds
-        return self._unwrapped.setdefault(name, Unwrapped(span))(seconds)
+        return self.clock.continued(seconds, span, arrival)
 
     def _exchanged(self, message: Message, arrival: float) -> None:
         if message.tc1 > 0:  # an answer; requests of the vehicle are not answered

@@ -35,11 +35,13 @@ class Kind:
         name: as options and folders have it.
         spoil: writes a spoiled input into a folder; returns the path to read.
         read: reads it as the commands do.
+        refuses: whether some inputs are refused; what is on a link is not.
     """
 
     name: str
     spoil: Callable[[Rng, Path], Path]
     read: Callable[[Path], Any]
+    refuses: bool = True
 
 
 @dataclass(frozen=True)

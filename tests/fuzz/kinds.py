@@ -1,9 +1,10 @@
-"""All kinds of files, by name."""
+"""All kinds of inputs, by name."""
 
 from .checkpoints import CHECKPOINT
 from .csv_folders import CSV
 from .logs import BIN, TLOG
+from .mavlink_frames import MAVLINK
 from .netcdf import NETCDF
 from .yaml_files import YAML
 
-KINDS = {kind.name: kind for kind in (TLOG, BIN, NETCDF, CSV, YAML, CHECKPOINT)}
+KINDS = {kind.name: kind for kind in (TLOG, BIN, NETCDF, CSV, YAML, CHECKPOINT, MAVLINK)}

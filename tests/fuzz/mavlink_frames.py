@@ -1,12 +1,14 @@
 """MAVLink frames at both ends of a link: the vehicle's ports, and our link with its telemetry.
 
-Both go on from input to input, as they do in a dive; now and then they begin anew.
+An input is twenty frames in a row. Both ends go on from input to input, as they do in a dive; now
+and then they begin anew.
 """
 
 import struct
 import time
 from pathlib import Path
 
+from spinndrift.sims.vehicle.autopilot.autopilot import READY
 from spinndrift.sims.vehicle.autopilot.navigation import Motion
 from spinndrift.sims.vehicle.ports import Ports
 from spinndrift.sims.vehicle.vehicle import Vehicle
@@ -18,7 +20,9 @@ from spinndrift.systems.mavlink.transport import Transport
 from .harness import Kind
 from .mutate import Rng, bytes_spoiled, packed_special, pick
 
-_ANEW = 1000  # inputs after which both ends begin anew: a vehicle may be made deaf
+_FRAMES = 20  # of an input
+_CHUNK = 256  # bytes that arrive together
+_ANEW = 100  # inputs after which both ends begin anew: a vehicle may be made deaf
 _TICK = 0.02  # s of the vehicle's time for each input
 _KINDS = [kind for kind in mavlink.mavlink_map.values() if hasattr(kind, "unpacker")]
 _TAKEN = {
@@ -97,12 +101,13 @@ def _codes(kind) -> list[str]:
 
 
 def _spoil(rng: Rng, folder: Path) -> Path:
-    kind = pick(rng, _READ if rng.random() < 0.8 else _KINDS)
-    data = framed(kind, _payload(rng, kind), int(rng.integers(256)), pick(rng, _SENDERS))
-    if rng.random() < 0.3:
-        data = bytes_spoiled(rng, data)
-    path = folder / "frame.bin"
-    path.write_bytes(data)
+    frames = []
+    for number in range(_FRAMES):
+        kind = pick(rng, _READ if rng.random() < 0.8 else _KINDS)
+        frame = framed(kind, _payload(rng, kind), number, pick(rng, _SENDERS))
+        frames.append(bytes_spoiled(rng, frame) if rng.random() < 0.3 else frame)
+    path = folder / "frames.bin"
+    path.write_bytes(b"".join(frames))
     return path
 
 
@@ -130,33 +135,38 @@ class _Ends:
     """The vehicle's ports and our link."""
 
     def __init__(self):
-        self.left = _ANEW
         self._vehicle = Vehicle()
         self._ports = Ports(self._vehicle, 2)
         self._link = Link(_Nowhere())  # pyright: ignore[reportArgumentType]
         self._t = 0.0
-        for _ in range(200):
+        while self._t < READY:
             self.take(b"")
+        self.left = _ANEW
 
     def close(self) -> None:
         self._link.close()
 
     def take(self, data: bytes) -> None:
         """Let both ends receive the bytes, and the link what the vehicle sends."""
-        self.left -= 1
-        self._t += _TICK
-        self._ports.receive(0, data)
-        self._vehicle.step(self._t, Motion())
-        self._receive(data)
-        self._receive(b"".join(self._ports.step()[0]))
-        link, now = self._link, time.monotonic()
+        for start in range(0, max(len(data), 1), _CHUNK):
+            chunk = data[start : start + _CHUNK]
+            self._t += _TICK
+            self._ports.receive(0, chunk)
+            self._vehicle.step(self._t, Motion())
+            self._receive(chunk)
+            self._receive(b"".join(self._ports.step()[0]))
+            self._look()
+        self._link.statistics()
+
+    def _look(self) -> None:
+        """Read all telemetry, as a driver does in its loop."""
+        link = self._link
         for read in (telemetry.attitude, telemetry.imu, telemetry.position, telemetry.battery):
             read(link)
         telemetry.depth(link, {}, 1025.0)
         telemetry.outputs(link, 8)
         telemetry.pilot_gain(link, {})
-        telemetry.status(link, now)
-        link.statistics()
+        telemetry.status(link, time.monotonic())
 
     def _receive(self, data: bytes) -> None:
         """What the link's thread does with bytes from its transport."""
@@ -172,6 +182,7 @@ def _read(path: Path) -> None:
         _ends.pop().close()
     if not _ends:
         _ends.append(_Ends())
+    _ends[0].left -= 1
     try:
         _ends[0].take(path.read_bytes())
     except BaseException:

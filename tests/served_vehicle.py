@@ -16,14 +16,21 @@ class Served:
     `text` overrides the scenario; a plant that was made for another server may be given.
     """
 
-    def __init__(self, *connections: str, text: str = "", plant: Plant | None = None):
+    def __init__(
+        self,
+        *connections: str,
+        text: str = "",
+        plant: Plant | None = None,
+        speed: float = 1.0,
+        record: bool = True,
+    ):
         scenario = load_scenario("station_keeping_calm", text)
         self.transports = open_all(connections)
         self.ports = [transport.port for transport in self.transports]
         if plant is not None:
             plant.restart()
-        self.simulation = Simulation(scenario, len(self.transports), plant=plant)
-        self.server = Server(self.simulation, self.transports)
+        self.simulation = Simulation(scenario, len(self.transports), record, plant)
+        self.server = Server(self.simulation, self.transports, speed=speed)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self.server.run, args=(self._stop,), daemon=True)
         self._thread.start()

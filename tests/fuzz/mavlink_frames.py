@@ -15,7 +15,7 @@ from spinndrift.sims.vehicle.vehicle import Vehicle
 from spinndrift.systems.mavlink import telemetry
 from spinndrift.systems.mavlink.dialect import mavlink
 from spinndrift.systems.mavlink.link import Link
-from spinndrift.systems.mavlink.transport import Transport
+from spinndrift.systems.mavlink.transport import Connection
 
 from .harness import Kind
 from .mutate import Rng, bytes_spoiled, packed_special, pick
@@ -111,33 +111,13 @@ def _spoil(rng: Rng, folder: Path) -> Path:
     return path
 
 
-class _Nowhere:
-    """A connection whose other side is silent."""
-
-    port = 0
-
-    def open(self, timeout: float = 0.0) -> Transport:
-        del timeout
-        return self
-
-    def read(self, timeout: float) -> bytes:
-        time.sleep(timeout)
-        return b""
-
-    def write(self, data: bytes) -> None:
-        del data
-
-    def close(self) -> None:
-        pass
-
-
 class _Ends:
     """The vehicle's ports and our link."""
 
     def __init__(self):
         self._vehicle = Vehicle()
         self._ports = Ports(self._vehicle, 2)
-        self._link = Link(_Nowhere())  # pyright: ignore[reportArgumentType]
+        self._link = Link(Connection.parse("udpin:127.0.0.1:0"))  # to which no one sends
         self._t = 0.0
         while self._t < READY:
             self.take(b"")

@@ -70,8 +70,9 @@ def yaw_ned_to_enu(yaw: Field) -> Values:
 
 
 def attitude(q1: Field, q2: Field, q3: Field, q4: Field) -> Float[np.ndarray, "4 *batch"]:
-    """q_WB from ATTITUDE_QUATERNION or XKQ, normalised; NaN where the message is all zero."""
-    q = quaternion_to_flu_enu(_stack(q1, q2, q3, q4))
+    """q_WB from ATTITUDE_QUATERNION or XKQ, normalised; NaN where it is all zero or not finite."""
+    fields = _stack(q1, q2, q3, q4)
+    q = quaternion_to_flu_enu(np.where(np.isfinite(fields).all(axis=0), fields, 0.0))
     norm = np.linalg.norm(q, axis=0)
     return q / np.where(norm > 0, norm, np.nan)
 

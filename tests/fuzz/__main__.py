@@ -30,12 +30,13 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/fuzz"), help="what was wrong")
     given = parser.parse_args()
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
-    warnings.simplefilter("error")
     import jax
 
     jax.config.update("jax_enable_x64", True)
     from .harness import judge
     from .kinds import KINDS as known
+
+    warnings.simplefilter("error")  # after the imports, some of which set filters of their own
 
     tried, wrong = Counter[str](), Counter[str]()
     with tempfile.TemporaryDirectory(prefix="fuzz-") as scratch:

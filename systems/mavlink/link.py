@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import BinaryIO, NamedTuple
 
 from ...models.config.errors import UserError
+from . import heartbeat
 from .clock import MICROSECONDS_32, MILLISECONDS_32, VehicleClock
 from .config import GROUND_STATION
 from .dialect import Message, Parser, mavlink
@@ -280,7 +281,7 @@ class Link:
                 continue
             if now >= due["heartbeat"]:
                 due["heartbeat"] = now + _HEARTBEAT
-                self.send(_heartbeat())
+                self.send(heartbeat.ours())
             if now >= due["timesync"]:
                 due["timesync"] = now + _TIMESYNC
                 self.send(mavlink.MAVLink_timesync_message(0, time.monotonic_ns()))
@@ -319,11 +320,11 @@ class Link:
     def _take_in(self, message: Message, arrival: float) -> None:
         peer, name = Peer(message.get_srcSystem(), message.get_srcComponent()), message.get_type()
         ours, aid = peer.system == self._me.system, name in _AIDS
-        if ours and (name in _STEERING or (name == "HEARTBEAT" and _is_station(message))):
+        if ours and (name in _STEERING or (name == "HEARTBEAT" and heartbeat.is_station(message))):
             self._others[peer] = arrival
         if ours and not aid:
             return
-        if name == "HEARTBEAT" and self.vehicle is None and _is_autopilot(message):
+        if name == "HEARTBEAT" and self.vehicle is None and heartbeat.is_autopilot(message):
             self.vehicle = peer
         if self.vehicle is not None and peer.system != self.vehicle.system and not aid:
             return
@@ -373,26 +374,6 @@ class Link:
         """Append a packet to the telemetry log: time in µs since 1970, then the packet."""
         if self._record is not None:
             self._record.write(struct.pack(">Q", time.time_ns() // 1000) + bytes(packet))
-
-
-def _heartbeat() -> Message:
-    return mavlink.MAVLink_heartbeat_message(
-        mavlink.MAV_TYPE_GCS,
-        mavlink.MAV_AUTOPILOT_INVALID,
-        0,
-        0,
-        mavlink.MAV_STATE_ACTIVE,
-        3,
-    )
-
-
-def _is_station(heartbeat: Message) -> bool:
-    return heartbeat.type == mavlink.MAV_TYPE_GCS
-
-
-def _is_autopilot(heartbeat: Message) -> bool:
-    ground = heartbeat.type in (mavlink.MAV_TYPE_GCS, mavlink.MAV_TYPE_ONBOARD_CONTROLLER)
-    return heartbeat.autopilot != mavlink.MAV_AUTOPILOT_INVALID and not ground
 
 
 def _open_record(path: Path | None, transport: Transport) -> BinaryIO | None:

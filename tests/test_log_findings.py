@@ -133,6 +133,18 @@ def test_records_of_ekf2_are_read_as_those_of_ekf3(tmp_path):
     assert [word for word, _ in found] == ["armed-unknown"]
 
 
+def test_a_dataflash_log_without_its_beginning_says_so(tmp_path):
+    log = dataflash(duration=8.0)
+    formats = [part for part in log.parts if part[2] == 128]
+    rest = [part for part in log.parts if part[2] != 128]
+    with pytest.raises(UserError, match="the log's beginning is lost, with the FMT records"):
+        imported(tmp_path, b"".join(rest), "lost.BIN")
+    kept = [part for part in formats if b"BAT\0" not in part]
+    recording, _, report = imported(tmp_path, b"".join([*kept, *rest]), "part.BIN")
+    assert "voltage" not in recording.dataset
+    assert any("layout of 1 kind of records" in line for line in report.dropped + report.done)
+
+
 def test_the_height_of_a_barometer_is_no_reset(tmp_path):
     """A plain six-thruster dive without a horizontal aid: one stretch a mode."""
     path = shared_data("data", "sitl_six_plain", "dive.tlog.xz")

@@ -4,11 +4,13 @@ A file of 44 MB takes about a second; pymavlink's reader takes half a minute. Na
 field types of the records come from the file's own FMT records (ArduPilot, AP_Logger).
 """
 
+from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from ...models.config.errors import UserError
 from .log_bytes import Progress, no_progress
 from .table import Table, numbers
 
@@ -38,6 +40,8 @@ _TYPES: dict[str, tuple[str, float | None]] = {
     "Z": ("S64", None),
 }
 
+_RECURRING = 10
+"""Records of one number without a layout, above which they are no accident of damaged bytes."""
 _NO_NUMBER = "anNZ"
 """Types of an array and of text."""
 
@@ -78,8 +82,17 @@ class _Format:
 
 
 def read_bin(data: bytes, wanted: Collection[str], progress: Progress = no_progress) -> BinLog:
-    """Decode the wanted message types; damaged stretches are skipped and reported in the notes."""
-    formats, offsets, skipped = _scan(data, wanted, progress)
+    """Decode the wanted message types; damaged stretches are skipped and reported in the notes.
+
+    Raises:
+        UserError: the records that tell the layout of the others are lost.
+    """
+    formats, offsets, skipped, unknown = _scan(data, wanted, progress)
+    if len(formats) == 1 and sum(unknown.values()) > 0:
+        raise UserError(
+            "the log's beginning is lost, with the FMT records that tell the layout of the others; "
+            "download the log again, or give the telemetry log (.tlog) of the dive"
+        )
     tables: dict[str, Table] = {}
     unreadable = []
     for number, found in offsets.items():
@@ -92,6 +105,12 @@ def read_bin(data: bytes, wanted: Collection[str], progress: Progress = no_progr
     notes = []
     if skipped:
         notes.append(f"{skipped} of {len(data)} bytes of the log are damaged and were skipped.")
+    lost = {number: count for number, count in unknown.items() if count >= _RECURRING}
+    if lost:
+        notes.append(
+            f"The layout of {len(lost)} kind{'s' * (len(lost) > 1)} of records "
+            f"({sum(lost.values())} records) is lost with their FMT record; they were left out."
+        )
     if unreadable:
         notes.append(f"Records of unknown layout were left out: {', '.join(sorted(unreadable))}.")
     return BinLog(tables, tuple(notes))
@@ -99,17 +118,20 @@ def read_bin(data: bytes, wanted: Collection[str], progress: Progress = no_progr
 
 def _scan(
     data: bytes, wanted: Collection[str], progress: Progress
-) -> tuple[dict[int, _Format], dict[int, list[int]], int]:
+) -> tuple[dict[int, _Format], dict[int, list[int]], int, Counter[int]]:
     formats = {_FMT_TYPE: _Format("FMT", _FMT_LENGTH, "BBnNZ", ())}
     lengths = [0] * 256
     lengths[_FMT_TYPE] = _FMT_LENGTH
     keep: list[list[int] | None] = [None] * 256
     i, end, skipped = 0, len(data), 0
+    unknown: Counter[int] = Counter()
     report = step = max(end // 50, 1)
     while i + 3 <= end:
         number = data[i + 2]
         length = lengths[number]
         if data[i] != 0xA3 or data[i + 1] != 0x95 or length == 0:
+            if length == 0 and data[i : i + 2] == _HEAD:
+                unknown[number] += 1
             found = data.find(_HEAD, i + 1)
             i, skipped = (found, skipped + found - i) if found >= 0 else (end, skipped + end - i)
             continue
@@ -130,7 +152,7 @@ def _scan(
         if i > report:
             report += step
             progress(0.3 + 0.5 * i / end)
-    return formats, {n: k for n, k in enumerate(keep) if k}, skipped
+    return formats, {n: k for n, k in enumerate(keep) if k}, skipped, unknown
 
 
 def _format(record: bytes) -> _Format | None:

@@ -82,21 +82,27 @@ def build_diagram(  # long: half of it says what it takes and refuses
         if name in INPUTS or (plant.HasOutputPort(name) and control.HasInputPort(name)):
             builder.Connect(plant.GetOutputPort(name), control.GetInputPort(name))
     builder.Connect(control.GetOutputPort("F_Bo_B"), plant.GetInputPort("F_Bo_B"))
-    truth = _truth(plant, control)
     periods = log_periods
     if periods is None:
         periods = {**default_log_periods(station), **CONTROLLER_PERIODS}
+    _add_logs(builder, plant, control, periods)
+    if extend is not None:
+        extend(builder, plant, control)
+    diagram = builder.Build()
+    diagram.set_name("closed_loop")
+    return diagram
+
+
+def _add_logs(
+    builder: DiagramBuilder, plant: System, control: System, periods: Mapping[str, float]
+) -> None:
+    truth = _truth(plant, control)
     for system in (plant, control):
         for i in range(system.num_output_ports()):
             port = system.get_output_port(i)
             name = port.get_name()
             if name in periods:
                 add_log(builder, port, name, periods[name], (system, i) in truth)
-    if extend is not None:
-        extend(builder, plant, control)
-    diagram = builder.Build()
-    diagram.set_name("closed_loop")
-    return diagram
 
 
 def seeded(diagram: Diagram, context: Context, seed: int) -> None:

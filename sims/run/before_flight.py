@@ -4,18 +4,24 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
+
+import numpy as np
 
 from ...models.config.errors import UserError
-from ...models.sensors import Dvl
+from ...models.sensors import DepthSensor, Dvl
 from ...systems.mavlink import telemetry
 from ...systems.mavlink.config import Mavlink
 from ...systems.mavlink.driver import Driver
-from ...systems.mavlink.interface import unread
+from ...systems.mavlink.interface import RESOLUTION, unread
+from ...systems.mavlink.link import Received
 from ...systems.mavlink.preflight import Finding
 from ..scenarios.scenario import Scenario
 from .way import check_free, find_passage, no_safe_plan
 
 _RATES = (200.0, 100.0, 50.0, 40.0, 20.0)  # Hz that the filter may have; their ticks fit the loop's
+_FEW = 5  # values
+_NEVER = 1e6
 _PATIENCE = 30.0  # s for what passes by itself after the vehicle's start
 _PASSING = {"attitude", "inertial sensors", "link", *telemetry.IMUS, "depth", "compass", "dvl"}
 
@@ -87,12 +93,12 @@ def _aged(age: float) -> str:
     return "no reading came" if math.isinf(age) else f"last reading {age:.1f} s ago"
 
 
-def as_granted(scenario: Scenario, driver: Driver) -> Scenario:
-    """The scenario with the rate of inertial samples that the vehicle granted, and its start.
+def as_granted(scenario: Scenario, driver: Driver, say: Tell = lambda text: None) -> Scenario:
+    """The scenario with the rate of inertial samples that the vehicle granted, and its noises.
 
     The filter's rate is the highest it may have up to that, at least 20 Hz; the samples are
-    instantaneous. The start has the vehicle's roll, pitch and depth, and in W the scenario's place
-    and yaw.
+    instantaneous. Noises that are larger at rest than configured are those of the filter. Without
+    a sensor of horizontal motion the fence, which needs a position, is off.
     """
     rates = driver.link.statistics().rates
     granted = max((rates.get(name, 0.0) for name in telemetry.IMUS), default=0.0)
@@ -100,9 +106,68 @@ def as_granted(scenario: Scenario, driver: Driver) -> Scenario:
     outputs = sensing.ekf.output_rate
     fit = [r for r in _RATES if abs(r / outputs - round(r / outputs)) < 1e-9]
     rate = next((r for r in fit if r <= 1.1 * granted), fit[-1] if fit else sensing.imu.rate)
-    imu = replace(sensing.imu, rate=rate, integrating=False)
+    # resolution of the samples, and as much dither
+    rounding = (RESOLUTION / math.sqrt(6) * math.sqrt(2 / rate)).tolist()
+    imu = replace(
+        sensing.imu,
+        rate=rate,
+        integrating=False,
+        accelerometer_density=math.hypot(sensing.imu.accelerometer_density, rounding[0]),
+        gyroscope_density=math.hypot(sensing.imu.gyroscope_density, rounding[3]),
+    )
+    depth, noise = sensing.depth, resting_noise(driver, scenario)
+    if depth is not None and noise.get("depth", 0.0) > 1.5 * depth.noise:
+        say(f"depth scatters by {noise['depth']:.3f} m at rest; the filter is told")
+        depth = replace(depth, noise=noise["depth"])
+    imu = replace(
+        imu,
+        accelerometer_density=max(imu.accelerometer_density, noise.get("force", 0.0)),
+        gyroscope_density=max(imu.gyroscope_density, noise.get("rate", 0.0)),
+    )
     late = [each.latencies[1] for each in sensing.sensors.values() if each.late]
     horizon = max([sensing.ekf.horizon, *(t + 2.5 / rate for t in late)])
-    ekf = replace(sensing.ekf, horizon=horizon)
-    station = replace(scenario.station, sensing=replace(sensing, imu=imu, ekf=ekf))
-    return replace(scenario, station=station)
+    ekf, link = replace(sensing.ekf, horizon=horizon), scenario.vehicle_link
+    if not horizontal(scenario) and link is not None and link.estimate == "own":
+        say("no sensor of horizontal motion: position is lost within seconds, the fence is off")
+        safety = replace(link.safety, fence=(_NEVER, _NEVER))
+        scenario = replace(scenario, vehicle_link=replace(link, safety=safety))
+    sensing = replace(sensing, imu=imu, ekf=ekf, depth=depth)
+    return replace(scenario, station=replace(scenario.station, sensing=sensing))
+
+
+def horizontal(scenario: Scenario) -> bool:
+    """Whether a sensor of the station observes horizontal motion."""
+    sensors = scenario.station.sensing.sensors.values()
+    seen = ("velocity", "position")
+    return any(s.observes in seen and not isinstance(s, DepthSensor) for s in sensors)
+
+
+def resting_noise(driver: Driver, scenario: Scenario, seconds: float = 2.0) -> dict[str, float]:
+    """Noise of a vehicle at rest: std of `depth` (m), densities of `force` and `rate`.
+
+    From differences of successive values, which slow motion hardly changes.
+    """
+    sensor, times = scenario.station.sensing.depth, []
+    values: dict[str, list] = {"depth": [], "imu": []}
+
+    def read(found: Received) -> None:
+        name = found.message.get_type()
+        if name == telemetry.IMUS[0]:
+            times.append(found.arrival)
+            values["imu"].append(telemetry.inertial(driver.link, found).value)
+        elif name.startswith("SCALED_PRESSURE") and sensor is not None:
+            depth = telemetry.depth(driver.link, driver.parameters, sensor.assumed_density)
+            if depth is not None and [float(depth.value[0])] != values["depth"][-1:]:
+                values["depth"].append(float(depth.value[0]))
+
+    with driver.link.reading(read):
+        time.sleep(seconds)
+    found: dict[str, float] = {}
+    if len(values["depth"]) > _FEW:
+        found["depth"] = float(np.std(np.diff(values["depth"])) / math.sqrt(2))
+    if len(times) > _FEW:
+        steps: Any = np.diff(np.array(values["imu"], float), axis=0)
+        std = steps.std(axis=0) / math.sqrt(2)
+        scale = math.sqrt(2 * (times[-1] - times[0]) / (len(times) - 1))
+        found |= {"force": float(std[:3].max() * scale), "rate": float(std[3:].max() * scale)}
+    return found

@@ -65,7 +65,8 @@ def fly(
     say(f"connecting to {link.connection}")
     with Driver(link, thrusters, dry_run=dry_run, record=record) as driver:
         checks = preflight(driver, scenario, say)
-        scenario = as_granted(scenario, driver)
+        scenario = as_granted(scenario, driver, say)
+        driver.use(scenario.vehicle_link or link)
         cockpit = Cockpit(driver, scenario, dry_run)
         progress(0.0, "compiling")
         cockpit.warm_up()

@@ -28,6 +28,12 @@ from .telemetry import Reading
 _AFTER = 5e-4  # s: commands go out after the updates of the same time
 _FRESH = 0.5  # s: older attitude or position of the autopilot is no estimate
 _GOOD, _LOST = 0.0, 2.0
+_FROZEN = 1.0  # s without a change of the inertial samples while thrusters run
+_REST = 0.3  # s after which a pressure that stays the same is a measurement, at rest
+_TINY = 1e-4  # m: resolution of pressure
+_PUSHING = 25.0  # µs from neutral
+RESOLUTION = np.array([9.80665e-3] * 3 + [1e-3] * 3)
+"""Of inertial samples on the link: 1 mg, 1 mrad/s."""
 
 
 class Anchor(NamedTuple):
@@ -69,7 +75,9 @@ class VehicleInterface(LeafSystem):
 
     Each sensor has an output port of its name with the layout of a simulated station's
     (`systems.plant.sensor_suite`); `pwm` are the outputs that the vehicle is told to give (µs).
-    The IMU's reading is the mean over the last period, NaN where nothing came; other readings are
+    The IMU's reading is the mean over the last period, NaN where nothing came or while it does not
+    change under thrust. Samples are dithered by their resolution: a vehicle at rest repeats them,
+    which is no fault (non-subtractive dither; Lipshitz et al. 1992). Other readings are
     taken at the sensors' configured rates at most, with their times of validity. A sensor that no
     message measures is never valid. `X_WB` and `health`, the estimate's, are for the guards.
 
@@ -138,6 +146,9 @@ class VehicleInterface(LeafSystem):
         self._held = ExitStack()
         self._epoch, self._anchor = 0.0, Anchor()
         self._samples = InertialSamples()
+        self._dither = np.random.default_rng(0)
+        self._raw, self._changed, self._pushed = np.full(6, np.nan), 0.0, math.inf
+        self._depth_seen = math.nan, 0.0
         self._taken: dict[str, float] = {}
         self.ages: dict[str, Callable[[], float]] = {}
         """Further ages for the guards (s): of the `plan`, of the `dead_man` key."""
@@ -173,6 +184,8 @@ class VehicleInterface(LeafSystem):
             if isinstance(sensor, Imu):
                 now = t + self._epoch
                 found = self._samples.mean(now - self.period, now)
+                if self._frozen():
+                    found = np.full(6, np.nan)
             else:
                 found = self._reading(name, sensor)
             if found is not None:
@@ -192,6 +205,8 @@ class VehicleInterface(LeafSystem):
         aids = [n for n in aids if not isinstance(self._sensors[n], DepthSensor)]
         if aids:
             ages["aid"] = min(self.age(name) for name in aids)
+        else:
+            health = None  # without them the position is soon lost; controllers are told
         acted = driver.act(
             t,
             value(self._F, context),
@@ -199,6 +214,10 @@ class VehicleInterface(LeafSystem):
             0 if health is None else int(health[0]),
             ages,
         )
+        if np.abs(acted.expected - NEUTRAL_US).max() < _PUSHING:
+            self._pushed = math.inf
+        elif math.isinf(self._pushed):
+            self._pushed = time.monotonic()
         set_groups(state, [self._pwm], [acted.expected])
         self.on_act(t, acted)
 
@@ -212,7 +231,15 @@ class VehicleInterface(LeafSystem):
         preferred = next(n for n in telemetry.IMUS if driver.link.latest(n) is not None)
         if found.message.get_type() == preferred:
             sample = telemetry.inertial(driver.link, found)
-            self._samples.add(sample.taken, sample.value)
+            if not np.array_equal(sample.value, self._raw):
+                self._raw, self._changed = sample.value, sample.arrival
+            noise = RESOLUTION * self._dither.uniform(-0.5, 0.5, 6)
+            self._samples.add(sample.taken, sample.value + noise)
+
+    def _frozen(self) -> bool:
+        """Whether thrusters run and the inertial samples do not change."""
+        now = time.monotonic()
+        return min(now - self._changed, now - self._pushed) > _FROZEN
 
     def _reading(self, name: str, sensor: Sensor) -> np.ndarray | None:
         """The port's new value, None while there is no new reading."""
@@ -223,6 +250,14 @@ class VehicleInterface(LeafSystem):
         found = read(self._driver, sensor, self._anchor, self._mounts[name])
         if found is None:
             return None
+        if isinstance(sensor, DepthSensor):
+            # messages repeat a measurement until the next one; a vehicle at rest repeats it as well
+            first, seen = self._depth_seen
+            if found.value[0] == first and found.arrival - seen < _REST:
+                return None
+            self._depth_seen = float(found.value[0]), found.arrival
+            tiny = _TINY * self._dither.uniform(-1, 1)
+            found = found._replace(value=found.value + np.array([tiny, 0.0]))
         taken = found.taken - self._epoch
         before = self._taken.get(name, -math.inf)
         # times of one stream jitter: half a period early is the next reading
@@ -258,7 +293,9 @@ def _depth(driver: Driver, sensor: Sensor, anchor: Anchor, R_BS: np.ndarray) -> 
     del anchor, R_BS
     assert isinstance(sensor, DepthSensor)
     found = telemetry.depth(driver.link, driver.parameters, sensor.assumed_density)
-    return found and found._replace(value=np.array([*found.value, 1.0]))
+    if found is None:
+        return None
+    return found._replace(value=np.array([*found.value, 1.0]))
 
 
 def _compass(driver: Driver, sensor: Sensor, anchor: Anchor, R_BS: np.ndarray) -> Reading | None:

@@ -34,7 +34,7 @@ class Signal(NamedTuple):
     value: Float[np.ndarray, "n size"]
 
 
-def build_diagram(  # long: half of it says what it takes and refuses
+def build_diagram(
     station: StationConfig,
     controller: Controller,
     *,

@@ -129,6 +129,20 @@ def test_a_dead_thruster_is_named_and_a_weak_one_is_not():
     assert words(swum(np.where(fourth, 0.5, 1.0))) == []
 
 
+def test_a_controller_that_opposes_a_disturbance_is_no_reversed_axis():
+    """The command is -k v a moment ago, the motion that of a drifting body: drag of wrong sign."""
+    rng = np.random.default_rng(2)
+    N, dt, mass = 2400, 0.05, HEAVY.mass + HEAVY.added_mass[0]
+    V, F, push = np.zeros((N, 6)), np.zeros((N, 6)), 0.0
+    for n in range(1, N):
+        push = 0.95 * push + rng.normal(0, 12.0)
+        F[n] = -40.0 * V[n - 2]
+        V[n, 0] = V[n - 1, 0] + dt / mass * (F[n - 1, 0] + push - 20.0 * V[n - 1, 0])
+    X = np.tile([1.0, 0, 0, 0, 0, 0, -2], (N, 1))
+    run = Recording.from_trajectories([Trajectory("held", X, V, {"F_Bo_B": F})], dt)
+    assert "axis-reversed" not in words(run) + words(run, None)
+
+
 def test_shifted_commands_are_named_with_the_shift(dive):
     late = changed(dive, "pwm", lambda p: np.concatenate([p[:, :, :1]] * 8 + [p[:, :, :-8]], 2))
     (finding,) = command_findings(late, HEAVY)

@@ -7,11 +7,10 @@ recorded order leaves unaccounted for, on evidence that chance does not give.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
 from ...se3 import AXES, WRENCH
@@ -19,6 +18,7 @@ from ...vehicles.vehicle import Vehicle
 from ..commands import voltage_of
 from ..store import Recording
 from .finding import Finding
+from .hypotheses import ALL, CAUSAL, PLAUSIBLE, Driven
 from .response import LAGS_S, AxisResponse, responses
 
 _EVIDENCE = 12.0
@@ -26,8 +26,6 @@ _EVIDENCE = 12.0
 hundred hypotheses together 1e-3."""
 _MOST = 0.5
 """Share that a named hypothesis accounts for, and most of the rest that it leaves."""
-_EARLIEST, _LATEST = -0.15, 0.45
-"""s of lag that thrusters and clocks have."""
 _HARDLY, _SURE = 10.0, 0.9
 """Commanded force over the force that the motion shows, above which no vehicle's numbers explain
 it; the largest share of a force that a command is expected to make up."""
@@ -42,44 +40,6 @@ _ORDERS = {
     "torque first (K,M,N,X,Y,Z), as Drake's spatial forces": (3, 4, 5, 0, 1, 2),
 }
 _RIGHT_DOWN = np.array([1, -1, -1, 1, -1, -1])
-
-
-@dataclass(frozen=True)
-class _Data:
-    """Responses by axis, the vehicle's weights (6, m) and the names of the columns."""
-
-    axes: dict[int, AxisResponse]
-    weights: Float[np.ndarray, "6 m"]
-    columns: tuple[str, ...]
-    needed: dict[int, float]
-    """Root mean square of the force (N, N·m) that the motion shows with the vehicle's numbers."""
-    given: dict[int, float]
-    """Root mean square of the commanded force."""
-
-    def shares(self, weights: np.ndarray, lag: int) -> dict[int, np.ndarray]:
-        """Shares by axis for hypotheses of weights (6, m, *H)."""
-        return {i: r.fit(weights[i], lag)[0] for i, r in self.axes.items()}
-
-    def evidence(self, shares: dict[int, np.ndarray]) -> np.ndarray:
-        """Nats of hypotheses against no relation at all."""
-        return sum(
-            (-0.5 * self.axes[i].count * np.log1p(-s) for i, s in shares.items()), np.zeros(())
-        )
-
-    def best(self, weights: np.ndarray, lags: Sequence[int]) -> tuple[np.ndarray, dict, np.ndarray]:
-        """Evidence, shares and lag (an index) of each hypothesis at its most likely lag."""
-        tried = [self.shares(weights, lag) for lag in lags]
-        nats = np.stack([self.evidence(shares) for shares in tried])
-        at = nats.argmax(axis=0)
-        picked = {
-            i: np.take_along_axis(np.stack([s[i] for s in tried]), at[None], 0)[0]
-            for i in self.axes
-        }
-        return nats.max(axis=0), picked, np.asarray(lags)[at]
-
-
-_PLAUSIBLE = np.flatnonzero((LAGS_S > _EARLIEST) & (LAGS_S < _LATEST)).tolist()
-_ALL = list(range(LAGS_S.size))
 
 
 def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Finding]:
@@ -139,16 +99,15 @@ def _data(
     weights: np.ndarray,
     names: tuple[str, ...],
     vehicle: Vehicle | None,
-) -> _Data:
+) -> Driven:
     zero = int(np.argmin(np.abs(LAGS_S)))
-    given, needed = {}, {}
+    given, needed, masses = {}, {}, {}
     for i, r in axes.items():
-        windows = r.RR[0, 0] / max(r.motion, 1e-12) ** 2
-        given[i] = float(np.sqrt(max(weights[i] @ r.CC[zero] @ weights[i], 0.0) / windows))
+        given[i] = float(np.sqrt(max(weights[i] @ r.CC[zero] @ weights[i], 0.0) / r.windows))
         if given[i] < 1e-6:  # what rounding leaves of an axis that thrusters can't actuate
             given[i] = 0.0
         if vehicle is None:
-            needed[i] = np.inf
+            needed[i], masses[i] = np.inf, 0.0
             continue
         rigid = (vehicle.mass,) * 3 + vehicle.inertia
         c = np.array([
@@ -156,22 +115,23 @@ def _data(
             vehicle.linear_damping[i],
             vehicle.quadratic_damping[i],
         ])  # fmt: skip
-        needed[i] = float(np.sqrt(max(c @ r.RR @ c, 0.0) / windows))
-    return _Data(axes, weights, names, needed, given)
+        masses[i] = float(c[0])
+        needed[i] = float(np.sqrt(max(c @ r.RR @ c, 0.0) / r.windows))
+    return Driven(axes, weights, names, needed, given, masses)
 
 
-def _nats(data: _Data, axis: int) -> float:
+def _nats(data: Driven, axis: int) -> float:
     """Evidence for any relation of an axis' motion to its command, of either sign and any lag."""
     r = data.axes[axis]
-    shares = [r.fit(s * data.weights[axis], lag)[0] for lag in _ALL for s in (1, -1)]
+    shares = [r.fit(s * data.weights[axis], lag)[0] for lag in ALL for s in (1, -1)]
     return float(-0.5 * r.count * np.log1p(-np.max(shares)))
 
 
-def _answered(data: _Data, axis: int) -> bool:
+def _answered(data: Driven, axis: int) -> bool:
     return _nats(data, axis) > _EVIDENCE and data.given[axis] < _HARDLY * data.needed[axis]
 
 
-def _unanswered(data: _Data, axis: int) -> bool:
+def _unanswered(data: Driven, axis: int) -> bool:
     """Whether the motion of an axis follows its command not at all, or hardly.
 
     Of a command that makes up a share ρ² of the force shown, n windows give -n/2 log(1 - ρ²) nats.
@@ -181,18 +141,20 @@ def _unanswered(data: _Data, axis: int) -> bool:
     return times > _HARDLY or bool(expected > 3 * _EVIDENCE and _nats(data, axis) < _EVIDENCE)
 
 
-def _orders(data: _Data, wrench: bool) -> tuple[float, list[Finding]]:
+def _orders(data: Driven, wrench: bool) -> tuple[float, list[Finding]]:
     """Columns of a wrench in another order, and axes whose command has the other sign.
 
     Returns the evidence for it, less `_EVIDENCE` for each change, and the findings.
     """
     pairs = np.moveaxis(np.stack([data.weights, -data.weights], axis=-1), 1, 0)  # m, column, sign
     own = sorted(data.axes)
-    usual, kept, _ = data.best(data.weights[..., None], _PLAUSIBLE)
+    usual, kept, _ = data.best(data.weights[..., None], PLAUSIBLE)
     count = np.array([[data.axes[i].count] for i in own])
     best, moves = -np.inf, []
-    for lag in _PLAUSIBLE:
-        table = np.stack([data.axes[i].fit(pairs, lag)[0] for i in own])
+    every = np.broadcast_to(pairs, (6, *pairs.shape))
+    for lag in CAUSAL:
+        shares = data.shares(every, lag, strict=True)
+        table = np.stack([shares[i] for i in own])
         both = table.max(axis=-1)  # (axis, column)
         nats = -0.5 * count * np.log1p(-both)
         if not wrench:
@@ -201,8 +163,8 @@ def _orders(data: _Data, wrench: bool) -> tuple[float, list[Finding]]:
         if (total := float(nats[rows, columns].sum())) > best:
             signs = 1 - 2 * table[rows, columns].argmax(axis=-1)
             rows = [own[row] for row in rows]
-            shares = both[np.arange(len(rows)), columns] if wrench else both[:, own].diagonal()
-            best, moves = total, list(zip(rows, columns.tolist(), signs, shares, strict=True))
+            kept_ = both[np.arange(len(rows)), columns] if wrench else both[:, own].diagonal()
+            best, moves = total, list(zip(rows, columns.tolist(), signs, kept_, strict=True))
     moved = [
         (i, j, int(sign))
         for i, j, sign, share in moves
@@ -222,15 +184,15 @@ def _named(usual: float, share: float, count: float) -> bool:
     return share >= _MOST and rest < _MOST and bool(-0.5 * count * np.log(rest) > _EVIDENCE)
 
 
-def _thrusters(data: _Data) -> tuple[float, list[Finding]]:
+def _thrusters(data: Driven) -> tuple[float, list[Finding]]:
     """Thrusters that push the other way, are exchanged or dead; as `_orders` returns them."""
     m = len(data.columns)
     flips = [("reversed", k, k) for k in range(m)]
     swaps = [("exchanged", a, b) for a, b in combinations(range(m), 2)]
-    usual, first, _ = data.best(data.weights[..., None], _PLAUSIBLE)
+    usual, first, _ = data.best(data.weights[..., None], PLAUSIBLE)
     chains = [_chain(data, options) for options in (flips, swaps, flips + swaps)]
     worth, weights, changes = max(chains, key=lambda chain: chain[0])
-    _, last, lags = data.best(weights[..., None], _PLAUSIBLE)
+    _, last, lags = data.best(weights[..., None], PLAUSIBLE)
     if not any(
         _named(float(first[i][0]), float(last[i][0]), r.count) for i, r in data.axes.items()
     ):
@@ -248,13 +210,13 @@ def _thrusters(data: _Data) -> tuple[float, list[Finding]]:
 _Change = tuple[str, int, int]
 
 
-def _chain(data: _Data, options: Sequence[_Change]) -> tuple[float, np.ndarray, list[_Change]]:
+def _chain(data: Driven, options: Sequence[_Change]) -> tuple[float, np.ndarray, list[_Change]]:
     """The best change, then the next best, …: evidence less `_EVIDENCE` each, weights, changes."""
-    nats, _, _ = data.best(data.weights[..., None], _PLAUSIBLE)
+    nats, _, _ = data.best(data.weights[..., None], PLAUSIBLE)
     now, weights, changes = float(nats[0]), data.weights, []
     while len(changes) < len(data.columns):
         tried = np.stack([_changed(weights, *option) for option in options], axis=-1)
-        nats, _, _ = data.best(tried, _PLAUSIBLE)
+        nats, _, _ = data.best(tried, CAUSAL, strict=True)
         at = int(nats.argmax())
         if nats[at] - _EVIDENCE < now:
             break
@@ -273,7 +235,7 @@ def _changed(weights: np.ndarray, kind: str, a: int, b: int) -> np.ndarray:
 
 
 def _is_dead(
-    data: _Data, weights: np.ndarray, k: int, usual: dict[int, np.ndarray], lag: int
+    data: Driven, weights: np.ndarray, k: int, usual: dict[int, np.ndarray], lag: int
 ) -> bool:
     """Whether the most likely factor on thruster k is 0, and clearly better than 1."""
     tried = np.repeat(weights[..., None], _FACTORS.size, axis=-1)
@@ -285,10 +247,10 @@ def _is_dead(
     )
 
 
-def _lag(data: _Data) -> list[Finding]:
+def _lag(data: Driven) -> list[Finding]:
     weights = data.weights[..., None]
-    nats, shares, lag = data.best(weights, _ALL)
-    usual, _, _ = data.best(weights, _PLAUSIBLE)
+    nats, shares, lag = data.best(weights, ALL)
+    usual, _, _ = data.best(weights, PLAUSIBLE)
     strong = [i for i in data.axes if shares[i][0] >= _MOST]
     if nats[0] - usual[0] < _EVIDENCE or not strong:
         return []
@@ -319,7 +281,7 @@ def _no_commands(recording: Recording) -> Finding:
     )
 
 
-def _no_answer(data: _Data, silent: Sequence[int]) -> Finding:
+def _no_answer(data: Driven, silent: Sequence[int]) -> Finding:
     axes = ", ".join(AXES[i] for i in silent)
     times = min(data.given[i] / max(data.needed[i], 1e-12) for i in silent)
     return Finding(
@@ -331,7 +293,7 @@ def _no_answer(data: _Data, silent: Sequence[int]) -> Finding:
     )
 
 
-def _silent(data: _Data, axis: int) -> Finding:
+def _silent(data: Driven, axis: int) -> Finding:
     times = data.given[axis] / max(data.needed[axis], 1e-12)
     return Finding(
         "axis-silent",
@@ -354,7 +316,7 @@ def _exchanged(moved: Sequence[tuple[int, int, int]]) -> Finding:
     )
 
 
-def _reversed_axes(data: _Data, moved: Sequence[tuple[int, int, int]], wrench: bool) -> Finding:
+def _reversed_axes(data: Driven, moved: Sequence[tuple[int, int, int]], wrench: bool) -> Finding:
     axes = [i for i, _, _ in moved]
     right_down = [i for i in data.axes if _RIGHT_DOWN[i] < 0]
     frd = wrench and set(axes) == set(right_down)
@@ -370,7 +332,7 @@ def _reversed_axes(data: _Data, moved: Sequence[tuple[int, int, int]], wrench: b
     )
 
 
-def _reversed_thruster(data: _Data, k: int) -> Finding:
+def _reversed_thruster(data: Driven, k: int) -> Finding:
     return Finding(
         "thruster-reversed",
         f"column {data.columns[k]}",
@@ -379,7 +341,7 @@ def _reversed_thruster(data: _Data, k: int) -> Finding:
     )
 
 
-def _swapped(data: _Data, a: int, b: int) -> Finding:
+def _swapped(data: Driven, a: int, b: int) -> Finding:
     return Finding(
         "thruster-exchanged",
         f"columns {data.columns[a]}, {data.columns[b]}",
@@ -388,7 +350,7 @@ def _swapped(data: _Data, a: int, b: int) -> Finding:
     )
 
 
-def _dead(data: _Data, k: int) -> Finding:
+def _dead(data: Driven, k: int) -> Finding:
     return Finding(
         "thruster-dead",
         f"column {data.columns[k]}",

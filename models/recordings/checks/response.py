@@ -45,14 +45,14 @@ class AxisResponse:
         RC: (lags, 3, m).
         CC: (lags, m, m).
         count: independent windows: those of the record over their correlation along time.
-        motion: root mean square of v̇ (m/s² or rad/s²).
+        windows: all windows.
     """
 
     RR: Float[np.ndarray, "3 3"]
     RC: Float[np.ndarray, "L 3 m"]
     CC: Float[np.ndarray, "L m m"]
     count: float
-    motion: float
+    windows: int
 
     def fit(
         self, weights: Float[np.ndarray, "m *H"], lag: int
@@ -170,7 +170,7 @@ def _axis(axis: int, pieces: Sequence[_Piece], step: float) -> AxisResponse:
         np.einsum("na,lnm->lam", R, C),
         np.einsum("lna,lnb->lab", C, C),
         count,
-        float(np.sqrt(np.mean(R[:, 0] ** 2))),
+        len(R),
     )
 
 

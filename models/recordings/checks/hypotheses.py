@@ -1,0 +1,65 @@
+"""Hypotheses on the commands, and how much of each the motion accounts for."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from .response import LAGS_S, AxisResponse
+
+_EARLIEST, _LATEST = -0.15, 0.45
+"""s of lag that thrusters and clocks have."""
+_LEAST_MASS = 0.1
+"""Share of the vehicle's mass that a named hypothesis must show."""
+PLAUSIBLE = np.flatnonzero((LAGS_S > _EARLIEST) & (LAGS_S < _LATEST)).tolist()
+CAUSAL = [lag for lag in PLAUSIBLE if LAGS_S[lag] > -0.05]
+"""Lags of hypotheses: before its command a motion only is where the command answers the motion."""
+ALL = list(range(LAGS_S.size))
+
+
+@dataclass(frozen=True)
+class Driven:
+    """Responses by axis, the vehicle's weights (6, m) and the names of the columns."""
+
+    axes: dict[int, AxisResponse]
+    weights: Float[np.ndarray, "6 m"]
+    columns: tuple[str, ...]
+    needed: dict[int, float]
+    """Root mean square of the force (N, N·m) that the motion shows with the vehicle's numbers."""
+    given: dict[int, float]
+    """Root mean square of the commanded force."""
+
+    mass: dict[int, float]
+    """The vehicle's mass or moment of inertia by axis; 0 if it is not known."""
+
+    def shares(self, weights: np.ndarray, lag: int, strict: bool = False) -> dict[int, np.ndarray]:
+        """Shares by axis for hypotheses of weights (6, m, *H).
+
+        `strict` takes a share for nothing if its mass is: a controller that opposes the motion
+        looks like drag with the other sign, but not like a mass.
+        """
+        found = {}
+        for i, r in self.axes.items():
+            share, mass = r.fit(weights[i], lag)
+            found[i] = np.where(mass > _LEAST_MASS * self.mass[i], share, 0.0) if strict else share
+        return found
+
+    def evidence(self, shares: dict[int, np.ndarray]) -> np.ndarray:
+        """Nats of hypotheses against no relation at all."""
+        return sum(
+            (-0.5 * self.axes[i].count * np.log1p(-s) for i, s in shares.items()), np.zeros(())
+        )
+
+    def best(
+        self, weights: np.ndarray, lags: Sequence[int], strict: bool = False
+    ) -> tuple[np.ndarray, dict, np.ndarray]:
+        """Evidence, shares and lag (an index) of each hypothesis at its most likely lag."""
+        tried = [self.shares(weights, lag, strict) for lag in lags]
+        nats = np.stack([self.evidence(shares) for shares in tried])
+        at = nats.argmax(axis=0)
+        picked = {
+            i: np.take_along_axis(np.stack([s[i] for s in tried]), at[None], 0)[0]
+            for i in self.axes
+        }
+        return nats.max(axis=0), picked, np.asarray(lags)[at]

@@ -113,6 +113,22 @@ def test_readings_are_those_of_the_vehicle(served: Served):
         assert 12 < sensed.voltage < 17
 
 
+def test_a_vehicle_that_booted_anew_is_read_again_before_a_flight(served: Served):
+    vehicle = served.simulation.vehicle
+    with connect(served.ports[0]) as driver:
+        assert vehicle.parameters.set("JS_GAIN_DEFAULT", 0.75)
+        assert until(lambda: vehicle.autopilot.t > 8.0, 60.0)  # a clock that runs back shows it
+        vehicle.reboot()
+        assert until(lambda: driver.link.statistics().reboots == 1, 30.0)
+        found = {finding.name: finding for finding in driver.preflight()}
+        assert driver.parameters["JS_GAIN_DEFAULT"] == 0.75
+        assert found  # its streams came back unasked: nothing here waits for ever
+        assert until(
+            lambda: driver.link.statistics().rates.get("ATTITUDE_QUATERNION", 0) > 15, 30.0
+        )
+    assert vehicle.parameters.set("JS_GAIN_DEFAULT", 0.5)
+
+
 def test_a_dry_run_commands_nothing(port: int):
     with connect(port, actuation="rc_override") as driver:
         driver._dry = True

@@ -104,8 +104,7 @@ class Driver:
         try:
             self.vehicle = self.link.find_vehicle()
             self._parameters = Parameters(self.link)
-            self.parameters: Mapping[str, float] = self._parameters.read_all()
-            self._actuation = make_actuation(config.actuation, thrusters, self.parameters)
+            self._read_vehicle()
             wanted = _STREAMS | {"RAW_IMU": config.imu_rate}
             self.refused = commands.request_rates(self.link, wanted)
             self.dvl = None if config.dvl is None else config.dvl.open()
@@ -163,6 +162,8 @@ class Driver:
 
     def preflight(self) -> list[Finding]:
         """The checks before arming; waits until rates can be counted."""
+        if self.link.clock.reboots != self._boots:
+            self._read_vehicle()
         self.restore()
         end = time.monotonic() + _SETTLE
         while time.monotonic() < end:
@@ -187,6 +188,11 @@ class Driver:
             not self._borrowed.left_over,
         )
         return preflight(self.requirements(), facts)
+
+    def _read_vehicle(self) -> None:
+        self._boots = self.link.clock.reboots
+        self.parameters: Mapping[str, float] = self._parameters.read_all()
+        self._actuation = make_actuation(self.config.actuation, self._thrusters, self.parameters)
 
     def restore(self) -> dict[str, float]:
         """Give back parameters that a former run left changed; what was restored.

@@ -105,8 +105,8 @@ class Driver:
             self.vehicle = self.link.find_vehicle()
             self._parameters = Parameters(self.link)
             self._read_vehicle()
-            wanted = _STREAMS | {"RAW_IMU": config.imu_rate}
-            self.refused = commands.request_rates(self.link, wanted)
+            rates = _STREAMS | {"RAW_IMU": config.imu_rate}
+            self.refused = commands.request_rates(self.link, rates)
             self.dvl = None if config.dvl is None else config.dvl.open()
         except BaseException:
             self.link.close()
@@ -165,9 +165,7 @@ class Driver:
         if self.link.clock.reboots != self._boots:
             self._read_vehicle()
         self.restore()
-        end = time.monotonic() + _SETTLE
-        while time.monotonic() < end:
-            time.sleep(0.05)
+        time.sleep(_SETTLE)
         heartbeat = self.link.latest("HEARTBEAT")
         status = telemetry.status(self.link, time.monotonic())
         assert heartbeat is not None
@@ -190,8 +188,7 @@ class Driver:
         return preflight(self.requirements(), facts)
 
     def _read_vehicle(self) -> None:
-        self._boots = self.link.clock.reboots
-        self.parameters: Mapping[str, float] = self._parameters.read_all()
+        self._boots, self.parameters = self.link.clock.reboots, self._parameters.read_all()
         self._actuation = make_actuation(self.config.actuation, self._thrusters, self.parameters)
 
     def restore(self) -> dict[str, float]:

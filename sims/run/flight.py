@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context, Diagram
 
 from ...models.config.errors import UserError
 from ...models.files.interrupts import end_noted
+from ...models.sensors import Dvl
 from ...systems.closed_loop import build_diagram, logged, seeded
 from ...systems.compiled.network import compile_functions
 from ...systems.drake import value
@@ -261,6 +262,7 @@ class Cockpit:
         simulator = Simulator(self.diagram)
         context = simulator.get_mutable_context()
         self._seed(context)
+        self._await_readings()
         X_WB = start_pose(self.driver, self.anchor, self.scenario.station)
         if self.station.HasSubsystemNamed("ekf"):
             ekf: Any = self.station.GetSubsystemByName("ekf")
@@ -273,16 +275,31 @@ class Cockpit:
         self.journal.epoch = epoch
         return Clockwork(simulator, self.tick, epoch)
 
+    def _await_readings(self) -> None:
+        """Wait until the readings are new: those of before are old after a compilation."""
+        since, driver = time.monotonic(), self.driver
+        wants_dvl = isinstance(self.scenario.station.sensing.dvl, Dvl)
+        while time.monotonic() < since + _START:
+            attitude = telemetry.attitude(driver.link)
+            fresh = attitude is not None and attitude.arrival > since
+            if fresh and (not wants_dvl or driver.dvl_state()[0] < time.monotonic() - since):
+                return
+            time.sleep(0.01)
+
     def _ages(self, context: Context) -> dict[str, Callable[[], float]]:
         """Ages (s) of the plan that a planner made, and of the dead-man key."""
         ages: dict[str, Callable[[], float]] = {}
         if isinstance(self.source, MppiBeside):
             port, own = self.source.GetOutputPort("plan"), self.source.GetMyContextFromRoot(context)
 
+            made = 0.0  # time of the newest plan that there was
+
             def age() -> float:
-                plan, t = value(port, own), context.get_time()
-                there = plan[1:5] @ plan[1:5] > 0.25
-                return float(t - plan[0]) if there else t
+                nonlocal made
+                plan = value(port, own)
+                if plan[1:5] @ plan[1:5] > 0.25:
+                    made = float(plan[0])
+                return context.get_time() - made
 
             ages["plan"] = age
         if self.dead_man is not None:

@@ -9,12 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ...systems.closed_loop import Signal
-from ...systems.estimation.error_state import POSITION, ROTATION, VELOCITY
 from ...systems.mavlink import telemetry
 from ...systems.mavlink.driver import Acted, Driver
 from ..scenarios.scenario import Scenario
 from .log import RunLog
-from .signals import PlanTap, mean_over, nis_and_rejections
+from .signals import PlanTap, consistency, mean_over
 
 ORDERS = ("fly", "neutral", "hold_depth", "disarm", "yield")
 """Orders of the guards, by their number in the log."""
@@ -127,16 +126,8 @@ def collect_flight(
         **journal.at(grid),
         "health": signals["health"].value[:n],
     }
-    P = signals["covariance"].value[:n]
-    if np.isfinite(P).any():
-        P = P.reshape(n, math.isqrt(P.shape[1]), -1)
-        blocks = [P[:, part, part].reshape(-1, 9) for part in (POSITION, ROTATION, VELOCITY)]
-        fused = scenario.station.sensing.fused
-        variables |= {
-            "error_std": np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0)),
-            "error_covariance": np.concatenate(blocks, axis=1),
-            **nis_and_rejections(signals["status"].value[:n], fused),
-        }
+    if np.isfinite(signals["covariance"].value[:n]).any():
+        variables |= consistency(signals, n, scenario.station.sensing.fused)
     link = scenario.vehicle_link
     return RunLog.create(
         scenario.name,

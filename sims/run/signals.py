@@ -166,10 +166,7 @@ def collect(
     finite = np.all(np.isfinite(signals["X_WB_cheat"].value[:n]), axis=1)
     n = n if finite.all() else max(1, int(np.argmin(finite)))
     grid = dt * np.arange(n)
-    P = signals["covariance"].value[:n]
-    P = P.reshape(n, math.isqrt(P.shape[1]), -1)
-    blocks = [P[:, part, part].reshape(-1, 9) for part in (POSITION, ROTATION, VELOCITY)]
-    status, fused = signals["status"].value[:n], scenario.station.sensing.fused
+    fused = scenario.station.sensing.fused
     variables = {
         "X_WB": signals["X_WB_cheat"].value[:n],
         "V_WB_B": signals["V_WB_B_cheat"].value[:n],
@@ -177,9 +174,7 @@ def collect(
         "pwm": signals["pwm_acting"].value[:n],
         "X_WB_estimate": signals["X_WB"].value[:n],
         "V_WB_B_estimate": signals["V_WB_B"].value[:n],
-        "error_std": np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0)),
-        "error_covariance": np.concatenate(blocks, axis=1),
-        **nis_and_rejections(status, fused),
+        **consistency(signals, n, fused),
         "F_disturbance_Bo_B": signals["F_disturbance_cheat"].value[:n],
         "flow_W": signals["flow_cheat"].value[:n],
     }
@@ -198,14 +193,25 @@ def collect(
     )
 
 
-def nis_and_rejections(
-    status: Float[np.ndarray, "n size"], fused: tuple[str, ...]
+def consistency(
+    signals: Mapping[str, Signal], n: int, fused: tuple[str, ...]
 ) -> dict[str, np.ndarray]:
-    """The last NIS of each fused sensor and its rejections in a row, from the filter's status."""
-    names = status_names(fused)
-    return {
+    """What the filter says of its errors, up to row n.
+
+    Standard deviations and covariances of the errors, and of each fused sensor the last NIS and the
+    rejections in a row.
+    """
+    P = signals["covariance"].value[:n]
+    P = P.reshape(n, math.isqrt(P.shape[1]), -1)
+    blocks = [P[:, part, part].reshape(-1, 9) for part in (POSITION, ROTATION, VELOCITY)]
+    status, names = signals["status"].value[:n], status_names(fused)
+    told = {
         kind: status[:, [names.index(f"{kind}_{name}") for name in fused]]
         for kind in ("nis", "rejected")
+    }
+    return told | {
+        "error_std": np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0)),
+        "error_covariance": np.concatenate(blocks, axis=1),
     }
 
 

@@ -13,7 +13,7 @@ from pydrake.systems.framework import LeafSystem
 
 from helpers import ROOT, module_files
 from spinndrift.models.disturbances import Combined
-from spinndrift.models.sensors import Imu
+from spinndrift.models.sensors import SHIPPED, Imu
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.systems.controllers.impedance import ImpedanceLaw
 from spinndrift.systems.estimation.disturbance_observer import MomentumObserver
@@ -44,6 +44,8 @@ def arguments() -> dict[str, dict]:
         "ThrustAllocation": {"thrusters": thrusters},
         "PulseWidths": {"thrusters": thrusters},
         "Mppi": {"planner": planner},
+        "MppiBeside": {"planner": planner},
+        "VehicleInterface": {"sensors": SHIPPED, "thrusters": 8, "health": 5},
         "Impedance": {"law": ImpedanceLaw(np.eye(6), np.eye(6), limits), "layout": PlanLayout()},
         "DisturbanceObserver": {"observer": MomentumObserver(dynamics)},
         "Reference": {"path": HoldPose()},

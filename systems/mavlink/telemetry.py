@@ -95,7 +95,8 @@ def dvl(link: Link, parameters: Mapping[str, float]) -> Reading | None:
     """Velocity of the DVL over the bed (m/s), 1 if valid, altitude (m, NaN if unknown).
 
     From VISION_POSITION_DELTA, which a DVL's driver sends to the autopilot, else from ODOMETRY; the
-    velocity is in the axes of B at the DVL. The altitude is that of a DISTANCE_SENSOR that looks
+    velocity is in the axes of B at the DVL. Drivers send the velocity of the stamp times the
+    interval, as which the autopilot takes it. The altitude is that of a DISTANCE_SENSOR that looks
     down. A time that is not the vehicle's counts as arrival less the autopilot's VISO_DELAY_MS.
     """
     found = link.latest("VISION_POSITION_DELTA")
@@ -104,19 +105,18 @@ def dvl(link: Link, parameters: Mapping[str, float]) -> Reading | None:
         dt = m.time_delta_usec * 1e-6
         valid = dt > 0 and m.confidence > 0
         v = codec.body_vector(*m.position_delta) / (dt if valid else 1.0)
-        middle = dt / 2  # the displacement is that of the time before the stamp
     else:
         found = link.latest("ODOMETRY")
         if found is None or found.message.child_frame_id not in _BODY_FRAMES:
             return None
-        m, middle = found.message, 0.0
+        m = found.message
         v, valid = codec.body_vector(m.vx, m.vy, m.vz), m.quality >= 0
     valid = valid and bool(np.isfinite(v).all())
     taken = None if found.boot is None else link.clock.local(found.boot)
     if taken is None or not found.arrival - _LATE <= taken <= found.arrival + _APART:
         taken = found.arrival - parameters.get("VISO_DELAY_MS", 10.0) * 1e-3
     value = np.array([*(v if valid else np.zeros(3)), float(valid), _altitude(link)])
-    return Reading(value, min(taken, found.arrival) - min(middle, _LATE), found.arrival)
+    return Reading(value, min(taken, found.arrival), found.arrival)
 
 
 def _altitude(link: Link) -> float:

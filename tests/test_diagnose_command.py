@@ -1,5 +1,6 @@
 """`spinndrift diagnose`: its files appear together, and it says what it assumes."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,41 +10,50 @@ from test_cli import called
 
 from spinndrift.models.files.owned import MARKER
 from spinndrift.models.recordings.store import Recording, Trajectory
+from spinndrift.sims.reports.pages import Page
 
 PREPARE = """
 from types import SimpleNamespace
 import spinndrift.sims.reports.diagnosis_report, spinndrift.training.diagnosis.pipeline
-from test_diagnose_command import Told
+from test_diagnose_command import Told, ToldPage
 spinndrift.training.diagnosis.pipeline.diagnose = lambda recording, vehicle, *_: SimpleNamespace(
     diagnosis=Told(), extended=vehicle.dynamics()
 )
-spinndrift.sims.reports.diagnosis_report.diagnosis_page = lambda *_: Told()
+spinndrift.sims.reports.diagnosis_report.diagnosis_page = lambda *_: ToldPage()
 """
 FILES = {MARKER, "diagnosis.json", "diagnosis.schema.json", "extended/model.spinn", "report.html"}
 
 
 class Told:
-    """A diagnosis and its page in place of real ones, which take half a minute."""
+    """A diagnosis in place of a real one, which takes half a minute."""
 
     sentence = "Nothing differs."
     causes = ()
 
-    def __init__(self, fault=None, words="new"):
-        self.fault, self.words = fault, words
+    def __init__(self, words="new"):
+        self.words = words
 
     def save(self, path):
-        path.write_text(self.words)
+        Path(path).write_text(self.words)
+
+
+class ToldPage(Page):
+    """Its page."""
+
+    def __init__(self, fault=None, words="new"):
+        super().__init__("Diagnosis")
+        self.fault, self.words = fault, words
 
     def write(self, path):
         if self.fault is not None:
             raise self.fault
-        path.write_text(self.words)
+        Path(path).write_text(self.words)
 
 
 @pytest.fixture
 def diagnosing(monkeypatch):
     def stand_in(fault=None, words="new"):
-        told = Told(fault, words)
+        told, page = Told(words), ToldPage(fault, words)
 
         def diagnose(recording, vehicle, *_):
             assert vehicle.name == "bluerov2_heavy"
@@ -51,7 +61,7 @@ def diagnosing(monkeypatch):
 
         monkeypatch.setattr("spinndrift.training.diagnosis.pipeline.diagnose", diagnose)
         monkeypatch.setattr(
-            "spinndrift.sims.reports.diagnosis_report.diagnosis_page", lambda *_: told
+            "spinndrift.sims.reports.diagnosis_report.diagnosis_page", lambda *_: page
         )
 
     return stand_in
@@ -60,7 +70,8 @@ def diagnosing(monkeypatch):
 def recorded(path, vehicle):
     n = 20
     pose = np.tile([1.0, 0, 0, 0, 0, 0, -1], (n, 1))
-    still = Trajectory("still", pose, np.zeros((n, 6)), {"F_Bo_B": np.zeros((n, 6))})
+    F = np.tile([0, 0, -1.0, 0, 0, 0], (n, 1))  # holds its depth
+    still = Trajectory("still", pose, np.zeros((n, 6)), {"F_Bo_B": F})
     Recording.from_trajectories([still], 0.05, vehicle=vehicle).save(path)
     return path
 

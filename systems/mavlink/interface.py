@@ -95,10 +95,10 @@ class VehicleInterface(LeafSystem):
         - dvl
         - depth
         - compass
-        - pwm
         - X_WB_autopilot
         - V_WB_B_autopilot
         - health_autopilot
+        - pwm
 
     """
 

@@ -127,7 +127,7 @@ def _client(address: str | None, workers: int) -> Iterator[Any]:
             n_workers=workers,
             threads_per_worker=1,
             processes=True,
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",  # a free port, on this machine alone
             memory_limit=0,
             host="127.0.0.1",
         ) as cluster,

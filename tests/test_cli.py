@@ -227,6 +227,7 @@ def test_train_resume_and_evaluate(generated, tmp_path, capsys, monkeypatch):
     assert 0 < overall["learned"]["rmse_position"] < 1
 
 
+@pytest.mark.slow
 def test_training_starts_from_a_model_with_effects(generated, tmp_path, capsys, monkeypatch):
     """As a diagnosis writes it; what it found stays, a SPINN learns what is left."""
     vehicle, lag = load_vehicle("bluerov2_heavy"), kind("thruster_lag").of(time_constant=0.1)

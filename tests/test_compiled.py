@@ -260,6 +260,7 @@ PLANNER = """{duration: 0.7, controller: {planner: {horizon: 20, sequences: 40, 
     knots: [2, 4], effective_samples: 4, shown_paths: 4}}}"""
 
 
+@pytest.mark.slow
 def test_a_planner_flies_as_in_drake():
     """Four calls, each from what the ones before made, in the planner's single precision."""
     scenario = load_scenario("pylon_crossing_calm", PLANNER)

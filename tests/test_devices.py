@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import pytest
 from diagonal import Diagonal, simulated
 
 from spinndrift.sims.compile_cache import compiled_environment
@@ -48,6 +49,7 @@ def learned() -> np.ndarray:
     return np.concatenate(parts)
 
 
+@pytest.mark.slow
 def test_two_devices_learn_what_one_does(tmp_path):
     """With the noise they draw: that of a window is a matter of its place in the batch.
 

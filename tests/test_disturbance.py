@@ -91,7 +91,14 @@ def test_a_slow_push_is_taken_out_of_all_that_it_moves():
     np.testing.assert_allclose(doubled[1], 2 * doubled[0])
 
 
-@pytest.mark.parametrize("name", ["disturbance_colour", "waves", "current_varying"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("disturbance_colour", marks=pytest.mark.slow),
+        "waves",
+        pytest.param("current_varying", marks=pytest.mark.slow),
+    ],
+)
 def test_no_name_imitates_a_large_random_structure(problem_of, name):
     """Three times a realistic size: names win thousands of nats, and none beside the structure."""
     problem, _ = problem_of(name, 3.0)
@@ -218,7 +225,7 @@ def agrees(law, omega, direction, amplitude, within=0.15):
 @pytest.mark.parametrize(
     "name", ["disturbance_level", "disturbance_state_dependence", "disturbance_impacts"]
 )
-@pytest.mark.parametrize("size", [1.0, 3.0])
+@pytest.mark.parametrize("size", [pytest.param(1.0, marks=pytest.mark.slow), 3.0])
 def test_levels_and_what_comes_and_goes_are_told_apart(problem_of, name, size):
     problem, _ = problem_of(name, size)
     evaluation = problem.evaluate(problem.believed)
@@ -228,7 +235,13 @@ def test_levels_and_what_comes_and_goes_are_told_apart(problem_of, name, size):
     assert all(law.name == name for law in groups[0])
 
 
-@pytest.mark.parametrize("name", ["disturbance_colour", "disturbance_state_dependence"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("disturbance_colour", marks=pytest.mark.slow),
+        "disturbance_state_dependence",
+    ],
+)
 def test_what_lasts_or_grows_is_no_level_in_calm_water(problem_of, name):
     """With a twentieth of the white disturbance, and as little of it believed."""
     calm = tuple(LEVELS / 20)
@@ -305,7 +318,7 @@ def test_a_belief_that_diverges_on_the_data_is_told(tmp_path):
         Diagnoser(read_csv(tmp_path / "data"), VEHICLE, belief).run()
 
 
-@pytest.mark.parametrize("size", [1.0, 3.0])
+@pytest.mark.parametrize("size", [1.0, pytest.param(3.0, marks=pytest.mark.slow)])
 def test_a_current_that_wanders_is_one_motion_of_the_water(tmp_path, size):
     """Not pushes on every axis: its size and time constant within three standard errors."""
     case = draw(4, names=("current_varying",), size=size, plan=Plan(runs=3))

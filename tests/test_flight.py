@@ -1,5 +1,6 @@
 """Scenarios flown in real time on a simulated vehicle, which another process serves."""
 
+import os
 import re
 import signal
 import subprocess
@@ -12,9 +13,10 @@ import numpy as np
 import pytest
 
 from spinndrift.models.config.errors import UserError
+from spinndrift.sims.run.dead_man import dead_man_key
 from spinndrift.sims.run.flight import fly
 from spinndrift.sims.run.folder import write_files
-from spinndrift.sims.scenarios.scenario import Scenario, load_scenario
+from spinndrift.sims.scenarios.scenario import Scenario, load_scenario, overridden
 from spinndrift.systems.mavlink import telemetry
 from spinndrift.systems.mavlink.link import Link
 from spinndrift.systems.mavlink.parameters import Parameters
@@ -90,6 +92,63 @@ def test_a_dry_run_commands_nothing(port: int):
     assert np.abs(run.log["F_Bo_B"]).max() > 0.1  # computed
     np.testing.assert_array_equal(run.log["pwm"], 1500.0)  # not sent
     assert "error_std" not in run.log  # an autopilot tells no covariance
+
+
+CONTROLLER = """
+import numpy as np
+from pydrake.systems.framework import LeafSystem
+
+class Failing(LeafSystem):
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorInputPort("X_WB", 7)
+        self.DeclareVectorInputPort("V_WB_B", 6)
+        self.DeclareStateOutputPort("F_Bo_B", self.DeclareDiscreteState(6))
+        self.DeclarePeriodicDiscreteUpdateEvent(0.02, 0.0, self.update)
+
+    def update(self, context, state):
+        if context.get_time() > 3.5:  # beyond the run without commands
+            raise RuntimeError("a fault of the controller")
+        state.set_value(0, np.array([15.0, 0, 0, 0, 0, 0]))
+"""
+
+
+def test_an_exception_in_the_diagram_leaves_no_thruster_running(port: int, tmp_path: Path):
+    (tmp_path / "failing.py").write_text(CONTROLLER)
+    own = f"controller: !Own {{system: {tmp_path}/failing.py:Failing}}"
+    goal = "success: !ReachGoal {goal: [50, 0, -1], progress_time: 99}"
+    base = scenario(port, 30.0)
+    with pytest.raises(RuntimeError, match="a fault of the controller"):
+        fly(overridden(base, f"{own}\n{goal}"), arm=True)
+    with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
+        link.find_vehicle(15.0)
+        assert link.wait_for("SERVO_OUTPUT_RAW", 5.0) is not None
+        shown, status = telemetry.outputs(link, 8), telemetry.status(link, time.monotonic())
+        assert shown is not None
+        assert status is not None
+        np.testing.assert_array_equal(shown.value, 1500.0)
+        assert not status.armed
+
+
+def test_a_dead_man_key_needs_a_terminal_and_counts_from_the_last_press(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    with open(os.devnull) as nothing, monkeypatch.context() as patched:
+        patched.setattr(sys, "stdin", nothing)
+        with pytest.raises(UserError, match="dead_man: there is no terminal"), dead_man_key():
+            pass
+    ours, theirs = os.openpty()
+    with os.fdopen(theirs) as terminal, monkeypatch.context() as patched:
+        patched.setattr(sys, "stdin", terminal)
+        with dead_man_key() as age:
+            time.sleep(0.3)
+            assert age() >= 0.3
+            os.write(ours, b" ")
+            end = time.monotonic() + 10.0
+            while age() > 0.25 and time.monotonic() < end:
+                time.sleep(0.01)
+            assert age() <= 0.25
+    os.close(ours)
 
 
 def test_a_vehicle_with_another_frame_is_refused(port: int):

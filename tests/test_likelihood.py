@@ -54,6 +54,7 @@ def inertia(model):
 TRUE_INERTIA = np.asarray(inertia(TRUTH.dynamics(dtype=jnp.float32)), float)
 
 
+@pytest.mark.slow
 def test_the_constants_spread_as_the_cramer_rao_bound_says(model, found):
     """Errors in units of the bound's own are normal: squares of 18 sum to χ²."""
     unravel = ravel_pytree(constants(model))[1]

@@ -122,6 +122,7 @@ def recording():
     return Recording(assemble(runs, DT, vehicle="bluerov2_heavy"))
 
 
+@pytest.mark.slow
 def test_all_coefficients_of_another_vehicle_are_returned_as_ratios():
     problem = DiagnosisProblem.of(recording(), load_vehicle("bluerov2_heavy"))
     problem = with_coefficients(problem, "all")

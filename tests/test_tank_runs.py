@@ -112,6 +112,7 @@ def test_errors_are_one_sentence(tmp_path):
     assert len(errors.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_real_runs(tmp_path):
     """Gains alone take a third off the position error on runs left out; times belong mid-bin."""
     folder = shared_data("data", "kth_bluerov2_heavy")

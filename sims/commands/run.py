@@ -96,7 +96,8 @@ class Run:
 
     def _fly(self, scenario: Any, out: Path) -> Any:
         """Fly on the vehicle."""
-        from ..run.flight import fly
+        with interrupts_held():
+            from ..run.flight import fly
 
         settings = {"arm": self.arm, "dry_run": self.dry_run, "record": out / "telemetry.tlog"}
         if self.quiet:

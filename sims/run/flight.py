@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from ...systems.station.config import StationConfig
 from ..scenarios.criteria import Monitor, Outcome
 from ..scenarios.scenario import Scenario
 from .before_flight import Tell, as_granted, checked_link, preflight
+from .dead_man import dead_man_key
 from .flight_log import Journal, collect_flight
 from .loop import Progress, Run, Timing, few_collections
 from .real_time import Clockwork, percentiles, short_turns, tick_of
@@ -80,8 +82,12 @@ def fly(
             )
         say("dry run: nothing is armed" if dry_run else "arming")
         cockpit.compile_monitor()
-        driver.prepare()
-        with short_turns():
+        checks = preflight(driver, scenario)
+        with ExitStack() as held:
+            if scenario.vehicle_link is not None and scenario.vehicle_link.safety.dead_man > 0:
+                cockpit.dead_man = held.enter_context(dead_man_key())
+            driver.prepare()
+            held.enter_context(short_turns())
             outcome = cockpit.fly(progress)
         statistics = driver.link.statistics()
     return cockpit.flight(outcome, checks, statistics)
@@ -172,7 +178,7 @@ class Cockpit:
         try:
             return self._fly(self._begin(), progress)
         finally:
-            self._end_planner()
+            self._end_planner(wait=False)  # the vehicle is still armed
             self.interface.end()
 
     def _monitor(self) -> Monitor:
@@ -309,9 +315,9 @@ class Cockpit:
     def _seed(self, context: Context) -> None:
         seeded(self.diagram, context, self.scenario.seed)
 
-    def _end_planner(self) -> None:
+    def _end_planner(self, wait: bool = True) -> None:
         if isinstance(self.source, MppiBeside):
-            self.source.end()
+            self.source.end(wait)
 
 
 def _anchor(driver: Driver, station: StationConfig, link: Mavlink) -> Anchor:

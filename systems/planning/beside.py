@@ -17,7 +17,6 @@ from .mppi import FIGURES, Mppi
 from .mppi_core import MppiPlanner
 
 _NICE = 10  # of the planning thread: the loop's thread goes first
-_END = 30.0  # s: longest call that is waited for at the end
 
 
 class Call(NamedTuple):
@@ -66,12 +65,13 @@ class PlanningThread:
                 found = self._done.get_nowait()
         return found
 
-    def close(self) -> None:
-        """End after the present call."""
-        if self._thread.is_alive():
-            with suppress(queue.Full):
-                self._waiting.put(None, timeout=_END)
-            self._thread.join(_END)
+    def close(self, wait: bool = True) -> None:
+        """End after the present call, and wait for it or not."""
+        with suppress(queue.Empty):
+            self._waiting.get_nowait()
+        self._waiting.put(None)
+        if wait:
+            self._thread.join()
 
     def _run(self) -> None:
         with suppress(OSError, AttributeError):  # a priority of threads is Linux' alone
@@ -131,10 +131,10 @@ class MppiBeside(LeafSystem):
         self.calls: list[tuple[float, float]] = []
         """Time of the state and latency (s) of each plan that came in."""
 
-    def end(self) -> None:
+    def end(self, wait: bool = True) -> None:
         """End the thread; a context that is initialised starts another."""
         if self.thread is not None:
-            self.thread.close()
+            self.thread.close(wait)
             self.thread = None
 
     def _begin(self, context: Context, state: DiscreteValues) -> None:

@@ -70,7 +70,7 @@ def fly(
         checks = preflight(driver, scenario, say)
         scenario = as_granted(scenario, driver, say)
         driver.use(scenario.vehicle_link or link)
-        cockpit = Cockpit(driver, scenario, dry_run)
+        cockpit = Cockpit(driver, scenario)
         progress(0.0, "compiling")
         cockpit.warm_up()
         say("running the loop without commands")
@@ -96,7 +96,7 @@ def fly(
 class Cockpit:
     """The closed loop of a connected vehicle."""
 
-    def __init__(self, driver: Driver, scenario: Scenario, dry_run: bool):
+    def __init__(self, driver: Driver, scenario: Scenario):
         """Build the diagram for the vehicle's present place.
 
         Raises:
@@ -104,7 +104,7 @@ class Cockpit:
                 comes.
         """
         assert scenario.vehicle_link is not None
-        self.driver, self.scenario, self.dry_run = driver, scenario, dry_run
+        self.driver, self.scenario = driver, scenario
         self.anchor = _anchor(driver, scenario.station, scenario.vehicle_link)
         self.diagram = build_diagram(
             scenario.station,
@@ -141,12 +141,12 @@ class Cockpit:
             UserError: the estimate is lost or not finite at the end.
         """
         self.interface.commanding = False
-        for attempt in range(_ATTEMPTS):
+        lost = ""
+        for _ in range(_ATTEMPTS):
             lost = self._shadowed()
             if not lost:
                 return
-            if attempt == _ATTEMPTS - 1:
-                raise UserError(lost)
+        raise UserError(lost)
 
     def _shadowed(self) -> str:
         """What is wrong with the estimate after a run without commands; empty if it is good."""

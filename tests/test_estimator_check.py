@@ -114,6 +114,10 @@ def test_every_setting_is_a_scenario_that_comes_back_from_its_file():
         *fault_settings(names, 30.0),
     ]
     assert {str(s) for s in settings} == set(names) - {"learned"}
+    calm, harbour = settings[:2]
+    assert calm.seeds(60) == range(60)
+    assert harbour.seeds(60) == range(60, 120)
+    assert consistency_settings(["harbour"], 60.0, None)[0].seeds(60) == harbour.seeds(60)
     for setting in settings:
         again = typed_yaml.loads(Scenario, typed_yaml.dump(setting.scenario))
         assert again == setting.scenario
@@ -130,7 +134,7 @@ def test_settings_are_flown_once_and_others_refused(tmp_path, monkeypatch):
     def fly(scenario, seeds, progress, engine):
         calls.append(scenario.station.sensing.faults)
         for seed in seeds:
-            if len(calls) == 2 and seed == 1:
+            if len(calls) == 2 and seed == seeds[1]:
                 yield flown()._replace(outcome=Outcome("interrupted", 1.0, "Stopped."))
             progress(0.5, "half")
             yield flown()

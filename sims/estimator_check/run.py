@@ -40,7 +40,7 @@ class Result:
 
 @dataclass(frozen=True)
 class FlySetting:
-    """Simulates a setting with the seeds 0, 1, …, and writes its scores atomically.
+    """Simulates a setting with its seeds, and writes its scores atomically.
 
     Attributes:
         out: folder; the file is `<table>/<name>.npz`.
@@ -72,7 +72,8 @@ class FlySetting:
             # zero would mean a new start
             progress(max(1e-6, (len(found) + fraction) / count), f"{setting}: {remark}")
 
-        for run in simulate_seeds(setting.scenario, range(count), report, self.engine):
+        seeds = setting.seeds(count)
+        for run in simulate_seeds(setting.scenario, seeds, report, self.engine):
             if run.outcome.reason == "interrupted":
                 raise KeyboardInterrupt
             found.append(score(run, setting.scenario.duration / 3))
@@ -105,10 +106,10 @@ class FlySetting:
         return Result(setting, scores, flown)
 
     def _made(self, setting: Setting) -> dict[str, Any]:
-        model = setting.scenario.station.model
+        model, seeds = setting.scenario.station.model, setting.seeds(self.runs[setting.table])
         return {
             "scenario": typed_yaml.dump(setting.scenario),
-            "runs": self.runs[setting.table],
+            "seeds": [seeds.start, seeds.stop],
             "model": "" if model is None else hashlib.sha256(model.read_bytes()).hexdigest(),
         }
 

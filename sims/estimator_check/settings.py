@@ -38,13 +38,19 @@ class Setting:
         table: the table that it is a row of.
         name: of its file.
         words: its description in the table.
+        row: of the whole table; each row has seeds of its own.
         scenario: its seed is replaced.
     """
 
     table: TableName
     name: str
     words: str
+    row: int
     scenario: Scenario
+
+    def seeds(self, runs: int) -> range:
+        """Seeds of its runs. What is drawn once a run (offset of depth) is no other row's."""
+        return range(self.row * runs, (self.row + 1) * runs)
 
     def __str__(self) -> str:
         """Its name."""
@@ -84,7 +90,7 @@ def consistency_settings(names: Sequence[str], seconds: float, model: Path | Non
         UserError: the model can't be read.
     """
     found = []
-    for name, (words, base, text) in _WATERS.items():
+    for row, (name, (words, base, text)) in enumerate(_WATERS.items()):
         if name not in names:
             continue
         scenario = _lasting(load_scenario(base, text), seconds)
@@ -93,7 +99,7 @@ def consistency_settings(names: Sequence[str], seconds: float, model: Path | Non
             vehicle = load_model(model, float)[1].get("vehicle") or scenario.station.vehicle
             station = replace(scenario.station, model=model.absolute(), vehicle=vehicle)
             scenario = replace(scenario, station=station)
-        found.append(Setting("consistency", name, words, scenario))
+        found.append(Setting("consistency", name, words, row, scenario))
     return found
 
 
@@ -101,11 +107,11 @@ def fault_settings(names: Sequence[str], seconds: float) -> list[Setting]:
     """Calm water with a fault from a third of the time on."""
     calm = _lasting(load_scenario(_CALM), seconds)
     found = []
-    for name, words, faults in _faults(seconds / 3):
+    for row, (name, words, faults) in enumerate(_faults(seconds / 3)):
         if name in names:
             sensing = replace(calm.station.sensing, faults=tuple(faults))
             station = replace(calm.station, sensing=sensing)
-            found.append(Setting("faults", name, words, replace(calm, station=station)))
+            found.append(Setting("faults", name, words, row, replace(calm, station=station)))
     return found
 
 

@@ -13,7 +13,7 @@ from ..models.vehicles.vehicle import load_vehicle
 from ..systems.logs.load import load_data
 from .acceptance import acceptance
 
-_LOGS = (".tlog", ".bin", ".nc")
+_LOGS = (".tlog", ".bin", ".nc", ".bag", ".db3", ".mcap")
 _PACKED = (".xz", ".gz")
 
 
@@ -47,7 +47,7 @@ def find_logs(folders: Sequence[Path]) -> list[tuple[Path, Path]]:
     found = [(folder, path) for folder in folders for path in _within(folder)]
     if not found:
         raise UserError(
-            f"{', '.join(map(str, folders))}: no log in there (.tlog, .BIN, CSV folder)"
+            f"{', '.join(map(str, folders))}: no log in there (.tlog, .BIN, ROS bag, CSV folder)"
         )
     return found
 

@@ -14,12 +14,15 @@ from spinndrift.models.config.errors import UserError
 COUNT = 1000
 FRAMES = 200
 """Inputs of twenty frames each."""
+BAGS = 30
+"""A bag is written anew for each input."""
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_what_is_spoiled_is_read_or_refused(name, tmp_path):
     fates, wrong = Counter[str](), []
-    for number in range(COUNT if KINDS[name].refuses else FRAMES):
+    count = {"bag": BAGS, "mavlink": FRAMES}.get(name, COUNT)
+    for number in range(count):
         verdict = judge(KINDS[name], number, tmp_path)
         fates[verdict.fate] += 1
         if not verdict.sound:
@@ -27,7 +30,7 @@ def test_what_is_spoiled_is_read_or_refused(name, tmp_path):
     assert not wrong, "\n\n".join(wrong[:5])
     # inputs that are all refused, or all read, would try little
     if KINDS[name].refuses:
-        assert min(fates["read"], fates["refused"]) >= COUNT / 50, fates
+        assert min(fates["read"], fates["refused"]) >= count / 50, fates
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,8 @@ class Demo:
     )
 
     log: Path | None = None
-    """Your own log (.tlog, .BIN), recording (.nc) or CSV folder; by default the shipped log."""
+    """Your own log (.tlog, .BIN), ROS bag, recording (.nc) or CSV folder; by default the shipped
+    log."""
     out: Path | None = None
     """Folder for all results; by default runs/demo, or runs/demo-2 and so on if that holds
     something else."""

@@ -38,7 +38,7 @@ class Diagnose:
     )
 
     data: Positional[Path]
-    """Recording (.nc), CSV folder or log (.tlog, .BIN)."""
+    """Recording (.nc), CSV folder, log (.tlog, .BIN) or ROS bag."""
     vehicle: str | None = None
     """Preset name or YAML file; by default what the data name, else the model's, else that of a
     log's frame, else bluerov2_heavy."""

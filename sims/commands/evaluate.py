@@ -29,7 +29,7 @@ class Evaluate:
     model: Positional[Path]
     """Model file (.spinn)."""
     data: Positional[Path]
-    """Recording (.nc), log (.tlog, .BIN) or CSV folder."""
+    """Recording (.nc), log (.tlog, .BIN), ROS bag or CSV folder."""
     out: Path | None = None
     """File for the results: .csv (tidy), .json (overall) or .nc."""
     length: Annotated[float, SECONDS] = 4.0

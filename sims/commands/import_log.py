@@ -1,6 +1,6 @@
 """`spinndrift import`: a log or a CSV folder to a Recording."""
 
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -21,7 +21,8 @@ class Import:
     """Convert a log to a Recording, the input of the other commands.
 
     Reads ArduPilot DataFlash logs (.BIN), MAVLink telemetry logs (.tlog), both also as .gz or .xz,
-    and folders of CSV files (docs/recording.md). Clocks are aligned, everything is resampled to one
+    ROS bags (.bag, .db3, .mcap or their folder; install spinndrift[ros]) and folders of CSV files
+    (docs/recording.md). Clocks are aligned, everything is resampled to one
     rate, and the summary says what the log lacks and what can therefore not be learned from it.
     """
 
@@ -31,7 +32,7 @@ class Import:
     )
 
     log: Positional[Path]
-    """The log file or CSV folder."""
+    """The log file, ROS bag or CSV folder."""
     out: Path | None = None
     """File to write (.nc); by default the log's name in the current folder."""
     rate: Annotated[float, Within(1, 400)] = 20.0
@@ -50,12 +51,16 @@ class Import:
     """Keep a log's disarmed stretches too."""
     system: Annotated[int | None, Within(1, 255)] = None
     """MAVLink system id, if a log holds several autopilots."""
+    topics: tuple[Path, ...] | None = None
+    """Topic map of a ROS bag (YAML); without a file, print a proposal and import nothing."""
     accept: tuple[str, ...] = ()
     """Words of severe findings on the data that are accepted (docs/checks.md), such as no-commands.
     """
 
     def place(self) -> AbstractContextManager[Path]:
         """Check and lock the outputs."""
+        if self._asks():
+            return nullcontext(self.log)
         with interrupts_held():
             from ...models.files.owned import output_file
             from ...models.recordings.store import Recording
@@ -73,10 +78,15 @@ class Import:
             from ..reports.findings import print_findings
 
         check_accepted(self.accept)
+        if self._asks():
+            self._propose()
+            return
         out = self._out()
         if out.suffix != ".nc":
             raise UserError(f"--out {out}: a Recording is a NetCDF file; give a name ending in .nc")
-        options = LogOptions(self.minimum, self.gap, self.water_density, self.disarmed, self.system)
+        options = LogOptions(
+            self.minimum, self.gap, self.water_density, self.disarmed, self.system, self._map()
+        )
         with progress_bar(f"reading {self.log.name}") as update:
             recording = load_data(
                 self.log,
@@ -96,6 +106,36 @@ class Import:
         for line in acceptance(recording):
             shown.print(f"  {line}", markup=False, soft_wrap=True)
         shown.print(f"wrote {out}")
+
+    def _asks(self) -> bool:
+        """Whether `--topics` was given without a file."""
+        return self.topics is not None and not self.topics
+
+    def _map(self) -> Path | None:
+        files = list(self.topics or ())
+        if len(files) > 1:
+            raise UserError(
+                f"--topics {files[0]}: give one file, or none for a proposal; the log stands "
+                "before it"
+            )
+        return files[0] if files else None
+
+    def _propose(self) -> None:
+        """Print the topic map that an import without one takes."""
+        with interrupts_held():
+            from ...systems.logs.bags.bag import open_bag
+            from ...systems.logs.bags.propose import propose, written
+
+        if self.out is not None:
+            raise UserError(
+                f"--out {self.out}: --topics without a file prints a proposal and writes nothing; "
+                "leave --out away and redirect the output"
+            )
+        with open_bag(self.log) as bag:
+            try:
+                print(written(bag, propose(bag)), end="")  # noqa: T201 - the command's output
+            except UserError as error:
+                raise UserError(f"{self.log}: {error}") from error
 
     def _out(self) -> Path:
         return self.out if self.out is not None else Path(f"{stem(self.log)}.nc")

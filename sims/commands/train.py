@@ -28,7 +28,7 @@ class Train:
     )
 
     data: Positional[Path]
-    """Recording (.nc), log (.tlog, .BIN) or CSV folder."""
+    """Recording (.nc), log (.tlog, .BIN), ROS bag or CSV folder."""
     out: Path = Path("runs/train")
     """Folder for model.spinn, metrics.csv, evaluation.csv, report.html."""
     method: str | None = None

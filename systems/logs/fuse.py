@@ -4,7 +4,8 @@ Attitude is interpolated along the geodesic, position by the Hermite cubic with 
 velocity as its slope, velocity linearly and then rotated into the body; rates and IMU are means
 about each instant (`models/recordings/resample.py`). The command of a step is the mean over that
 step of the linear interpolation of the logged outputs: a zero-order hold of these samples would
-delay the commands by half a sampling period (50 ms at the 10 Hz of a DataFlash log).
+delay the commands by half a sampling period (50 ms at the 10 Hz of a DataFlash log). Commands that
+act until the next one (`Signals.held`) are held.
 """
 
 from itertools import pairwise
@@ -126,10 +127,18 @@ def resample(signals: Signals, segment: Segment, number: int, dt: float) -> Traj
         name_of(segment, number),
         np.concatenate([q, p]).T,
         np.concatenate([v, omega]).T,
-        {"pwm": mean(t + dt / 2, signals.outputs.t, signals.outputs.x, dt).T},
+        {signals.command: _commands(signals, t, dt)},
         sensors,
         float(t[0]),
     )
+
+
+def _commands(signals: Signals, t: np.ndarray, dt: float) -> np.ndarray:
+    """Mean command of each step, time first."""
+    outputs = signals.outputs
+    if signals.held:
+        return hold(t, outputs.t, outputs.x, dt).T
+    return mean(t + dt / 2, outputs.t, outputs.x, dt).T
 
 
 def _at(series: Series, t: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A vehicle's log to a recording: telemetry (.tlog) and DataFlash (.BIN), plain or .xz/.gz."""
+"""A vehicle's log to a recording: telemetry (.tlog), DataFlash (.BIN), ROS bags."""
 
 import os
 from collections.abc import Sequence
@@ -11,10 +11,12 @@ from ...models.recordings.csv import METADATA, read_csv
 from ...models.recordings.schema import check_plausible
 from ...models.recordings.store import Recording
 from ...models.vehicles.vehicle import load_vehicle
+from .bags.bag import bag_kind
+from .bags.signals import read_bag
 from .dataflash import read_bin
 from .frame import settled
 from .fuse import fuse
-from .log_bytes import LogBytes, Progress, no_progress, read_log_bytes
+from .log_bytes import Progress, no_progress, read_log_bytes
 from .report import ImportReport, tell
 from .signals import Signals
 from .signals_dataflash import WANTED as BIN_WANTED
@@ -39,6 +41,7 @@ class LogOptions:
             them uncorrected.
         disarmed: keep disarmed stretches too.
         system: MAVLink system id, if several autopilots are in the log.
+        topics: topic map of a ROS bag; None takes the one beside the bag, or else a proposed one.
     """
 
     minimum: float = 5.0
@@ -46,6 +49,7 @@ class LogOptions:
     water_density: float | None = None
     disarmed: bool = False
     system: int | None = None
+    topics: Path | None = None
 
 
 def import_log(  # long: a third of it says what it takes and refuses
@@ -78,11 +82,7 @@ def import_log(  # long: a third of it says what it takes and refuses
     _check_options(RATES[-1] if rate is None else rate, options)
     if vehicle is not None:
         load_vehicle(vehicle)
-    raw = read_log_bytes(path, progress)
-    try:
-        signals = _signals(raw, vehicle, options, progress)
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
+    damage, signals = _signals(path, vehicle, options, progress)
     enforce(str(path), signals.findings, accept)
     try:
         rate = own_rate(signals) if rate is None else rate
@@ -102,7 +102,7 @@ def import_log(  # long: a third of it says what it takes and refuses
             "longer gaps (gap)"
         )
     progress(0.95)
-    report = tell(signals, path.name, trajectories, lines, [*raw.notes, *dropped], 1.0 / rate)
+    report = tell(signals, path.name, trajectories, lines, [*damage, *dropped], 1.0 / rate)
     try:
         recording = Recording.from_trajectories(
             trajectories,
@@ -138,10 +138,10 @@ def load_data(  # long: half of it says what it takes and refuses
     accept: Sequence[str] = (),
     progress: Progress = no_progress,
 ) -> Recording:
-    """Read data of any kind: a recording (.nc), a CSV folder, or a vehicle's log.
+    """Read data of any kind: a recording (.nc), a CSV folder, a vehicle's log or a ROS bag.
 
     Args:
-        path: file, or folder with a `recording.yaml`.
+        path: file, folder with a `recording.yaml`, or folder of a ROS 2 bag.
         rate: Hz; None keeps that of the data (20 for logs, or that of `own_rate` if `resample` is
             False).
         vehicle: preset or file; None keeps the one that the data name, or that of a log's frame.
@@ -164,7 +164,8 @@ def load_data(  # long: half of it says what it takes and refuses
     options = options or LogOptions()
     if path.suffix.lower() == ".csv" and path.is_file():
         raise UserError(f"{path}: give its folder, with a {METADATA} in it (see docs/recording.md)")
-    if path.is_dir() or path.suffix.lower() in (".yaml", ".yml"):
+    bag = path.is_dir() and bag_kind(path) is not None and not (path / METADATA).exists()
+    if (path.is_dir() and not bag) or path.suffix.lower() in (".yaml", ".yml"):
         recording = read_csv(path, rate=rate, resample=resample)
     elif path.suffix.lower() in (".nc", ".nc4", ".h5"):
         recording = Recording.load(path)
@@ -192,16 +193,23 @@ def load_data(  # long: half of it says what it takes and refuses
 
 
 def _signals(
-    raw: LogBytes,
-    vehicle: str | None,
-    options: LogOptions,
-    progress: Progress,
-) -> Signals:
-    if raw.kind == "bin":
-        read = read_bin(raw.data, BIN_WANTED, progress)
-        return signals_from_bin(read, vehicle, options.water_density)
-    log = read_tlog(raw.data, TLOG_WANTED, options.system, progress, AIDS)
-    return signals_from_tlog(log, vehicle, options.water_density)
+    path: Path, vehicle: str | None, options: LogOptions, progress: Progress
+) -> tuple[tuple[str, ...], Signals]:
+    """Sentences on damage of the file, and its signals."""
+    density = options.water_density
+    if bag_kind(path) is not None:
+        return (), read_bag(path, options.topics, vehicle, density, progress)
+    raw = read_log_bytes(path, progress)
+    if options.topics is not None:
+        raise UserError(f"{path}: --topics is for ROS bags; leave it out here")
+    try:
+        if raw.kind == "bin":
+            read = read_bin(raw.data, BIN_WANTED, progress)
+            return raw.notes, signals_from_bin(read, vehicle, density)
+        log = read_tlog(raw.data, TLOG_WANTED, options.system, progress, AIDS)
+        return raw.notes, signals_from_tlog(log, vehicle, density)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
 
 
 def _check_options(rate: float, options: LogOptions) -> None:

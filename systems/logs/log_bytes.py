@@ -18,7 +18,8 @@ _GZIP = b"\x1f\x8b"
 _DATAFLASH = b"\xa3\x95"
 _CHUNK = 1 << 20
 _NEEDED = (
-    "give a MAVLink telemetry log (.tlog) or an ArduPilot DataFlash log (.BIN), or .xz/.gz of one"
+    "give a MAVLink telemetry log (.tlog) or an ArduPilot DataFlash log (.BIN), or .xz/.gz of one, "
+    "or a ROS bag (.bag, .db3, .mcap, or its folder)"
 )
 
 

@@ -106,8 +106,8 @@ def _motion(signals: Signals) -> list[str]:
     told = []
     p = signals.position
     if p is not None:
-        what = "Position and velocity" if np.isfinite(p.x[0]).any() else "Height and climb"
-        told.append(f"{what} from {_at(p)} (the autopilot's estimate).")
+        whose = "" if p.source.startswith("/") else " (the autopilot's estimate)"  # a ROS topic
+        told.append(f"{_what(signals, p)} from {_at(p)}{whose}.")
     depth = signals.pressure_depth
     if depth is not None:
         told.append(f"Depth by pressure from {_at(depth)}.")
@@ -123,6 +123,17 @@ def _motion(signals: Signals) -> list[str]:
                 "depths are then 2.5 % too large (give the water's density to correct it)."
             )
     return told
+
+
+def _what(signals: Signals, p: Series) -> str:
+    if np.isfinite(p.x[0]).any():
+        return "Position and velocity"
+    return "Velocity" if _moves_ahead(signals) else "Height and climb"
+
+
+def _moves_ahead(signals: Signals) -> bool:
+    """Whether there is a horizontal velocity."""
+    return signals.velocity is not None and bool(np.isfinite(signals.velocity.x[0]).any())
 
 
 def _battery(signals: Signals) -> list[str]:
@@ -148,7 +159,7 @@ def _consistency(kept: Sequence[Trajectory], dt: float) -> tuple[list[str], list
         if mean > _CONSISTENT:
             good.append(f"{sentence}.")
         else:
-            bad.append(f"{sentence} only: the autopilot's estimate is poor here.")
+            bad.append(f"{sentence} only: the estimate is poor here.")
     return good, bad
 
 
@@ -160,7 +171,7 @@ def _lacking(signals: Signals) -> list[str]:
             "No position or velocity at all: only rotation can be learned; stream "
             "LOCAL_POSITION_NED or GLOBAL_POSITION_INT."
         )
-    elif not np.isfinite(p.x[0]).any():
+    elif not _moves_ahead(signals):
         told.append(
             "No horizontal estimate: surge and sway velocity and position are missing and can't be "
             "learned, heave is that of the vertical velocity; a DVL or GPS and an EKF origin give "
@@ -169,16 +180,16 @@ def _lacking(signals: Signals) -> list[str]:
     elif p.rate < _SLOW_STATE_HZ:
         told.append(
             f"Position and velocity at {p.rate:.1f} Hz only: motion faster than about "
-            f"{p.rate / 4:.1f} Hz is not seen; ask for LOCAL_POSITION_NED at 20 Hz or more."
+            f"{p.rate / 4:.1f} Hz is not seen; log {p.source} at 20 Hz or more."
         )
     if signals.attitude.rate < _SLOW_STATE_HZ:
         told.append(f"Attitude at {signals.attitude.rate:.1f} Hz only: fast turns are smoothed.")
     rate = signals.outputs.rate
-    if rate < _SLOW_OUTPUTS_HZ:
+    if rate < _SLOW_OUTPUTS_HZ and not signals.held:
         told.append(
             f"Thruster outputs at {rate:.1f} Hz: thruster lag and delays below about "
             f"{2 / rate:.1f} s can't be learned, and commands between samples are unknown; log "
-            "SERVO_OUTPUT_RAW at 50 Hz or more."
+            f"{signals.outputs.source} at 50 Hz or more."
         )
     if signals.voltage is None:
         told.append("No battery voltage: thrust is that of the nominal voltage.")

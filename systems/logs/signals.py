@@ -53,7 +53,9 @@ class Signals:
         rates: ω of B in W, in B (rad/s).
         specific_force: in B (m/s²).
         pressure_depth: m, positive down.
-        outputs: PWM (µs) of the vehicle's thrusters, direction normalised.
+        outputs: PWM (µs) of the vehicle's thrusters, direction normalised; or the `command`.
+        command: variable of a recording that `outputs` are: pwm, thruster_force (N) or F_Bo_B.
+        held: each of the outputs acts until the next; False if they are samples of a faster signal.
         vehicle: preset or file whose thrusters these are.
         spans: armed, mode, aiding, wiring: the states that are constant within a segment.
         cuts: times at which a segment must end: resets, reboots.
@@ -64,6 +66,8 @@ class Signals:
     attitude: Series
     rates: Series
     outputs: Series
+    command: str = "pwm"
+    held: bool = False
     vehicle: str = ""
     position: Series | None = None
     velocity: Series | None = None

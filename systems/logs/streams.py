@@ -52,9 +52,12 @@ def aid_spans(
 
 
 def missing_states(
-    spans: Mapping[str, Spans], voltage: Series | None, batteries: Sequence[str]
+    spans: Mapping[str, Spans],
+    voltage: Series | None,
+    batteries: Sequence[str],
+    arming: str = "HEARTBEAT, or ARM records (LOG_DISARMED 0 starts the log at arming)",
 ) -> list[Finding]:
-    """What the log does not tell of arming and voltage, although it could."""
+    """What the log does not tell of arming and voltage, although it could by messages `arming`."""
     found = []
     if "armed" not in spans:
         found.append(
@@ -62,7 +65,7 @@ def missing_states(
                 "armed-unknown",
                 "",
                 "the log does not tell when the vehicle was armed, so all of it is taken",
-                "log HEARTBEAT, or ARM records (LOG_DISARMED 0 starts the log at arming)",
+                f"log {arming}",
             )
         )
     if voltage is None and batteries:

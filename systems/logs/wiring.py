@@ -12,7 +12,7 @@ from ...models.vehicles.vehicle import load_vehicle
 from ..mavlink.codec import FRAME_THRUSTERS, MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS, thruster_pwm
 from .signals import Parameter, Series, Spans, series
 
-_PRESETS, _USUAL = {6: "bluerov2", 8: "bluerov2_heavy"}, 8
+PRESETS, _USUAL = {6: "bluerov2", 8: "bluerov2_heavy"}, 8
 _OFF = 0  # SERVOn_FUNCTION of an output that the autopilot leaves to DO_SET_SERVO
 
 
@@ -134,7 +134,7 @@ def _vehicle(
     if count is None and six and not _drives(functions[7]) and not _drives(functions[8]):
         count, told = 6, "SERVOn_FUNCTION"
     if named is None:
-        name = _PRESETS[count or _USUAL]
+        name = PRESETS[count or _USUAL]
         said = f"{told}: {count} thrusters, read as those of {name} (--vehicle names another)."
         more = load_vehicle(name).limitation()
         return name, [] if count in (None, _USUAL) else [said, more]
@@ -142,7 +142,7 @@ def _vehicle(
     if count not in (None, own):
         raise UserError(
             f"{told} is that of a vehicle with {count} thrusters, and {named} has {own}; leave the "
-            f"vehicle out, or name one with {count} (--vehicle {_PRESETS[count]})"
+            f"vehicle out, or name one with {count} (--vehicle {PRESETS[count]})"
         )
     return named, []
 

@@ -15,7 +15,7 @@ import warnings
 from collections import Counter
 from pathlib import Path
 
-KINDS = ("tlog", "bin", "netcdf", "csv", "yaml", "checkpoint", "mavlink")
+KINDS = ("tlog", "bin", "bag", "netcdf", "csv", "yaml", "checkpoint", "mavlink")
 _MEMORY = 8 << 30
 """Bytes of addresses that a reader of such small files may have; JAX alone maps four GB."""
 

@@ -25,6 +25,7 @@ WORDS: dict[str, tuple[Severity, str]] = {
     "velocity-held": ("cut", "velocity stands still at a value while the vehicle moves"),
     "velocity-impossible": ("cut", "velocities that no underwater vehicle has"),
     "dead-reckoning": ("cut", "the aid of the horizontal estimate stopped"),
+    "messages-unreadable": ("cut", "messages of a bag can't be read"),
     "output-direction": ("cut", "a thruster's direction was changed in mid-log"),
     "output-reversed": ("note", "an output is turned by SERVOn_REVERSED"),
     "thruster-dead": ("note", "a thruster has no effect"),

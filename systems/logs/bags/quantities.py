@@ -1,0 +1,160 @@
+"""Quantities of a bag's topics as series in W and B, in SI units, on one clock."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from ....models.frames import frd_to_flu, ned_to_enu, twist_frd_to_flu
+from ....models.recordings.resample import linear, rotations, slerp
+from ..signals import Series, series
+from .bag import Column
+from .clocks import Clock
+from .messages import FORMS, Quantity
+from .topics import Topic, TopicMap
+
+_NED = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+_HALF_WIDTH_S = 0.05
+"""Least half width of a central difference: a wider one attenuates, 1 Hz by 2 % at 50 ms."""
+
+
+@dataclass(frozen=True)
+class Quantities:
+    """What the map takes from the columns of a bag."""
+
+    columns: Mapping[str, Column]
+    map: TopicMap
+    clock: Clock
+    notes: list[str] = field(default_factory=list)
+
+    def topic(self, quantity: Quantity) -> Topic | None:
+        """The topic of a quantity, if its messages are there."""
+        one = self.map.of(quantity)
+        return one if one is not None and one.topic in self.columns else None
+
+    def taken(self, quantity: Quantity) -> tuple[Topic, np.ndarray, np.ndarray] | None:
+        """Topic, times (s) and numbers (k, n) of a quantity, scaled; None if it is not there."""
+        one = self.topic(quantity)
+        if one is None:
+            return None
+        column = self.columns[one.topic]
+        t, told = self.clock.times(column)
+        self.notes.extend(note for note in told if note not in self.notes)
+        x = column.x[FORMS[column.type].gives[quantity]]
+        if quantity in ("pwm", "forces") and one.channels:
+            x = _chosen(x, one.channels, 0.0)
+        bare = quantity not in ("attitude", "state", "aiding", "parameters")
+        return one, t - one.delay, x * one.scale + one.offset if bare else x
+
+    def attitude(self) -> Series | None:
+        """q_WB."""
+        found = self.taken("attitude")
+        if found is None:
+            return None
+        one, t, q = found
+        return series(t, _attitude(q, one), one.topic, "attitude")
+
+    def position(self) -> Series | None:
+        """p_WB (m)."""
+        found = self.taken("position")
+        if found is None:
+            return None
+        one, t, p = found
+        return series(t, ned_to_enu(p) if one.world_down else p, one.topic, "position")
+
+    def velocity(self, attitude: Series) -> Series | None:
+        """Velocity of Bo in W (m/s), turned by the message's own attitude if it has one."""
+        found = self.taken("velocity")
+        if found is None:
+            return None
+        one, t, v = found
+        if one.expressed == "world":
+            v_W = ned_to_enu(v) if one.world_down else v
+        else:
+            column = self.columns[one.topic]
+            own = FORMS[column.type].gives.get("attitude")
+            q = None if own is None else _attitude(column.x[own], one)
+            if q is None or not np.isfinite(q).all():
+                q = slerp(t, attitude.t, attitude.x)
+            v_W = rotations(q).apply((frd_to_flu(v) if one.body_down else v).T).T
+        return series(t, v_W, one.topic, "velocity")
+
+    def rates(self, attitude: Series) -> Series | None:
+        """ω of B in W, in B (rad/s); the source begins with IMU if it is a bare gyro."""
+        found = self.taken("rates")
+        if found is None:
+            return None
+        one, t, w = found
+        if one.expressed == "world":
+            w_W = ned_to_enu(w) if one.world_down else w
+            w = rotations(slerp(t, attitude.t, attitude.x)).inv().apply(w_W.T).T
+        elif one.body_down:
+            w = frd_to_flu(w)
+        gyro = self.columns[one.topic].type.endswith("/Imu") and "attitude" not in one.gives
+        return series(t, w, f"IMU {one.topic}" if gyro else one.topic, "rate")
+
+    def acceleration(self) -> Series | None:
+        """Specific force in B (m/s²)."""
+        found = self.taken("acceleration")
+        if found is None:
+            return None
+        one, t, a = found
+        return series(t, frd_to_flu(a) if one.body_down else a, one.topic, "specific force")
+
+    def wrench(self) -> Series | None:
+        """F_Bo_B (N, N·m), as commanded."""
+        found = self.taken("wrench")
+        if found is None or found[2].shape[0] != 6:
+            return None
+        one, t, F = found
+        return series(t, twist_frd_to_flu(F) if one.body_down else F, one.topic, "force")
+
+    def scalar(self, quantity: Quantity, limits: str, sign: float = 1.0) -> Series | None:
+        """A single number over time."""
+        found = self.taken(quantity)
+        if found is None:
+            return None
+        one, t, x = found
+        return series(t, sign * x[0], one.topic, limits)
+
+
+def _chosen(x: np.ndarray, channels: tuple[int, ...], absent: float) -> np.ndarray:
+    """Rows of the numbered elements; `absent` for 0 and for elements that are not there."""
+    there = [x[c - 1] if 0 < c <= x.shape[0] else np.full(x.shape[1], absent) for c in channels]
+    return np.stack(there)
+
+
+def _attitude(q: Float[np.ndarray, "4 n"], topic: Topic) -> Float[np.ndarray, "4 n"]:
+    """q_WB from a quaternion between the topic's axes; NaN where it is none."""
+    norm = np.linalg.norm(q, axis=0)
+    known = np.isfinite(norm) & (np.abs(norm - 1) < 0.1)
+    R = rotations(np.where(known, q, np.array([[1.0], [0.0], [0.0], [0.0]])))
+    R = (_NED if topic.world_down else Rotation.identity()) * R
+    R = R * (_FRD if topic.body_down else Rotation.identity())
+    return np.where(known, R.as_quat(scalar_first=True).T, np.nan)
+
+
+def derivative(one: Series) -> Series:
+    """Central differences of a series, over at least ±50 ms and one of its steps."""
+    t, half = _middles(one)
+    x = (linear(t + half, one.t, one.x) - linear(t - half, one.t, one.x)) / (2 * half)
+    return Series(t, x, f"{one.source}, differentiated")
+
+
+def turning(attitude: Series) -> Series:
+    """ω in B by central differences of the attitude: R(t + h) = R(t − h) exp(2 h ω)."""
+    t, half = _middles(attitude)
+    before, after = (
+        rotations(slerp(t + side * half, attitude.t, attitude.x)) for side in (-1.0, 1.0)
+    )
+    turned = (before.inv() * after).as_rotvec().T
+    return Series(t, turned / (2 * half), f"{attitude.source}, differentiated")
+
+
+def _middles(one: Series) -> tuple[np.ndarray, float]:
+    half = max(_HALF_WIDTH_S, float(np.median(np.diff(one.t))))
+    inside = one.t[(one.t >= one.t[0] + half) & (one.t <= one.t[-1] - half)]
+    return (inside, half) if inside.size > 1 else (one.t, half)

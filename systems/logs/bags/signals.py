@@ -1,0 +1,320 @@
+"""From the topics of a bag to signals, which then go the way of every log."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ....models.config.errors import UserError
+from ....models.recordings.checks.finding import Finding
+from ....models.vehicles.vehicle import load_vehicle
+from ...mavlink import codec
+from ..depth import in_water
+from ..log_bytes import Progress, no_progress
+from ..signals import (
+    Parameter,
+    Series,
+    Signals,
+    Spans,
+    parameters_of,
+    sampled_spans,
+    series,
+    undelayed,
+)
+from ..signals_tlog import UNAIDED
+from ..streams import missing_states
+from ..wiring import PRESETS, Wiring, direction_findings, thruster_outputs, wiring
+from .bag import Bag, Column, open_bag
+from .clocks import Clock
+from .messages import COMMANDS, PRESSURE, SAMPLED, Quantity
+from .propose import listed, propose
+from .quantities import Quantities, derivative, turning
+from .topics import Topic, TopicMap, beside, load_map
+
+_MOVES_US = 20.0
+_HOW = "name one in a topic map (`spinndrift import BAG --topics`)"
+
+
+def read_bag(
+    path: Path,
+    topics: Path | None = None,
+    vehicle: str | None = None,
+    density: float | None = None,
+    progress: Progress = no_progress,
+) -> Signals:
+    """Read a bag by a topic map: `topics`, the one beside the bag, or else the proposed one.
+
+    `vehicle` and `density` are those of `import_log`.
+
+    Raises:
+        UserError: the bag or the map can't be read, or attitude or commands are not in the bag.
+    """
+    with open_bag(path) as bag:
+        topics = topics or beside(path)
+        given = None if topics is None else load_map(topics, bag)
+        told = [] if topics is None else [f"Topics by {topics.name}."]
+        try:
+            used = propose(bag) if given is None else given
+            columns = bag.read([one.topic for one in used.topics], progress)
+            found = _signals(bag, used, columns, vehicle, density)
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from error
+        return replace(found, notes=(*bag.notes, *told, *found.notes))
+
+
+def _signals(
+    bag: Bag,
+    used: TopicMap,
+    columns: Mapping[str, Column],
+    vehicle: str | None,
+    density: float | None,
+) -> Signals:
+    reference = used.of("attitude")
+    if reference is None or reference.topic not in columns:
+        raise UserError(f"no topic tells the attitude ({listed(bag)}); {_HOW}")
+    taken = Quantities(columns, used, Clock(columns[reference.topic]))
+    attitude = taken.attitude()
+    if attitude is None or not np.isfinite(attitude.x).all():
+        raise UserError(
+            f"{reference.topic}: its quaternions are not of unit length; take the attitude from "
+            "another topic (`--topics`)"
+        )
+    first, last = float(attitude.t[0]), float(attitude.t[-1])
+    parameters, strange = _parameters(taken)
+    known = {p.name: p.value for p in parameters}
+    outputs, command, wired, wire_notes = _outputs(bag, taken, parameters, (first, last), vehicle)
+    autopilot = taken.topic("parameters")
+    position, velocity, motion_notes = _motion(taken, attitude)
+    rates = taken.rates(attitude)
+    if rates is None:
+        rates = turning(attitude)
+        motion_notes.append(f"{attitude.source}: body rates are differences of the attitude.")
+    force = taken.acceleration()
+    delays: list[str] = []
+    if _same(autopilot, taken.topic("rates")):
+        rates, delays = undelayed(rates, known, "INS_GYRO_FILTER")
+    if force is not None and _same(autopilot, taken.topic("acceleration")):
+        force, delay = undelayed(force, known, "INS_ACCEL_FILTER")
+        delays += delay
+    if _same(autopilot, taken.topic("position")):
+        position, velocity = in_water(position, velocity, known, density)
+    spans = {"wiring": wired.spans, **_states(taken), **_aiding(taken, velocity)}
+    voltage = _voltage(taken)
+    batteries = [one.topic for one in (taken.topic("voltage"),) if one is not None]
+    findings = [*missing_states(spans, voltage, batteries, "mavros_msgs/State"), *_broken(columns)]
+    return Signals(
+        attitude=attitude,
+        rates=rates,
+        outputs=outputs,
+        command=command,
+        held=columns[outputs.source].type not in SAMPLED,
+        vehicle=wired.vehicle,
+        position=position,
+        velocity=velocity,
+        specific_force=force,
+        pressure_depth=_pressure_depth(taken, known, density),
+        voltage=voltage,
+        rc=_rc(taken),
+        spans=spans,
+        notes=(*taken.notes, *strange, *wire_notes, *motion_notes, *delays),
+        findings=(*findings, *direction_findings(wired)),
+        turned=wired.turned,
+    )
+
+
+def _same(one: Topic | None, other: Topic | None) -> bool:
+    """Whether two topics are of one node, so that its parameters hold for both."""
+    spaces = [None if t is None else t.topic.strip("/").split("/")[0] for t in (one, other)]
+    return spaces[0] is not None and spaces[0] == spaces[1]
+
+
+def _parameters(taken: Quantities) -> tuple[list[Parameter], list[str]]:
+    found = taken.taken("parameters")
+    if found is None:
+        return [], []
+    one, t, values = found
+    names = [name.encode("ascii", "replace") for name in taken.columns[one.topic].text]
+    return parameters_of(t, np.array(names, object), values[0])
+
+
+def _outputs(
+    bag: Bag,
+    taken: Quantities,
+    parameters: Sequence[Parameter],
+    span: tuple[float, float],
+    vehicle: str | None,
+) -> tuple[Series, str, Wiring, list[str]]:
+    """What drives the thrusters, its name in a recording, and the vehicle's thrusters."""
+    quantity: Quantity | None = next((q for q in COMMANDS if taken.topic(q) is not None), None)
+    found = None if quantity is None else taken.taken(quantity)
+    if quantity is None or found is None:
+        raise UserError(
+            f"no topic tells what the thrusters did ({listed(bag)}); record mavros_msgs/RCOut or "
+            f"the commands of the thrusters, or {_HOW}"
+        )
+    one, t, x = found
+    if quantity == "wrench":
+        wired = wiring(parameters, *span, vehicle)
+        return _there(taken.wrench(), one), "F_Bo_B", wired, []
+    if quantity == "forces":
+        wired = wiring(parameters, *span, vehicle or _by_count(one, x.shape[0]))
+        count = len(load_vehicle(wired.vehicle).propulsion.mounts)
+        if count != x.shape[0]:
+            raise UserError(
+                f"{one.topic}: {x.shape[0]} forces, and {wired.vehicle} has {count} thrusters; "
+                "name the vehicle (--vehicle), or `channels` in the topic map"
+            )
+        signs = np.array(one.directions or (1,) * count)
+        x = x * signs[:count, None] if signs.size >= count else x
+        return _there(series(t, x, one.topic, "thrust"), one), "thruster_force", wired, []
+    bare = taken.columns[one.topic].type.startswith("std_msgs")
+    named = vehicle
+    if vehicle is None and not any(p.name == "FRAME_CONFIG" for p in parameters):
+        named = _by_count(one, x.shape[0] if bare or one.channels else _moving(x))
+    wired = wiring([*parameters, *_directions(one, span[0])], *span, named)
+    channels = np.zeros((32, t.size))
+    rows = min(x.shape[0], 32)
+    channels[:rows] = np.nan_to_num(x[:rows])
+    outputs, notes = thruster_outputs(t, channels, wired, one.topic)
+    return _there(outputs, one), "pwm", wired, [*wired.notes, *notes]
+
+
+def _there(found: Series | None, topic: Topic) -> Series:
+    if found is None:
+        raise UserError(
+            f"{topic.topic}: hardly a message of it can be used as a command of the thrusters; "
+            "record it while the vehicle moves, or take another topic (`--topics`)"
+        )
+    return found
+
+
+def _directions(topic: Topic, t: float) -> list[Parameter]:
+    return [Parameter(t, f"MOT_{n}_DIRECTION", float(d)) for n, d in enumerate(topic.directions, 1)]
+
+
+def _moving(pwm: np.ndarray) -> int:
+    """Thrusters that outputs drive: six if 7 and 8 stand still while the others move."""
+    moves = [bool(np.ptp(x[x > 0]) > _MOVES_US) if (x > 0).any() else False for x in pwm[:8]]
+    return 6 if all(moves[:6]) and len(moves) >= 6 and not any(moves[6:]) else 8
+
+
+def _by_count(topic: Topic, count: int) -> str:
+    """The preset with so many thrusters.
+
+    Raises:
+        UserError: there is none.
+    """
+    if count not in PRESETS:
+        raise UserError(
+            f"{topic.topic}: drives {count} thrusters, and no preset has as many; name the vehicle "
+            "(--vehicle), or the thrusters' `channels` in the topic map"
+        )
+    return PRESETS[count]
+
+
+def _motion(taken: Quantities, attitude: Series) -> tuple[Series | None, Series | None, list[str]]:
+    """Position and velocity in W; what one of them lacks is derived from the other topics."""
+    position, velocity = taken.position(), taken.velocity(attitude)
+    if position is not None and velocity is not None:
+        return position, velocity, []
+    if position is not None:
+        said = f"{position.source}: velocities are differences of the positions."
+        return position, derivative(position), [said]
+    z = taken.scalar("height", "position")
+    if z is None:
+        depth = _pressure_depth(taken, {}, None)
+        z = None if depth is None else replace(depth, x=-depth.x)
+    if velocity is not None:
+        told = [] if z is None else [f"{velocity.source}: the height is that of {z.source}."]
+        height = np.full(velocity.t.size, np.nan) if z is None else _within(velocity.t, z)
+        lacking = np.full(velocity.t.size, np.nan)
+        p = np.stack([lacking, lacking, height])
+        return Series(velocity.t, p, velocity.source), velocity, told
+    if z is None:
+        return None, None, []
+    lacking = np.full((2, z.t.size), np.nan)
+    climb = derivative(z)
+    v = np.concatenate([np.full((2, climb.t.size), np.nan), climb.x[None]])
+    return (
+        replace(z, x=np.concatenate([lacking, z.x[None]])),
+        replace(climb, x=v),
+        [f"{z.source}: climb is the difference of heights."],
+    )
+
+
+def _within(t: np.ndarray, one: Series) -> np.ndarray:
+    return np.interp(t, one.t, one.x)
+
+
+def _states(taken: Quantities) -> dict[str, Spans]:
+    found = taken.taken("state")
+    if found is None:
+        return {}
+    one, t, armed = found
+    order = np.argsort(t, kind="stable")
+    modes = taken.columns[one.topic].text
+    return {
+        "mode": sampled_spans(t[order], [modes[i] for i in order]),
+        "armed": sampled_spans(t[order], ["" if armed[0, i] else "disarmed" for i in order]),
+    }
+
+
+def _aiding(taken: Quantities, velocity: Series | None) -> dict[str, Spans]:
+    if velocity is not None and not np.isfinite(velocity.x[0]).any():
+        return {"aiding": Spans(np.array([-np.inf]), np.array([np.inf]), (UNAIDED,))}
+    found = taken.taken("aiding")
+    if found is None:
+        return {}
+    _, t, aided = found
+    order = np.argsort(t, kind="stable")
+    labels = ["" if aided[0, i] else UNAIDED for i in order]
+    return {"aiding": sampled_spans(t[order], labels)}
+
+
+def _pressure_depth(
+    taken: Quantities, known: Mapping[str, float], density: float | None
+) -> Series | None:
+    topic = taken.topic("depth")
+    found = taken.taken("depth")
+    if topic is None or found is None:
+        return None
+    if taken.columns[topic.topic].type != PRESSURE:
+        return taken.scalar("depth", "depth")
+    _, t, pascal = found
+    hPa = pascal[0] / 100.0
+    if np.nanmedian(hPa) < 500:  # not absolute
+        return None
+    names = ("BARO2_GND_PRESS", "BARO1_GND_PRESS")
+    surface = next((known[n] / 100.0 for n in names if known.get(n)), 0.0)
+    surface = surface if 800 < surface < 1200 else codec.SURFACE_PRESSURE_HPA
+    gradient = codec.pascal_per_metre(known.get("BARO_SPEC_GRAV", 1.0), density)
+    depth = codec.depth_from_pressure(hPa, surface, gradient)
+    return series(t, depth, topic.topic, "depth")
+
+
+def _voltage(taken: Quantities) -> Series | None:
+    found = taken.taken("voltage")
+    if found is None:
+        return None
+    one, t, x = found
+    known = x[0] > 0
+    return series(t[known], x[0, known], one.topic, "voltage")
+
+
+def _rc(taken: Quantities) -> Series | None:
+    found = taken.taken("rc")
+    return None if found is None else series(found[1], found[2], found[0].topic, "channel")
+
+
+def _broken(columns: Mapping[str, Column]) -> list[Finding]:
+    return [
+        Finding(
+            "messages-unreadable",
+            topic,
+            f"{one.broken} of its messages can't be read and were left out",
+            "copy the bag again",
+        )
+        for topic, one in columns.items()
+        if one.broken
+    ]

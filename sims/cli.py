@@ -12,10 +12,10 @@ from ..models.files.interrupts import interrupts_held
 _DESCRIPTION = """Learned stochastic dynamics and control for underwater vehicles.
 
 The usual order: `import` a log (or `generate` one), `train` a model on it, `evaluate` the model on
-data it has not seen, `run` a mission with it. `diagnose` names what a simulation gets wrong,
-`check` measures diagnoses and the estimator where the answer is known, `study` compares the methods
-of training on simulated data, `vehicle` serves a simulated vehicle to ground stations, `demo` goes
-the whole way from a log that comes along to a dive.
+data it has not seen, `run` a mission with it. `collect` flies maneuvers for data, `diagnose` names
+what a simulation gets wrong, `check` measures diagnoses and the estimator where the answer is
+known, `study` compares the methods of training on simulated data, `vehicle` serves a simulated
+vehicle to ground stations, `demo` goes the whole way from a log that comes along to a dive.
 `spinndrift COMMAND --help` explains each."""
 
 
@@ -75,6 +75,7 @@ def _parsed(given: list[str]) -> _Command:
     import tyro
 
     from .commands.check import Check
+    from .commands.collect import Collect
     from .commands.demo import Demo
     from .commands.diagnose import Diagnose
     from .commands.evaluate import Evaluate
@@ -92,6 +93,7 @@ def _parsed(given: list[str]) -> _Command:
         "train": Train,
         "evaluate": Evaluate,
         "run": Run,
+        "collect": Collect,
         "diagnose": Diagnose,
         "check": Check,
         "study": Study,

@@ -45,8 +45,8 @@ TINY = TrainingConfig(
 
 
 COMMANDS = (
-    "import", "generate", "train", "evaluate", "run", "diagnose", "check", "study", "vehicle",
-    "demo",
+    "import", "generate", "train", "evaluate", "run", "collect", "diagnose", "check", "study",
+    "vehicle", "demo",
 )  # fmt: skip
 GENERATED = (
     "--maneuvers", "surge-forward", "yaw-left", "--disturbances", "calm", "--trajectories", "3",

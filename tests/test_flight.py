@@ -6,17 +6,25 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from spinndrift.models.config.errors import UserError
+from spinndrift.models.files.owned import run_folder
+from spinndrift.models.recordings.store import Recording
+from spinndrift.sims.run import flight
+from spinndrift.sims.run.collection import COLLECTION, collect, maneuver_scenario
 from spinndrift.sims.run.dead_man import dead_man_key
 from spinndrift.sims.run.flight import fly
 from spinndrift.sims.run.folder import write_files
+from spinndrift.sims.scenarios.maneuvers import Maneuvers
 from spinndrift.sims.scenarios.scenario import Scenario, load_scenario, overridden
+from spinndrift.systems.controllers.maneuvers import Steadiness
 from spinndrift.systems.mavlink import telemetry
 from spinndrift.systems.mavlink.link import Link
 from spinndrift.systems.mavlink.parameters import Parameters
@@ -79,6 +87,44 @@ def test_a_flight_holds_its_pose_and_leaves_the_vehicle_as_it_was(port: int, tmp
         status = telemetry.status(link, time.monotonic())
         assert status is not None
         assert not status.armed
+
+
+def test_a_guard_ends_a_collection_and_voids_the_trajectory_it_was_in(
+    port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    pressed = [0.0]
+
+    @contextmanager
+    def key() -> Iterator[Callable[[], float]]:
+        yield lambda: pressed[0]
+
+    def let_go(fraction: float, words: str) -> None:
+        if "2 of 2" in words and "open loop" in words:
+            pressed[0] = 9.0
+
+    monkeypatch.setattr(flight, "dead_man_key", key)
+    settings = Maneuvers(
+        ("surge-forward",), 2, duration=2.0, steady=Steadiness(0.3, 12.0, 0.2, 0.2)
+    )
+    base = scenario(port, 1.0, ", imu_rate: 20.0")
+    assert base.vehicle_link is not None
+    safety = replace(base.vehicle_link.safety, dead_man=1.0, end="disarm")
+    link = replace(base.vehicle_link, safety=safety)
+    wanted = maneuver_scenario(replace(base, vehicle_link=link), settings)
+    with run_folder(tmp_path / "out", COLLECTION) as folder:
+        found = collect(wanted, folder, arm=True, report=False, progress=let_go)
+    assert found.outcome is not None
+    assert found.outcome.reason == "guard"
+    assert "the dead-man key was not pressed" in found.outcome.sentence
+    assert (found.added, found.there, found.wanted) == (1, 1, 2)
+    recording = Recording.load(folder / "recording.nc")
+    (run,) = recording.trajectories()
+    assert (run.scenario, run.sensors["repeat"][0]) == ("surge-forward", 1)
+    assert len(run) == 41
+    assert np.ptp(run.commands["F_Bo_B"][10:, 0]) < 1.0, "a constant wrench, after its ramp"
+    assert run.commands["F_Bo_B"][10:, 0].mean() > 20
+    assert run.V_WB_B[-1, 0] > run.V_WB_B[0, 0] + 0.2, "it moved as it was pushed"
+    assert (folder / "dive-1" / "telemetry.tlog").stat().st_size > 10_000
 
 
 def test_nothing_is_armed_without_being_asked(port: int):

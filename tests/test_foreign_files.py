@@ -13,6 +13,7 @@ from spinndrift.sims.demo import DEMO
 from spinndrift.sims.diagnosis_benchmark.run import CHECK
 from spinndrift.sims.estimator_check.run import ESTIMATOR
 from spinndrift.sims.reports.marked_page import BEGIN, END
+from spinndrift.sims.run.collection import COLLECTION
 from spinndrift.sims.run.folder import RUN
 from spinndrift.sims.study.run import STUDY
 from spinndrift.sims.vehicle.write import VEHICLE
@@ -23,6 +24,7 @@ FOLDERS = {
     "train": (("train", "missing.nc"), TRAINING),
     "resume": (("train", "missing.nc", "--resume"), TRAINING),
     "run": (("run", "pylon_crossing_calm", "--model", "missing.spinn"), RUN),
+    "collect": (("collect", "pylon_crossing_calm", "--maneuver", "missing.json"), COLLECTION),
     "diagnose": (("diagnose", "missing.nc"), DIAGNOSIS),
     "check": (("check", "diagnosis", "--cases", "missing"), CHECK),
     "estimator": (("check", "estimator", "--model", "missing.spinn"), ESTIMATOR),
@@ -42,6 +44,7 @@ IN_THEM = {
     "demo": ("training/model.spinn", "dive/log.nc", "training/a.txt", "dive/a.txt"),
     "study": ("rich/pinn/seed-0/result.json", "rich/pinn/.seed-0.partial/training/a.txt"),
     "check": ("one/judged.json", "one/a.txt"),
+    "collect": ("dive-1/log.nc", "dive-1/a.txt"),
 }
 """What may be in the way in the folders that a command makes inside its own."""
 

@@ -115,8 +115,8 @@ def test_a_message_of_unknown_form_is_passed_on():
 def test_examples_of_the_help_can_be_given(capsys):
     """Their files are in the checkout, or another example writes them."""
     lines = []
-    for command in ("import", "generate", "train", "evaluate", "run", "diagnose", "check", "study",
-                    "demo"):  # fmt: skip
+    for command in ("import", "generate", "train", "evaluate", "run", "collect", "diagnose",
+                    "check", "study", "demo"):  # fmt: skip
         with pytest.raises(SystemExit):
             cli.main([command, "--help"])
         shown = capsys.readouterr().out.split("examples:\n")[1].splitlines()

@@ -16,6 +16,7 @@ from spinndrift.models.disturbances import Combined
 from spinndrift.models.sensors import SHIPPED, Imu
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.systems.controllers.impedance import ImpedanceLaw
+from spinndrift.systems.controllers.maneuvers import ManeuverProgram, Steadiness
 from spinndrift.systems.estimation.disturbance_observer import MomentumObserver
 from spinndrift.systems.planning.mppi_config import MppiConfig
 from spinndrift.systems.planning.mppi_core import MppiPlanner
@@ -38,6 +39,9 @@ def arguments() -> dict[str, dict]:
         StationKeeping().build(StationConfig()),
         config=MppiConfig(horizon=10, sequences=20, knots=(2,)),
     )
+    law = ImpedanceLaw(np.eye(6), np.eye(6), limits)
+    start, nothing = np.eye(7)[:1], np.zeros((1, 6))
+    program = ManeuverProgram(start, np.zeros(1, int), nothing[None], nothing, 0.1, (("a", 1),))
     return {
         "LearnedPlant": {"dynamics": dynamics, "thrusters": thrusters},
         "DisturbanceSource": {"disturbance": Combined()},
@@ -46,8 +50,9 @@ def arguments() -> dict[str, dict]:
         "Mppi": {"planner": planner},
         "MppiBeside": {"planner": planner},
         "VehicleInterface": {"sensors": SHIPPED, "thrusters": 8, "health": 5},
-        "Impedance": {"law": ImpedanceLaw(np.eye(6), np.eye(6), limits), "layout": PlanLayout()},
+        "Impedance": {"law": law, "layout": PlanLayout()},
         "DisturbanceObserver": {"observer": MomentumObserver(dynamics)},
+        "ManeuverSequence": {"program": program, "law": law, "steady": Steadiness()},
         "Reference": {"path": HoldPose()},
         "PidController": {"vehicle": VEHICLE},
         "DeadReckoning": {"imu": Imu(), "X0_WB": np.eye(7)[0]},

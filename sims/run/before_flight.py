@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...models.config.errors import UserError
-from ...models.sensors import DepthSensor, Dvl
+from ...models.sensors import Dvl
 from ...systems.mavlink import telemetry
 from ...systems.mavlink.config import Mavlink
 from ...systems.mavlink.driver import Driver
@@ -127,19 +127,12 @@ def as_granted(scenario: Scenario, driver: Driver, say: Tell = lambda text: None
     late = [each.latencies[1] for each in sensing.sensors.values() if each.late]
     horizon = max([sensing.ekf.horizon, *(t + 2.5 / rate for t in late)])
     ekf, link = replace(sensing.ekf, horizon=horizon), scenario.vehicle_link
-    if not horizontal(scenario) and link is not None and link.estimate == "own":
+    if not sensing.horizontal and link is not None and link.estimate == "own":
         say("no sensor of horizontal motion: position is lost within seconds, the fence is off")
         safety = replace(link.safety, fence=(_NEVER, _NEVER))
         scenario = replace(scenario, vehicle_link=replace(link, safety=safety))
     sensing = replace(sensing, imu=imu, ekf=ekf, depth=depth)
     return replace(scenario, station=replace(scenario.station, sensing=sensing))
-
-
-def horizontal(scenario: Scenario) -> bool:
-    """Whether a sensor of the station observes horizontal motion."""
-    sensors = scenario.station.sensing.sensors.values()
-    seen = ("velocity", "position")
-    return any(s.observes in seen and not isinstance(s, DepthSensor) for s in sensors)
 
 
 def resting_noise(driver: Driver, scenario: Scenario, seconds: float = 2.0) -> dict[str, float]:

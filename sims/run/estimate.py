@@ -23,13 +23,15 @@ _CONFIDENCE = 0.95
 def estimate_error(log: RunLog) -> tuple[np.ndarray, np.ndarray] | None:
     """The filter's error δ = (δp, δθ, δv) (N, 9) and its estimated standard deviations (N, 9).
 
-    The truth is X̂ exp([δp, δθ]), v̂ + δv (`systems.estimation.error_state`).
+    The truth is X̂ exp([δp, δθ]), v̂ + δv (`systems.estimation.error_state`). Without a covariance
+    in the log the deviations are NaN.
     """
     if "X_WB_estimate" not in log:
         return None
     pose = local(log["X_WB_estimate"], log["X_WB"])
     velocity = (log["V_WB_B"] - log["V_WB_B_estimate"])[:, :3]
-    return np.concatenate([pose, velocity], axis=1), log["error_std"][:, :9]
+    error = np.concatenate([pose, velocity], axis=1)
+    return error, log["error_std"][:, :9] if "error_std" in log else np.full_like(error, np.nan)
 
 
 def local(X: Float[np.ndarray, "n 7"], Y: Float[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 6"]:

@@ -33,6 +33,7 @@ from .flight_log import Journal, collect_flight
 from .loop import Progress, Run, Timing, few_collections
 from .real_time import Clockwork, percentiles, short_turns, tick_of
 from .signals import PlanTap, log_commands, log_periods, plan_source
+from .trajectories import Keep, ManeuverTap
 
 _SHADOW = 3.0  # s in which the loop runs without commanding
 _ATTEMPTS = 3  # to get an estimate
@@ -49,6 +50,7 @@ def fly(
     record: Path | None = None,
     say: Tell = lambda text: None,
     progress: Progress = lambda fraction, remark: None,
+    keep: Keep | None = None,
 ) -> Run:
     """Fly a scenario on the vehicle of its `vehicle_link`; stops and disarms it at the end.
 
@@ -56,7 +58,7 @@ def fly(
     again, arm, fly. With `dry_run` nothing is armed, changed or commanded; all is computed and
     logged. The run's scenario has the rates that the vehicle granted; its log has the estimate in
     place of the truth. `record` is a telemetry log (.tlog) to write. `say` gets sentences on what
-    is done.
+    is done. `keep` takes in each trajectory that the controller `!Maneuvers` finishes.
 
     Raises:
         UserError: the scenario has no `vehicle_link` or no safe plan, a check of the pre-flight
@@ -88,7 +90,7 @@ def fly(
                 cockpit.dead_man = held.enter_context(dead_man_key())
             driver.prepare()
             held.enter_context(short_turns())
-            outcome = cockpit.fly(progress)
+            outcome = cockpit.fly(progress, keep)
         statistics = driver.link.statistics()
     return cockpit.flight(outcome, checks, statistics)
 
@@ -171,12 +173,12 @@ class Cockpit:
 
     # -------------------------------------------------------------------------------- the flight
 
-    def fly(self, progress: Progress) -> Outcome:
+    def fly(self, progress: Progress, keep: Keep | None = None) -> Outcome:
         """Run from the present place on until monitor, guard, clock or user end the flight."""
         self.interface.commanding = True
         self.interface.on_act = self.journal.act
         try:
-            return self._fly(self._begin(), progress)
+            return self._fly(self._begin(), progress, keep)
         finally:
             self._end_planner(wait=False)  # the vehicle is still armed
             self.interface.end()
@@ -190,12 +192,13 @@ class Cockpit:
         """Compile what the monitor computes."""
         self._monitor().check(0.0, *self.scenario.station.initial_state())
 
-    def _fly(self, clockwork: Clockwork, progress: Progress) -> Outcome:
+    def _fly(self, clockwork: Clockwork, progress: Progress, keep: Keep | None) -> Outcome:
         s, monitor = self.scenario, self._monitor()
         context = clockwork.simulator.get_mutable_context()
         own = self.station.GetMyContextFromRoot(context)
         ports = [self.station.GetOutputPort(name) for name in ("X_WB", "V_WB_B")]
         self.tap = PlanTap(self.diagram, context, s.log.samples)
+        maneuvers = ManeuverTap(s, self.diagram, context, keep, self.journal)
         self.context, self.clockwork = context, clockwork
         stride = max(1, round(1 / (s.log.rate * clockwork.tick)))
         ended: list[Outcome] = []
@@ -212,12 +215,14 @@ class Cockpit:
             if round(t / clockwork.tick) % stride == 0:
                 self.tap.read(t)
                 found = monitor.check(t, *(value(port, own) for port in ports))
+                found = found or maneuvers.read(t)
                 if found is not None:
                     ended.append(found)
                     return False
                 if round(t * s.log.rate) % round(s.log.rate) == 0:
-                    done = max(monitor.progress, t / s.duration)
-                    progress(done, f"{t:.0f} s, {self.journal.words()}")
+                    done = maneuvers.done if maneuvers.names else t / s.duration
+                    told = f"{t:.0f} s, {self.journal.words()} {maneuvers.words()}"
+                    progress(max(monitor.progress, done), told)
             return True
 
         limit = s.duration + s.vehicle_link.safety.hold if s.vehicle_link else s.duration

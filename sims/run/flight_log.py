@@ -93,6 +93,30 @@ class Journal:
             "longest_silence_s": max(silences, default=None),
         }
 
+    def steps(self, grid: Float[np.ndarray, " n"], dt: float) -> dict[str, np.ndarray]:
+        """What was sent in the step that begins at each time of the grid: its mean.
+
+        With the voltage and the outputs that the vehicle showed at the step's begin.
+        """
+        first = next((i for i, e in enumerate(self.entries) if e.t > grid[0] - 1.0), 0)
+        entries = self.entries[first:]
+        times = np.array([entry.t for entry in entries])
+        index = np.clip(np.searchsorted(times, grid + 1e-6, side="right") - 1, 0, None)
+        ahead = times - grid[0]
+        sent = {
+            "F_Bo_B": np.stack([entry.F_Bo_B for entry in entries]),
+            "pwm": np.stack([entry.expected for entry in entries]),
+        }
+        inside = (ahead > -1e-6) & (ahead < grid[-1] - grid[0] + dt - 1e-6)
+        found = {
+            name: mean_over(Signal(ahead[inside], v[inside]), grid - grid[0], dt)
+            for name, v in sent.items()
+        }
+        volts = np.array([entry.voltage for entry in entries])[index]
+        if np.isfinite(volts).all():
+            found["voltage"] = volts
+        return found | {"pwm_shown": np.stack([entry.shown for entry in entries])[index]}
+
     def at(self, grid: Float[np.ndarray, " n"]) -> dict[str, np.ndarray]:
         """Variables of a log over the times of the grid."""
         times = np.array([entry.t for entry in self.entries])
@@ -126,7 +150,9 @@ def collect_flight(
         **journal.at(grid),
         "health": signals["health"].value[:n],
     }
-    if np.isfinite(signals["covariance"].value[:n]).any():
+    if "maneuver" in signals:
+        variables["maneuver"] = signals["maneuver"].value[:n]
+    if "covariance" in signals and np.isfinite(signals["covariance"].value[:n]).any():
         variables |= consistency(signals, n, scenario.station.sensing.fused)
     link = scenario.vehicle_link
     return RunLog.create(

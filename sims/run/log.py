@@ -10,6 +10,7 @@ Besides the variables of every recording (`docs/recording.md`) a run's log holds
 - `health` (2 + n), if the filter has such a port: 0 good, 1 degraded, 2 lost, then 1 where it
   trusts the imu and each fused sensor;
 - `X_WB_plan`, `V_WB_B_plan`: the plan at that time; `plan_valid`: 1 where there was one;
+- `maneuver` (5), of the controller `!Maneuvers`: its port (`systems.controllers.maneuvers`);
 - `F_disturbance_Bo_B` (N, N·m), `flow_W` (velocity m/s, acceleration m/s²): disturbances and flow;
 
 and for every plan (dim `plan`): `plan_time` (s), `plan_X_WB`, and with a sampling planner also

@@ -23,6 +23,7 @@ from ..scenarios.criteria import FollowPath, Monitor, Outcome
 from ..scenarios.scenario import Scenario
 from .log import RunLog
 from .signals import PlanTap, collect, log_commands, log_periods, plan_source
+from .trajectories import Keep, ManeuverTap
 from .way import check_free, find_passage, holding, no_safe_plan
 
 Progress = Callable[[float, str], None]
@@ -80,7 +81,12 @@ class Run(NamedTuple):
     """Name, result and words of each check of its pre-flight."""
 
 
-def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engine = "auto") -> Run:
+def simulate(
+    scenario: Scenario,
+    progress: Progress | None = None,
+    engine: Engine = "auto",
+    keep: Keep | None = None,
+) -> Run:
     """Simulate a scenario to its end. The same scenario gives the same log, bit for bit.
 
     Drake steps the diagram, or one compiled loop does (`systems.compiled.simulator`), which is
@@ -91,7 +97,8 @@ def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engin
     is returned. A second Ctrl-C, or one before the first step, interrupts at once.
 
     If no path to the goal satisfies the allowed risk, a planner holds the vehicle's start pose, and
-    the outcome is `no safe plan`.
+    the outcome is `no safe plan`. `keep` takes in each trajectory that the controller `!Maneuvers`
+    finishes.
 
     Raises:
         UserError: start or goal are in an obstacle, the scenario names what can't be read, its
@@ -103,7 +110,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None, engine: Engin
         >>> simulate(scenario).outcome.reason
         'duration'
     """
-    return next(simulate_seeds(scenario, [scenario.seed], progress, engine))
+    return next(simulate_seeds(scenario, [scenario.seed], progress, engine, keep))
 
 
 def simulate_seeds(
@@ -111,6 +118,7 @@ def simulate_seeds(
     seeds: Iterable[int],
     progress: Progress | None = None,
     engine: Engine = "auto",
+    keep: Keep | None = None,
 ) -> Iterator[Run]:
     """Simulate a scenario with one seed after the other, as `simulate`, with one diagram for all.
 
@@ -140,7 +148,7 @@ def simulate_seeds(
             simulator = _simulator(diagram, scenario, engine)
         else:
             simulator.reset_context(diagram.CreateDefaultContext())
-        run = _one(diagram, simulator, scenario.with_changes(seed=seed), warm, tell, passage)
+        run = _one(diagram, simulator, scenario.with_changes(seed=seed), warm, tell, passage, keep)
         yield run
         if run.outcome.reason == "interrupted":
             return
@@ -184,6 +192,7 @@ def _one(
     warm: bool,
     tell: Progress,
     passage: Passage | None,
+    keep: Keep | None,
 ) -> Run:
     """Simulate a diagram once, in a new context; `warm` says that its programs are compiled."""
     context = simulator.get_mutable_context()
@@ -192,6 +201,7 @@ def _one(
     obstacles = scenario.station.obstacles
     monitor = Monitor(vehicle, obstacles, scenario.success, scenario.goal, scenario.safety)
     tap = PlanTap(diagram, context, scenario.log.samples)
+    maneuvers = ManeuverTap(scenario, diagram, context, keep)
     timing = Timing(dt=1 / scenario.log.rate)
     started = time.perf_counter()
     with _ticking(tell, "compiling"):
@@ -202,7 +212,7 @@ def _one(
             _warm_up(diagram, min(scenario.duration, _WARM_UP))
     timing.compilation = time.perf_counter() - started
     with interrupt_noted() as stopped, few_collections():
-        outcome = _fly(scenario, diagram, simulator, monitor, tap, timing, tell, stopped)
+        outcome = _fly(scenario, diagram, simulator, monitor, tap, maneuvers, timing, tell, stopped)
     if passage is not None and not passage.safe and outcome.reason in ("duration", "no progress"):
         outcome = Outcome("no safe plan", outcome.time, no_safe_plan(scenario, passage))
     log = collect(scenario, logged(diagram, context), tap, outcome.time, passage)
@@ -233,6 +243,7 @@ def _fly(
     simulator: Simulator | CompiledSimulator,
     monitor: Monitor,
     tap: PlanTap,
+    maneuvers: ManeuverTap,
     timing: Timing,
     tell: Progress,
     stopped: threading.Event,
@@ -269,11 +280,13 @@ def _fly(
                 outcome = outcome or monitor.check(round(n * dt, 9), *(v[:, n] for v in seen))
             k += stride
             t = round(k * dt, 9)
+            outcome = outcome or maneuvers.read(t)
             if outcome is None and k >= steps:
                 outcome = Outcome("duration", t, f"The time limit of {t:.1f} s was reached.")
             elif outcome is None and k // 5 > (k - stride) // 5:
-                done = max(done, k / steps, monitor.progress)
-                tell(done, f"{t:.0f} s, {timing.speed(200):.1f} × real time")
+                done = max(done, maneuvers.done, monitor.progress)
+                done = done if maneuvers.names else max(done, k / steps)
+                tell(done, f"{t:.0f} s, {timing.speed(200):.1f} × real time {maneuvers.words()}")
             if outcome is None and stopped.is_set():
                 outcome = Outcome("interrupted", t, f"The run was interrupted after {t:.1f} s.")
         # complete the row of the last sample with the updates at its time

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from ...models.vehicles.vehicle import Vehicle
 from ...systems.planning.mppi import FIGURES
 from ...systems.planning.obstacles import BoxHull, Cylinders, Pylon
-from ..scenarios.criteria import FollowPath, Outcome, ReachGoal
+from ..scenarios.criteria import Finish, FollowPath, Outcome, ReachGoal, Success
 from .estimate import (
     BLOCKS,
     HEALTH,
@@ -31,7 +31,7 @@ _PWM = (1100.0, 1900.0)
 def metrics(
     log: RunLog,
     outcome: Outcome,
-    success: ReachGoal | FollowPath,
+    success: Success,
     vehicle: Vehicle,
     obstacles: tuple[Pylon, ...] = (),
     goal: Float[np.ndarray, "3"] | None = None,
@@ -48,9 +48,7 @@ def metrics(
     return _plain({"outcome": told, **values})
 
 
-def verdict(
-    outcome: Outcome, success: ReachGoal | FollowPath, values: dict[str, Any]
-) -> tuple[bool, str]:
+def verdict(outcome: Outcome, success: Success, values: dict[str, Any]) -> tuple[bool, str]:
     """Whether the run succeeded, and the sentence that says so."""
     if isinstance(success, ReachGoal):
         words = outcome.sentence
@@ -58,6 +56,8 @@ def verdict(
             left = values["path"]["final_distance_m"]
             words = f"The time limit was reached {left:.2f} m from the goal."
         return outcome.reason == "goal", words
+    if isinstance(success, Finish):
+        return outcome.reason == "finished", outcome.sentence
     if outcome.reason != "duration":
         return False, outcome.sentence
     rms = values["tracking"]["position_rms_m"]
@@ -122,7 +122,7 @@ def _path(log, outcome, success, vehicle, obstacles, goal) -> dict[str, Any]:
     return found
 
 
-def _tracking(log: RunLog, success: ReachGoal | FollowPath) -> dict[str, Any]:
+def _tracking(log: RunLog, success: Success) -> dict[str, Any]:
     error = tracking_error(log)
     if error is None:
         return {"position_rms_m": None}

@@ -17,6 +17,7 @@ from ...systems.estimation.error_state import POSITION, ROTATION, VELOCITY
 from ...systems.estimation.state import status_names
 from ...systems.planning.passage import Passage
 from ...systems.planning.plan import PlanLayout
+from ..scenarios.maneuvers import Maneuvers
 from ..scenarios.scenario import Scenario
 from .log import Plans, RunLog
 
@@ -39,12 +40,17 @@ _RATED = (
     "V_WB_B_cheat",
     "F_disturbance_cheat",
     "flow_cheat",
+    "maneuver",
 )
+_OF_FILTER = ("covariance", "status")
 
 
 def log_periods(scenario: Scenario) -> dict[str, float]:
     """Logging period of each port of station and controller (s)."""
-    return dict.fromkeys(_RATED, 1 / scenario.log.rate)
+    ends = isinstance(scenario.controller, Maneuvers)  # then the commands of a step are logged too
+    names = {*_RATED, *(("pwm",) if ends else ())}
+    names -= set(() if scenario.log.covariance else _OF_FILTER)
+    return dict.fromkeys(sorted(names), 1 / scenario.log.rate)
 
 
 def log_commands(scenario: Scenario) -> Callable[[DiagramBuilder, System, System], None]:
@@ -174,12 +180,14 @@ def collect(
         "pwm": signals["pwm_acting"].value[:n],
         "X_WB_estimate": signals["X_WB"].value[:n],
         "V_WB_B_estimate": signals["V_WB_B"].value[:n],
-        **consistency(signals, n, fused),
         "F_disturbance_Bo_B": signals["F_disturbance_cheat"].value[:n],
         "flow_W": signals["flow_cheat"].value[:n],
     }
-    if "health" in signals:
-        variables["health"] = signals["health"].value[:n]
+    if "covariance" in signals:
+        variables |= consistency(signals, n, fused)
+    for name in ("health", "maneuver"):
+        if name in signals:
+            variables[name] = signals[name].value[:n]
     return RunLog.create(
         scenario.name,
         dt,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...models.config.errors import UserError
-from ...systems.controllers.kinds import ControllerKind, MppiImpedance
+from ...systems.controllers.kinds import Controller, MppiImpedance
 from ...systems.planning.obstacles import Pylon
 from ...systems.planning.passage import Passage, upright_gap, widest_way
 from ...systems.planning.paths import PoseConfig
@@ -55,7 +55,7 @@ def find_passage(scenario: Scenario) -> Passage | None:
     return Passage(float(widest), std, allowed)
 
 
-def holding(scenario: Scenario) -> ControllerKind:
+def holding(scenario: Scenario) -> Controller:
     """The scenario's controller; a planner gets the task to hold the start pose."""
     controller = scenario.controller
     if not isinstance(controller, MppiImpedance):

@@ -20,7 +20,7 @@ from ...systems.planning.obstacles import BoxHull, Cylinders, Pylon
 
 Reason = Literal[
     "goal", "collision", "spinning", "near goal", "no progress", "not finite", "duration",
-    "interrupted", "no safe plan", "guard",
+    "interrupted", "no safe plan", "guard", "finished",
 ]  # fmt: skip
 
 
@@ -80,6 +80,15 @@ class FollowPath:
 
 
 @dataclass(frozen=True)
+class Finish:
+    """Success is that a controller with an end, `!Maneuvers`, comes to it."""
+
+
+Success = ReachGoal | FollowPath | Finish
+"""The kinds that a scenario can name by a tag."""
+
+
+@dataclass(frozen=True)
 class Safety:
     """Limits that end any run.
 
@@ -105,7 +114,7 @@ class Monitor:
         self,
         vehicle: Vehicle,
         obstacles: tuple[Pylon, ...],
-        success: ReachGoal | FollowPath,
+        success: Success,
         goal: Float[np.ndarray, "3"] | None,
         safety: Safety | None = None,
     ):

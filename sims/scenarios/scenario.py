@@ -16,7 +16,8 @@ from ...systems.mavlink.config import Mavlink
 from ...systems.own import OwnSystem
 from ...systems.station.config import StationConfig
 from ..vehicle.config import VehicleServer
-from .criteria import FollowPath, ReachGoal, Safety
+from .criteria import Finish, ReachGoal, Safety, Success
+from .maneuvers import Maneuvers
 
 _FOLDER = Path(__file__).parent
 _TEXT = "--scenario-text"
@@ -29,10 +30,12 @@ class LogSettings:
     Attributes:
         rate: samples per second; its period is a multiple of the station's.
         samples: keep the planner's samples, for figures (a few MB per minute).
+        covariance: keep the filter's covariance and innovations (3 MB per minute).
     """
 
     rate: float = 20.0
     samples: bool = True
+    covariance: bool = True
 
     def __post_init__(self) -> None:
         """Check numbers."""
@@ -63,8 +66,8 @@ class Scenario:
     """
 
     name: str
-    controller: ControllerKind
-    success: ReachGoal | FollowPath
+    controller: ControllerKind | Maneuvers
+    success: Success
     description: str = ""
     duration: float = 60.0
     station: StationConfig = field(default_factory=StationConfig)
@@ -90,6 +93,20 @@ class Scenario:
         )
         if isinstance(self.success, ReachGoal) and self.goal is None:
             raise UserError("Scenario.success: ReachGoal needs `goal`: [x, y, z] in m")
+        ends = isinstance(self.controller, Maneuvers)
+        require(
+            ends == isinstance(self.success, Finish),
+            self,
+            "success",
+            "give !Finish {} with the controller !Maneuvers, and with no other",
+        )
+        if isinstance(self.controller, Maneuvers):
+            require(
+                self.controller.rate == self.log.rate,
+                self.log,
+                "rate",
+                f"give {self.controller.rate:g}, the rate of the controller's commands",
+            )
 
     @property
     def seed(self) -> int:

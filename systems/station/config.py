@@ -85,6 +85,13 @@ class Sensing:
         return tuple(n for n, each in self.sensors.items() if each.observes is not None)
 
     @property
+    def horizontal(self) -> bool:
+        """Whether a sensor observes horizontal motion."""
+        seen = ("velocity", "position")
+        every = self.sensors.values()
+        return any(s.observes in seen and not isinstance(s, DepthSensor) for s in every)
+
+    @property
     def water_depth(self) -> float:
         """Depth of the bed as the DVL is told it (m); that of a DVL by default without one."""
         return (self.dvl or Dvl()).water_depth

@@ -32,7 +32,7 @@ from ..selection.hypotheses import Evidence
 from ..selection.model_selection import Choice, Hypothesis, parameters_of
 from .maneuver_library import MANEUVERS, simulate_maneuvers
 
-_NOTHING = 0.05
+NOTHING = 0.05
 """Nats a minute below which a maneuver counts as uninformative: standard errors 5 % smaller."""
 _MOST = 4
 """Most rivals that a cause is to be distinguished from."""
@@ -185,7 +185,7 @@ def _advice(a: Hypothesis, opponents: Sequence[Hypothesis], value: Mapping[str, 
     family = kind(a[0]).family
     names = list(dict.fromkeys(name for name, _ in opponents))
     apart = f"to distinguish it from {', '.join(names)}" if names else "to measure it better"
-    if value[best] < _NOTHING:
+    if value[best] < NOTHING:
         return f"{apart}: {_BY_ITSELF[family]}; no maneuver of the set does"
     return f"{apart}: {MANEUVERS[best].text} (expected: {value[best]:.2g} nats a minute)"
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from ....models.effects.extended import Extended
 from ....models.se3 import AXES
+from ....models.thrusters import Thrusters
 from ...data.maneuvers import largest
 from ..data.arrays import Data
 from ..filter.problem import DiagnosisProblem
@@ -141,6 +142,23 @@ MANEUVERS: dict[str, Maneuver] = {
 }  # fmt: skip
 
 
+def full_effort(thrusters: Thrusters) -> Float[np.ndarray, "6"]:
+    """The wrench about each axis alone that counts as full effort (N, N·m)."""
+    return _GENTLE * [largest(thrusters, axis) for axis in np.eye(6)]
+
+
+def heading(k: int) -> float:
+    """Heading of a maneuver's variant k (rad)."""
+    return 2 * np.pi / _HEADINGS * (k % _HEADINGS) + 0.3
+
+
+def place(name: str, k: int) -> tuple[float, float, float]:
+    """Where a maneuver's variant k begins: x and y (m), depth as a share of the usual one."""
+    if not MANEUVERS[name].apart:
+        return 0.0, 0.0, 1.0
+    return _APART * np.cos(2.4 * k), _APART * np.sin(2.4 * k), 0.3 + 0.2 * k
+
+
 def simulate_maneuvers(
     problem: DiagnosisProblem, theta: Float[np.ndarray, " p"]
 ) -> Iterator[tuple[list[str], Data]]:
@@ -156,7 +174,7 @@ def simulate_maneuvers(
     left_out = set() if own.has_voltage else {"battery"}
     left_out |= {"thrusters"} if own.command == "F_Bo_B" else set()
     every = list(itertools.product([t for t in MANEUVERS if t not in left_out], range(VARIANTS)))
-    full = _GENTLE * [largest(thrusters, axis) for axis in np.eye(6)]
+    full = full_effort(thrusters)
     alone = np.min(np.abs(thrusters.curve.limits(thrusters.nominal_voltage)), axis=0) * np.ones(n)
     for first in range(0, len(every), R):
         some = every[first : first + R]
@@ -166,12 +184,12 @@ def simulate_maneuvers(
         X[:, 0] = 1.0
         X[:, 4:] = middle[:, None]
         for r, (name, k) in enumerate(some):
-            maneuver, half = MANEUVERS[name], np.pi / _HEADINGS * (k % _HEADINGS) + 0.15
+            maneuver, half = MANEUVERS[name], heading(k) / 2
             X[:, 0, r], X[:, 3, r] = np.cos(half), np.sin(half)
-            if maneuver.apart:
-                X[:, 4, r] += _APART * np.cos(2.4 * k)
-                X[:, 5, r] += _APART * np.sin(2.4 * k)
-                X[:, 6, r] = (0.3 + 0.2 * k) * middle[2]
+            x, y, depth = place(name, k)
+            X[:, 4, r] += x
+            X[:, 5, r] += y
+            X[:, 6, r] *= depth
             share = maneuver.effort(own.times[:-1, r], k)
             if share.shape[1] == 1:
                 single[:, k % n, r] = share[:, 0] * alone[k % n]

@@ -475,10 +475,11 @@ def test_structure_without_a_name_is_found_where_it_is(tmp_path):
         ("backlash", 70013, "play", "backlash"),
         ("slew", 70004, "slew", "N/s at most"),
         ("exchange", 70005, "exchange", "take each other's command"),
+        ("steps", 70006, "steps", "in steps of"),
     ],
 )
 def test_how_thrusters_follow_is_told_with_number_and_place(tmp_path, name, seed, kind, words):
-    """One thruster of eight with play, all at a limited rate, two wired to each other's drive."""
+    """One of eight with play, all at a limited rate or in steps, two at each other's drive."""
     from spinndrift.training.diagnosis.candidates.groups import described, refined
     from spinndrift.training.diagnosis.candidates.unknowns import screened
 

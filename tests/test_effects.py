@@ -575,9 +575,15 @@ def test_a_drive_of_limited_rate_follows_as_its_differential_equation():
 
 @pytest.mark.parametrize("kind", FOLLOWERS)
 def test_what_follows_stays_where_its_command_stays(kind):
-    u = jnp.array([-3.0, 0.0, 7.0])
+    u = jnp.array([-4.0, 0.0, 8.0])  # multiples of the step
     for part in FOLLOWERS[kind](u, u, 0.1, 2.0):
         np.testing.assert_array_equal(part, u)
+
+
+def test_drives_with_few_speeds_do_the_nearest_one():
+    end, mean = FOLLOWERS["steps"](jnp.zeros(4), jnp.array([-3.2, 0.9, 1.1, 7.1]), 0.1, 2.0)
+    np.testing.assert_array_equal(end, [-4.0, 0.0, 2.0, 8.0])
+    np.testing.assert_array_equal(mean, end)
 
 
 def test_two_exchanged_thrusters_do_what_the_other_is_told():

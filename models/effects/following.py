@@ -1,4 +1,4 @@
-"""Response of drives with backlash or a rate limit to a held command, one parameter each."""
+"""Drives with backlash, a rate limit or few speeds under a held command, one parameter each."""
 
 from collections.abc import Callable
 from typing import Any
@@ -33,4 +33,13 @@ def ramped(
     return after, jnp.where(there, command + on_the_way, (before + after) / 2)
 
 
-FOLLOWERS: dict[str, Follower] = {"play": taken_up, "slew": ramped}
+def stepped(
+    before: Float[Array, "*#b"], command: Float[Array, "*#b"], held: Any, step: Any
+) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+    """Multiples of `step` (N) alone: the one nearest to the command."""
+    del held
+    after = step * jnp.round(command / step) + 0 * before
+    return after, after
+
+
+FOLLOWERS: dict[str, Follower] = {"play": taken_up, "slew": ramped, "steps": stepped}

@@ -31,9 +31,11 @@ POSE = ("cos ψ", "sin ψ", "cos 2ψ", "sin 2ψ", "φ", "θ")
 POWERS = ("|f|f", "f²", "f³")
 """Terms in a thruster's force, in units of 10 N."""
 WORLD = ("east", "north", "up")
-_SIZES = {"flow": 0.004, "place": 0.1, "depth": 0.1, "play": 0.3, "slew": 0.3, "exchange": 0.1}
+_SIZES = {
+    "flow": 0.004, "place": 0.1, "depth": 0.1, "exchange": 0.1, **dict.fromkeys(FOLLOWERS, 0.3)
+}  # fmt: skip
 _FOLLOWED = 2.0
-"""Memory duration (s) assumed for thrusters with backlash or a rate limit."""
+"""Memory duration (s) assumed for thrusters that follow their command (`FOLLOWERS`)."""
 _PUSHES = ("motion", "pose", "place", "depth", "damping")
 
 
@@ -47,8 +49,9 @@ class Unknown(Effect):
     for each; numbers s (m) and centres. `flow`: the same as a velocity of the water. `depth`: a
     force in W of (z - c) / s and its square, in three directions; numbers c and s (m). `damping`:
     a wrench on an axis of (z - c) / s times its own velocity, and times that velocity's square.
-    `play` and `slew`: one thruster or all (`thrusters`) have backlash of ± numbers[0] (N) or a
-    rate limit of numbers[0] (N/s); the weight 0 is no such effect, 1 the full one.
+    `play`, `slew` and `steps`: one thruster or all (`thrusters`) have backlash of ± numbers[0] (N),
+    a rate limit of numbers[0] (N/s), or forces in multiples of numbers[0] (N) alone; the weight 0
+    is no such effect, 1 the full one.
     `exchange`: two thrusters, by number, take a share (the weight) of each other's command.
     """
 
@@ -196,7 +199,7 @@ class Unknown(Effect):
         return 5 * self.numbers[0] if self.kind == "memory" else 0.0
 
     def initial(self, command: Float[Array, "n *batch"]) -> Float[Array, "m *batch"]:
-        """For backlash and rate limits the command itself, as the actual output is not known."""
+        """For drives that follow their command the command itself: the actual output is unknown."""
         return command if self.kind in FOLLOWERS else super().initial(command)
 
     def actuate(

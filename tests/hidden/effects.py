@@ -70,6 +70,7 @@ UNKNOWN: dict[str, type] = {
     "backlash": unknown.Backlash,
     "slew": unknown.Slew,
     "exchange": unknown.Exchange,
+    "steps": unknown.Steps,
 }
 
 

@@ -240,3 +240,29 @@ class Exchange(_Unknown):
     def drawn(cls, rng: Any, size: float) -> "Exchange":
         i, j = sorted(int(k) for k in rng.choice(8, 2, replace=False))
         return cls((i + 1, j + 1), min(size, 1.0))
+
+
+@dataclass(frozen=True)
+class Steps(_Unknown):
+    """Drives know few speeds: each does the multiple of a step that is nearest to its command."""
+
+    kind = "steps"
+    variables = tuple(f"f{k}" for k in range(1, 9))
+    step: float = 0.0
+
+    @property
+    def where(self) -> str:
+        return "thrusters"
+
+    def parameters(self) -> Parameters:
+        return {"step": value(self.step, "N")}
+
+    def neutral(self) -> bool:
+        return self.step == 0
+
+    def distort(self, u: np.ndarray, volts: np.ndarray) -> np.ndarray:
+        return self.step * np.round(u / self.step) if self.step else u.copy()
+
+    @classmethod
+    def drawn(cls, rng: Any, size: float) -> "Steps":
+        return cls(around(rng, 6.0 * size))

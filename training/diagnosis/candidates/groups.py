@@ -28,6 +28,9 @@ NODES = {
 that hang on them resonate."""
 FOLLOWED = {"play": (0.3, 0.6, 1.2, 2.4, 4.8), "slew": (8.0, 16.0, 32.0, 64.0, 128.0)}
 """Backlash (±N) and rate limits (N/s) of thrusters that are tried."""
+STEPS = tuple(float(s) for s in np.geomspace(1.0, 16.0, 37))
+"""Steps (N) of the thrust that are tried, of all thrusters: what sends or executes the commands has
+a resolution. Nodes are close, as all multiples up to the largest force have to fit."""
 _CORRELATED, _MOST_CORRELATED = 0.1, 2
 """Correlation of neighbouring innovations from which memories of other velocities are tried on an
 axis, and number of such axes at most."""
@@ -57,6 +60,7 @@ def groups(
         for where in ("thrusters", *(str(k + 1) for k in range(d.u.shape[1]))):
             for kind, numbers in FOLLOWED.items():
                 yield _of_follower(problem, kind, where, numbers)
+        yield _of_follower(problem, "steps", "thrusters", STEPS)
     z = d.X[:-1, 6][d.weight > 0]
     numbers = (float(z.mean()), float(z.std() + 1e-3))
     yield _of_state(problem, Unknown.neutral(kind="depth", acts_on="W", numbers=numbers))
@@ -129,7 +133,7 @@ def _of_exchange(problem: DiagnosisProblem) -> Group:
 def _of_follower(
     problem: DiagnosisProblem, kind: str, where: str, numbers: Sequence[float]
 ) -> Group:
-    """Backlash or rate limit of one thruster or of all, one value a node."""
+    """Backlash, rate limit or steps of one thruster or of all, one value a node."""
     model, d = problem.model, problem.data
     count, single = d.u.shape[1], where != "thrusters"
     effect = Unknown.neutral(kind=kind, acts_on=where, numbers=(numbers[0],), thrusters=count)
@@ -225,6 +229,7 @@ def _bumps(x: np.ndarray, y: np.ndarray, most: int = 16) -> tuple[float, ...]:
 
 
 _FINER = (1.4, 1.18, 1.08)
+_FINER_STEPS = (1.03, 1.015, 1.007)
 """Factors of successive refinements between nodes."""
 
 
@@ -247,7 +252,7 @@ def refined(screen: Screen, found: Matched, rng: np.random.Generator) -> Unknown
         return replace(effect, numbers=found.group.labels[found.node])
     if effect.kind in FOLLOWERS:
         (number,) = found.group.labels[found.node]
-        for spread in _FINER:
+        for spread in _FINER_STEPS if effect.kind == "steps" else _FINER:
             numbers = (number / spread, number, number * spread)
             finer = _of_follower(screen.problem, effect.kind, effect.acts_on, numbers)
             number = numbers[screen.match(finer, 0.01, rng, draws=0).node]
@@ -286,7 +291,11 @@ def described(effect: Unknown, weights: np.ndarray, problem: DiagnosisProblem) -
         single = where != "thrusters"
         variables = (f"f{where}",) if single else tuple(f"f{k + 1}" for k in range(d.u.shape[1]))
         who = f"thruster {where} following its" if single else "thrusters that follow their"
-        how = {"play": "with backlash of {:.2g} N", "slew": "by {:.2g} N/s at most"}
+        how = {
+            "play": "with backlash of {:.2g} N",
+            "slew": "by {:.2g} N/s at most",
+            "steps": "in steps of {:.2g} N",
+        }
         description = f"{who} commands {how[effect.kind].format(effect.numbers[0])}"
     elif effect.kind == "pose":
         description = f"a wrench on {where} that depends on heading, roll or pitch"

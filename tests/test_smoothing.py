@@ -1,0 +1,105 @@
+"""States that were not recorded: errors as large as claimed, under a right and a wrong model."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from spinndrift.models import se3
+from spinndrift.models.recordings.build import Trajectory
+from spinndrift.models.recordings.store import Recording
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.data.generate import GenerateConfig, generate
+from spinndrift.training.smoothing.complete import complete
+from spinndrift.training.smoothing.levels import Belief
+
+FINE, EVERY = 100.0, 5
+"""Rate of the simulation (Hz), and samples of it per sample of the recording."""
+B = 0.5
+"""Diffusion of the simulated forces (N√s); a tenth of it for moments (N·m√s)."""
+TURNED = ("surge-forward", "sway-left", "yaw-left")
+
+
+def simulated(vehicle, seed=3, duration=6.0, noise=0.05):
+    """A run that goes through maneuvers one after the other, with an accelerometer; and the truth.
+
+    Each maneuver is simulated by itself from a moving start; the force is that of the change of
+    velocity in W over 20 ms.
+    """
+    config = GenerateConfig(
+        maneuvers=TURNED,
+        trajectories=1,
+        duration=duration,
+        rate=FINE,
+        substeps=2,
+        start_spread=(0.3, 0.3, 0.1, 0.1, 0.1, 0.2),
+        seed=seed,
+        diffusion=(B,) * 3 + (B / 10,) * 3,
+    )
+    rng = np.random.default_rng(seed)
+    runs, truth = [], []
+    for run in generate(config, vehicle).trajectories():
+        X, V = run.X_WB.T, run.V_WB_B.T
+        v_W = np.asarray(se3.rotate(jnp.asarray(X), jnp.asarray(V[:3])))
+        force = np.zeros_like(v_W)
+        force[:, 1:-1] = (v_W[:, 2:] - v_W[:, :-2]) * FINE / 2
+        force[:, 0], force[:, -1] = force[:, 1], force[:, -2]
+        force[2] += 9.80665
+        force = np.asarray(se3.rotate_inverse(jnp.asarray(X), jnp.asarray(force))).T
+        force = force + rng.normal(0, noise, force.shape) + rng.normal(0, 0.05, 3)
+        part = slice(None, None, EVERY)
+        seen_X, seen_V = run.X_WB[part].copy(), run.V_WB_B[part].copy()
+        truth.append(seen_V.copy())
+        seen_V[:, 3:] += rng.normal(0, 2e-3, (len(seen_V), 3))
+        seen_X[:, 6] += rng.normal(0, 5e-3, len(seen_X))
+        seen_X[:, 4:6], seen_V[:, :3] = np.nan, np.nan
+        commands = {name: values[part] for name, values in run.commands.items()}
+        climb = v_W[2, part] + rng.normal(0, 5e-3, len(seen_X))
+        sensors = {"imu_specific_force": force[part], "vertical_velocity": climb}
+        runs.append(Trajectory(run.scenario, seen_X, seen_V, commands, sensors))
+    recording = Recording.from_trajectories(runs, EVERY / FINE, vehicle=vehicle.name)
+    return recording, np.stack(truth)
+
+
+def errors(recording, truth, found):
+    """Errors of u and v, and their mean square relative to the claimed ones."""
+    error = (found.recording.dataset["V_WB_B"].to_numpy()[:, 0] - truth)[..., :2]
+    normal = error / found.deviation[:, 0, :, 3:5]
+    return np.sqrt((error**2).mean()), (normal**2).mean()
+
+
+def test_hidden_velocities_under_the_true_model_have_the_claimed_errors():
+    true = load_vehicle("bluerov2_heavy")
+    recording, truth = simulated(true)
+    found = complete(recording, true, true.dynamics(), belief=Belief(np.full(22, 1e-3)))
+    assert found.recording.missing == {}
+    assert not found.observed[..., 3:6].any()
+    assert found.observed[..., [2, 6, 7, 8]].all()
+    size, normal = errors(recording, truth, found)
+    assert size < 0.05
+    assert 0.5 < normal < 2
+    # the diffusion that the data were simulated with, on the axes whose motion is measured
+    np.testing.assert_allclose(found.levels.white[3:], B / 10, rtol=0.25)
+
+
+def test_hidden_velocities_under_a_wrong_model_are_not_claimed_to_be_exact():
+    """Drag and mass are 1.5 times the truth's."""
+    true = load_vehicle("bluerov2_heavy")
+    recording, truth = simulated(true)
+    drag = tuple(1.5 * d for d in true.quadratic_damping)
+    wrong = replace(true, mass=1.5 * true.mass, quadratic_damping=drag).dynamics()
+    found = complete(recording, true, wrong)
+    size, normal = errors(recording, truth, found)
+    assert size < 0.05
+    assert 0.5 < normal < 2
+    # yaw's drag, from the turn at a constant command, whose velocity is measured
+    np.testing.assert_allclose(found.scales[17], -np.log(1.5), atol=0.02)
+
+
+def test_what_was_recorded_is_kept():
+    vehicle = load_vehicle("bluerov2_heavy")
+    recording, _ = simulated(vehicle)
+    found = complete(recording, vehicle, vehicle.dynamics(), rounds=1).recording.dataset
+    for name, columns in (("X_WB", [0, 1, 2, 3, 6]), ("V_WB_B", [3, 4, 5])):
+        kept, before = (d[name].to_numpy()[..., columns] for d in (found, recording.dataset))
+        np.testing.assert_array_equal(kept, before)

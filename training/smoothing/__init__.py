@@ -1,0 +1,1 @@
+"""States that were not recorded: a smoother over a model's dynamics."""

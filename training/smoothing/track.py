@@ -1,0 +1,51 @@
+"""Measurements of a recording's runs, as arrays side by side."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ...models.recordings.store import Recording
+from .states import Track
+
+_ROUND_UP = 64  # samples: runs of similar length share a compiled program
+
+
+def track_of(
+    recording: Recording, vehicle: Any
+) -> tuple[Track, list[tuple[int, int]], np.ndarray, np.ndarray, np.ndarray]:
+    """Measurements of all runs, where they stand, and what of pose and twist was recorded."""
+    data, lengths = recording.dataset, recording.lengths
+    places = [(int(j), int(k)) for j, k in np.argwhere(lengths > 0)]
+    N = -(-int(lengths.max()) // _ROUND_UP) * _ROUND_UP
+    wrench = recording.wrench(vehicle).to_numpy()
+
+    def of(name: str, size: int) -> np.ndarray:
+        """A variable, each run's last sample repeated; NaN where there is none."""
+        found = np.full((len(places), N, size), np.nan)
+        if name in data:
+            values = data[name].to_numpy()
+            values = values if values.ndim == 4 else values[..., None]
+            for i, (j, k) in enumerate(places):
+                found[i] = values[j, k, np.minimum(np.arange(N), lengths[j, k] - 1)]
+        return found
+
+    X, V, depth = of("X_WB", 7), of("V_WB_B", 6), of("pressure_depth", 1)
+    climb, force = of("vertical_velocity", 1), of("imu_specific_force", 3)
+    z = X[..., 6:]
+    X[..., 6:] = np.where(np.isfinite(z).any(axis=1, keepdims=True), z, -depth)
+    seen = np.concatenate([X[..., 4:], np.zeros((*X.shape[:2], 3)), V, climb, force], axis=-1)
+    inside = np.arange(N) < np.array([lengths[p] for p in places])[:, None]
+    known: np.ndarray = np.isfinite(seen) & inside[..., None]
+    # w of a log without u and v is the climb with them taken as zero: the climb itself is used
+    derived = known[..., 12] & ~known[..., 6:8].all(axis=-1)
+    known[..., 8] &= ~derived
+    seen = np.where(known, seen, 0.0)
+    lasts = np.concatenate([inside[:, 1:], np.zeros((len(places), 1), bool)], axis=1)
+    F = np.stack([wrench[j, k, np.minimum(np.arange(N), lengths[j, k] - 1)] for j, k in places])
+    own = np.all(np.isfinite(np.concatenate([X[..., 4:], V], axis=-1)), axis=1)
+    own[:, 5] &= ~derived.any(axis=1)
+    observed = np.repeat(own[:, None], N, axis=1)
+    filled = np.nan_to_num(X), np.nan_to_num(V)
+    track = Track(*map(jnp.asarray, (np.nan_to_num(F), seen, X[..., :4], known, lasts)))
+    return track, places, *filled, observed

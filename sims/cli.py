@@ -15,7 +15,8 @@ The usual order: `import` a log (or `generate` one), `train` a model on it, `eva
 data it has not seen, `run` a mission with it. `collect` flies maneuvers for data, `diagnose` names
 what a simulation gets wrong, `check` measures diagnoses and the estimator where the answer is
 known, `study` compares the methods of training on simulated data, `vehicle` serves a simulated
-vehicle to ground stations, `demo` goes the whole way from a log that comes along to a dive.
+vehicle to ground stations, `export` writes a run or a recording for Foxglove, `demo` goes the whole
+way from a log that comes along to a dive.
 `spinndrift COMMAND --help` explains each."""
 
 
@@ -79,6 +80,7 @@ def _parsed(given: list[str]) -> _Command:
     from .commands.demo import Demo
     from .commands.diagnose import Diagnose
     from .commands.evaluate import Evaluate
+    from .commands.export import Export
     from .commands.generate import Generate
     from .commands.import_log import Import
     from .commands.run import Run
@@ -92,6 +94,7 @@ def _parsed(given: list[str]) -> _Command:
         "generate": Generate,
         "train": Train,
         "evaluate": Evaluate,
+        "export": Export,
         "run": Run,
         "collect": Collect,
         "diagnose": Diagnose,

@@ -11,7 +11,7 @@ import pytest
 from helpers import ROOMS, ROOT, module_files
 
 PACKAGE = ROOT / "src" / "spinndrift"
-DATA_SUFFIXES = {".yaml", ".csv", ".xz", ".html", ".css"}  # as in pyproject.toml
+DATA_SUFFIXES = {".yaml", ".csv", ".xz", ".html", ".css", ".json"}  # as in pyproject.toml
 
 
 @pytest.fixture(scope="module")

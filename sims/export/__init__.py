@@ -1,0 +1,1 @@
+"""Runs and recordings as MCAP files with Foxglove's well-known messages."""

@@ -4,9 +4,10 @@ from collections.abc import Callable
 
 from ..models.config.errors import UserError
 from ..models.recordings.store import Recording
+from ..models.se3 import TWIST
 from ..training.config import TrainingConfig, WindowConfig
 from ..training.data.windows import window_places
-from ..training.diagnosis.data.arrays import unmeasured_coordinates
+from ..training.diagnosis.data.arrays import unmeasured_channels
 
 _EVALUATED_S = 4.0
 _DIAGNOSED_S = 3.0
@@ -46,10 +47,13 @@ def _evaluate(recording: Recording) -> str:
 
 
 def _diagnose(recording: Recording) -> str:
-    unmeasured = unmeasured_coordinates(recording)
+    unmeasured = unmeasured_channels(recording)
     if recording.duration < _DIAGNOSED_S:
         raise UserError(f"{recording.duration:.2g} s in all is too little; record longer")
+    velocities = [name for name in unmeasured if name in TWIST]
     dead = f"; {', '.join(unmeasured)} from the velocity" if unmeasured else ""
+    if velocities:
+        dead = f"; {', '.join(velocities)} were not measured: no causes of their own are named"
     return f"{recording.duration:.0f} s{dead}"
 
 

@@ -26,12 +26,8 @@ from spinndrift.training.diagnosis.data.checks import limits
 from spinndrift.training.diagnosis.disturbance.laws import find_laws
 from spinndrift.training.diagnosis.filter import problem as problem_module
 from spinndrift.training.diagnosis.filter.innovations import predict
-from spinndrift.training.diagnosis.filter.noise import (
-    Noise,
-    filtered,
-    make_filter,
-    process_covariance,
-)
+from spinndrift.training.diagnosis.filter.kalman import filtered, make_filter
+from spinndrift.training.diagnosis.filter.noise import Noise, process_covariance
 from spinndrift.training.diagnosis.filter.sensitivities import whitened_sensitivities
 from spinndrift.training.diagnosis.filter.transition import Transition
 from spinndrift.training.diagnosis.findings.reported import following, noise_levels, residual
@@ -580,8 +576,8 @@ def test_positions_that_were_not_measured_tell_nothing_and_ask_for_nothing(tmp_p
     assert all(np.isnan(left[name].variance_ratio) for name in "xyz")
     assert "position_m" not in noise_levels(problem, after)
     assert "x, y of the position were not measured" in limits(problem.data, [], False)[0]
-    hidden["V_WB_B"][..., 0] = np.nan
-    with pytest.raises(UserError, match="V_WB_B u is missing; a diagnosis needs"):
+    hidden["V_WB_B"][..., 3] = np.nan
+    with pytest.raises(UserError, match="V_WB_B p is missing; a diagnosis needs"):
         Diagnoser(Recording(hidden), VEHICLE)
 
 

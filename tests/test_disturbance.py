@@ -28,7 +28,8 @@ from spinndrift.training.diagnosis.disturbance.waves import (
     find_current,
     find_waves,
 )
-from spinndrift.training.diagnosis.filter.noise import estimate, score_of
+from spinndrift.training.diagnosis.filter.kalman import score_of
+from spinndrift.training.diagnosis.filter.noise import estimate
 from spinndrift.training.diagnosis.filter.transition import Transition
 from spinndrift.training.diagnosis.pipeline import Diagnoser
 from spinndrift.training.diagnosis.selection.correlated_noise import CorrelatedNoise

@@ -8,12 +8,11 @@ from hidden.simulator import Noise as Hidden
 
 from spinndrift.models.recordings.csv import read_csv
 from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.diagnosis.filter.kalman import filtered, make_filter
 from spinndrift.training.diagnosis.filter.likely_noise import fit_with_slow_noise
 from spinndrift.training.diagnosis.filter.noise import (
     Noise,
     estimate,
-    filtered,
-    make_filter,
     process_covariance,
     unit_processes,
 )

@@ -23,6 +23,7 @@ class DvlLeverArm(MeasurementEffect):
     parameters: ClassVar = (Parameter("offset", "m", (0.02,), -1.0, 1.0),)
     places: ClassVar = XYZ
     order: ClassVar[int] = 20
+    needs: ClassVar = frozenset({"velocity"})
     source: ClassVar[str] = "cm"
 
     def _lever(self, V: Array) -> Array:
@@ -44,6 +45,7 @@ class DvlMisalignment(MeasurementEffect):
     parameters: ClassVar = (Parameter("angle", "rad", (0.01,), -0.5, 0.5),)
     places: ClassVar = AXES[3:]
     order: ClassVar[int] = 30
+    needs: ClassVar = frozenset({"velocity"})
     source: ClassVar[str] = "0.1 to 5°"
 
     def twist(
@@ -60,6 +62,7 @@ class DvlScale(MeasurementEffect):
     name: ClassVar[str] = "dvl_scale"
     parameters: ClassVar = (Parameter("scale", "1", (0.01,), -0.5, 0.5),)
     order: ClassVar[int] = 40
+    needs: ClassVar = frozenset({"velocity"})
     source: ClassVar[str] = "0.1 to 1 % and worse with wrong salinity"
 
     def _factor(self, V: Array) -> Array:

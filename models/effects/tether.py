@@ -28,6 +28,7 @@ class TetherEffect(Effect):
         Parameter("arm_z", "m", (0.1,), -2.0, 2.0),
     )
     places: ClassVar = ("W",)
+    needs: ClassVar = frozenset({"velocity"})
     simpler: ClassVar = ("current_steady", "net_buoyancy")
     essential: ClassVar = ("stiffness", "pull_east", "pull_north")
     source: ClassVar[str] = "11 N for 10 m of cable broadside at 0.5 m/s"

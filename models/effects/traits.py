@@ -9,8 +9,8 @@ from ..dynamics import Dynamics
 
 Group = Literal["scales", "linear", "command", "all"]
 """Coefficients that are fitted together before causes are sought (`--refit`)."""
-Need = Literal["thrust", "pwm", "voltage"]
-"""What a recording may lack: commands of single thrusters, as pulses, the supply voltage."""
+Need = Literal["thrust", "pwm", "voltage", "velocity"]
+"""What a recording may lack: commands of single thrusters, pulses, supply voltage, velocity."""
 
 
 class Region(NamedTuple):

@@ -18,6 +18,7 @@ class CurrentSteady(Effect):
         Parameter("north", "m/s", (0.03,), -3.0, 3.0),
     )
     places: ClassVar = ("W",)
+    needs: ClassVar = frozenset({"velocity"})
     source: ClassVar[str] = "0.02 to 0.5 m/s in harbours and tanks with pumps"
 
     def flow(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "3 *#batch"]:

@@ -102,6 +102,8 @@ def horizon_figure(diagnosis: Diagnosis) -> Figure:
         for name, g in diagnosis.gain.items():
             tables = (g.position_rmse, g.rotation_rmse, g.velocity_rmse, g.energy_score)
             table = tables[number]
+            if not table:
+                continue
             h = [float(k) for k in table]
             errors[name] = np.array([v.value for v in table.values()])
             low, high = np.array([v.interval95 for v in table.values()]).T
@@ -109,9 +111,11 @@ def horizon_figure(diagnosis: Diagnosis) -> Figure:
             ax.plot(
                 h, errors[name], lines[name], ms=3.5, color=colors[name], label=CONTENDERS[name]
             )
+        ax.set_title(title if errors else f"{title.split(' / ')[0]}: not measured")
+        if not errors:
+            continue
         top = panel_top(errors)
         ax.set_ylim(0, top)
-        ax.set_title(title)
         ax.set_xlabel("horizon / s")
         beyond = [n for n, e in errors.items() if not np.all(e <= top)]
         for row, name in enumerate(beyond):

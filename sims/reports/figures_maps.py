@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from ...models.se3 import AXES
+from ...models.se3 import AXES, TWIST
 from ...training.diagnosis.data.arrays import Data
-from ...training.diagnosis.filter.noise import filtered, make_filter
+from ...training.diagnosis.filter.kalman import filtered, make_filter
 from ...training.diagnosis.filter.problem import Evaluation
 from ...training.diagnosis.filter.transition import Transition
 from ...training.diagnosis.pipeline import Finding
@@ -39,11 +39,12 @@ def in_one_noise(finding: Finding) -> Finding:
     d, evaluation, noise = finding.data, finding.base, finding.final.noise
     here = d.weight[:, None] > 0
     error = np.where(here, np.asarray(evaluation.predictions.error), 0.0)
+    latent = evaluation.predictions.latent
     jacobian = np.where(here[:, :, None], np.asarray(evaluation.predictions.jacobian), 0.0)
-    steps = Transition.along(jacobian, d.weight, evaluation.predictions.late)
+    steps = Transition.along(jacobian, d.weight, evaluation.predictions.late, latent)
     inverse = np.asarray(finding.extended.inertia().inverse)
-    kalman = make_filter(noise, steps, inverse, d.dt, d.step, jacobian)
-    z = filtered(error, jacobian, kalman) * d.weight[:, None]
+    kalman = make_filter(noise, steps, inverse, d.dt, d.step, jacobian, latent)
+    z = filtered(error, jacobian, kalman, latent) * d.weight[:, None]
     return replace(finding, base=evaluation._replace(noise=noise, kalman=kalman, z=z))
 
 
@@ -73,6 +74,9 @@ def variables(finding: Finding) -> dict[str, Float[np.ndarray, "N R"]]:
     }
     found |= {n: np.degrees(angle) for n, angle in angles.items()}
     found |= {"east": d.X[:-1, 4], "north": d.X[:-1, 5], "height": d.X[:-1, 6]}
+    if d.latent:  # velocities and places that the model has made up
+        unmeasured = {TWIST[i] for i in d.latent} | {"east", "north"}
+        found = {n: values for n, values in found.items() if n not in unmeasured}
     if d.command == "F_Bo_B":
         to_wrench = np.asarray(finding.extended.allocate(jnp.eye(d.u.shape[1])))
         wrench = np.einsum("fi,nir->fnr", to_wrench, d.u)

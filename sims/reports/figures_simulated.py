@@ -44,6 +44,18 @@ def shown(
     return np.concatenate([X[:, 4:], turned, V], axis=1) * _SCALE.reshape(12, *(1,) * (X.ndim - 2))
 
 
+def _compared(finding: Finding) -> list[int]:
+    """Channels whose simulations are compared with records."""
+    return np.flatnonzero(finding.data.compared).tolist()
+
+
+def _title(finding: Finding, i: int) -> str:
+    """A channel with its unit, or that it was not measured."""
+    if i not in _compared(finding):
+        return f"{CHANNELS[i]}: not measured"
+    return f"{CHANNELS[i]} / {_UNITS[i]}"
+
+
 def _bounded(values: np.ndarray) -> np.ndarray:
     """The values, with diverged ones replaced by ±`_LOST`."""
     return np.clip(np.nan_to_num(values, nan=_LOST, posinf=_LOST, neginf=-_LOST), -_LOST, _LOST)
@@ -51,7 +63,8 @@ def _bounded(values: np.ndarray) -> np.ndarray:
 
 def _typical(finding: Finding, simulated: Simulated) -> int:
     """The run with the median error in the scenario that the belief forecasts worst."""
-    error = _bounded((simulated.errors[:, :, 0].astype(float) ** 2).sum(axis=(0, 1)))
+    e = simulated.errors[:, _compared(finding), 0].astype(float)
+    error = _bounded((e**2).sum(axis=(0, 1)))
     scenario = finding.data.scenario[simulated.pieces]
     there = np.unique(scenario)
     worst = there[np.argmax([np.median(error[scenario == s]) for s in there])]
@@ -79,15 +92,16 @@ def bands_figure(finding: Finding) -> Figure:
         turn = found[:, 3:6] - record[:, 3:6, None]
         found[:, 3:6] = record[:, 3:6, None] + (turn + 180) % 360 - 180
         low, high = np.quantile(found, ((1 - _BAND) / 2, (1 + _BAND) / 2), axis=2)
-        for i, ax in enumerate(axes.flat):
+        for i, ax in zip(_compared(finding), axes.flat[_compared(finding)], strict=True):
             for a in range(0, n, simulated.every):  # no line from window to window
                 b = slice(a, a + simulated.every)
                 named = name if a == 0 else None
                 ax.fill_between(t[b], low[b, i], high[b, i], color=color, alpha=0.3, lw=0,
                                 label=named)  # fmt: skip
     for i, ax in enumerate(axes.flat):
-        ax.plot(t, record[:, i], color=INK, lw=1.0, label="recorded")
-        ax.set_title(f"{CHANNELS[i]} / {_UNITS[i]}")
+        if i in _compared(finding):
+            ax.plot(t, record[:, i], color=INK, lw=1.0, label="recorded")
+        ax.set_title(_title(finding, i))
         for a in range(first.every, n, first.every):
             ax.axvline(t[a], color=GRID, lw=1.2, zorder=0)
     for ax in axes[-1]:
@@ -97,7 +111,7 @@ def bands_figure(finding: Finding) -> Figure:
         "90 % bands",
         fontsize=9.5, x=0.01, ha="left",
     )  # fmt: skip
-    common_legend(figure, axes[0, 2])
+    common_legend(figure, axes.flat[_compared(finding)[0]])
     return figure
 
 
@@ -117,14 +131,14 @@ def axes_figure(finding: Finding) -> Figure:
                 .mean(axis=0)
             )
         t = dt * np.arange(1, simulated.every + 1)
-        for i, ax in enumerate(axes.flat):
+        for i, ax in zip(_compared(finding), axes.flat[_compared(finding)], strict=True):
             ax.plot(t, np.sqrt(square[:, i]), color=color, label=name)
     for i, ax in enumerate(axes.flat):
-        ax.set_title(f"{CHANNELS[i]} / {_UNITS[i]}")
+        ax.set_title(_title(finding, i))
         ax.set_ylim(bottom=0)
     for ax in axes[-1]:
         ax.set_xlabel("horizon / s")
-    common_legend(figure, axes[0, 5])
+    common_legend(figure, axes.flat[5])
     return figure
 
 
@@ -148,7 +162,8 @@ def at_ends(
         windows = np.stack([values[n + 1 - every : n + 1, simulated.pieces].mean(0) for n in ends])
         means[name] = windows[exists]
     piece = np.broadcast_to(simulated.pieces, exists.shape)[exists]
-    return _bounded(own[:, :, 0] / np.maximum(spread, 1e-12)), means, piece
+    z = own[:, :, 0] / np.maximum(spread, 1e-12) * data.compared
+    return _bounded(z), means, piece
 
 
 @styled
@@ -174,7 +189,8 @@ def runs_figure(finding: Finding) -> Figure:
         (finding.base, finding.final), MODELS.values(), strict=True
     ):
         count = np.maximum(data.weight.sum(axis=0) * data.measured.sum(), 1)
-        one = np.sqrt((evaluation.z.astype(float) ** 2).sum(axis=(0, 1)) / count)
+        z = evaluation.z[:, data.measured > 0].astype(float) if data.latent else evaluation.z
+        one = np.sqrt((z.astype(float) ** 2).sum(axis=(0, 1)) / count)
         _dots(axes[0, 0], np.arange(len(order)), one[order], name, color)
     last = contenders(finding)[-1][0]
     for simulated, name, color in contenders(finding):

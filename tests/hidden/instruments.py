@@ -4,7 +4,7 @@ import numpy as np
 
 from .effect import Signals
 from .plant import Plant
-from .rotations import exponential, product, to_world
+from .rotations import exponential, product, to_body, to_world
 
 LEAD = 0.2
 """The simulation begins so many s before the first sample, so that late signals have a past."""
@@ -88,3 +88,24 @@ def record(
         p = history[at[0], :3, np.arange(at.shape[1])].T[:, None] + path - path[:, :1] + walk
     X, V = np.concatenate([q, p]), np.concatenate([v, w])
     return np.moveaxis(X, 0, 1), np.moveaxis(V, 0, 1)
+
+
+def specific_force(history: np.ndarray, samples: np.ndarray, h: float) -> np.ndarray:
+    """What an accelerometer at Bo shows at samples (N, B): the mean over a step, (N, 3, B).
+
+    The change of the velocity in W over the step, less gravity, seen from the body at its middle.
+    """
+    half = max(int(np.median(np.diff(samples, axis=0))) // 2, 1)
+    lead, last = round(LEAD / h), len(history) - 1
+    at = samples + lead
+    before, after = np.maximum(at - half, 0), np.minimum(at + half, last)
+    run = np.arange(history.shape[2])
+
+    def state(i: np.ndarray) -> np.ndarray:
+        return np.moveaxis(history[i, :13, run], -1, 0)
+
+    first, middle, end = state(before), state(at), state(after)
+    v_W = [to_world(y[3:7], y[7:10]) for y in (first, end)]
+    a_W = (v_W[1] - v_W[0]) / ((after - before) * h)
+    a_W[2] += 9.80665
+    return np.moveaxis(to_body(middle[3:7], a_W), 0, 1)

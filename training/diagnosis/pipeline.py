@@ -161,6 +161,9 @@ class Diagnoser:
         nuisance = refitted(problem, config.refit)
         if nuisance:
             first = self._refitted(problem)
+            if problem.data.latent:  # velocities without a record follow from the coefficients
+                problem = self.problem = problem.along(first.theta)
+                base, first = self._believed(problem), self._refitted(problem, first.theta)
         start = Selection.start(problem, base, first, config.seed)
         found, nuisance, structures = find_causes(
             start, nuisance, config.refit, self._selector, self.progress
@@ -250,15 +253,18 @@ class Diagnoser:
                 "give a --vehicle or --model that is near"
             ) from error
 
-    def _refitted(self, problem: DiagnosisProblem) -> Evaluation:
-        """The believed model with the coefficients of `refit` fitted."""
+    def _refitted(
+        self, problem: DiagnosisProblem, start: Float[np.ndarray, " p"] | None = None
+    ) -> Evaluation:
+        """The believed model with the coefficients of `refit` fitted, from `start` on."""
         if self.config.refit == "all":
             remark = "all coefficients together"
             return problem.evaluate(
-                identify(problem, lambda f: self.progress(0.03 + 0.07 * f, remark))
+                identify(problem, lambda f: self.progress(0.03 + 0.07 * f, remark), start)
             )
         rows = refitted(problem, self.config.refit)
-        return problem.evaluate(problem.polish(problem.believed, rows)[0])
+        start = problem.believed if start is None else start
+        return problem.evaluate(problem.polish(start, rows)[0])
 
     def _together(
         self, found: Selection, rows: list[int]

@@ -67,7 +67,7 @@ def groups(
     for i in moving:
         yield _of_state(problem, Unknown.neutral(kind="damping", acts_on=AXES[i], numbers=numbers))
     bumps = _bumps(d.X[:-1, 4][d.weight > 0], d.X[:-1, 5][d.weight > 0])
-    if len(bumps) > 9:
+    if len(bumps) > 9 and not d.latent:
         for kind in ("place", "flow"):
             yield _of_state(problem, Unknown.neutral(kind=kind, acts_on="W", numbers=bumps))
 

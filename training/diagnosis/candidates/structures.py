@@ -89,19 +89,32 @@ def _through(
     whiten: Array,
     weight: Array,
     step: Array,
+    carried: Array | None = None,
 ) -> Float[Array, "N 12 L R"]:
     """Whitened sensitivities to accelerations d."""
 
-    def body(nu: Array, given: tuple) -> tuple[Array, Array]:
-        a, A, gap, white, exists, h = given
+    def body(state: tuple[Array, Array], given: tuple) -> tuple[tuple[Array, Array], Array]:
+        a, A, gap, white, exists, h, before = given
+        nu, passed = state
         direct = h[None, None] / 2 * jnp.concatenate([jnp.zeros_like(a), a])
-        moved = through(gap, nu) - direct
-        nu = jnp.sum(A[:, :, None] * moved[None], axis=1) - direct
-        return nu, through(white, nu) * exists[None, None]
+        kept = through(gap, nu) + passed
+        nu = jnp.sum(A[:, :, None] * (kept - direct)[None], axis=1) - direct
+        if before is not None:
+            passed = jnp.sum(before[:, :, None] * kept[None], axis=1)
+            nu = nu - passed
+        return (nu, passed), through(white, nu) * exists[None, None]
 
     zero = jnp.zeros((12, *d.shape[2:]), d.dtype)
-    xs = (d, jacobian, keep, whiten, weight, step)
-    return jax.lax.scan(body, zero, xs)[1].astype(jnp.float32)
+    xs = (d, jacobian, keep, whiten, weight, step, carried)
+    return jax.lax.scan(body, (zero, zero), xs)[1].astype(jnp.float32)
+
+
+def _carried(evaluation: Evaluation, pieces: np.ndarray) -> Array | None:
+    """`Latent.carried` of some pieces, where there is any."""
+    latent = evaluation.predictions.latent
+    if latent is None or latent.carried is None:
+        return None
+    return jnp.asarray(latent.carried[..., pieces])
 
 
 class Screen:
@@ -134,6 +147,7 @@ class Screen:
             jnp.asarray(k.whiten),
             jnp.asarray(data.weight[:, self.kept]),
             jnp.asarray(data.own_steps(self.kept)),
+            _carried(evaluation, self.kept),
         )
         z = evaluation.z[..., self.kept].reshape(len(data.u) * 12, -1)
         self.z = z[None] if free is None else np.concatenate([z[None], free[..., self.kept]])

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ....models.effects.unknown import Unknown
+from ....models.se3 import AXES
 from ..disturbance.found import best_law
 from ..filter.problem import DiagnosisProblem, Evaluation
 from ..filter.sensitivities import whitened_sensitivities
@@ -100,11 +101,13 @@ def find_structure(
     """Structure in the residual of the causes; where it wins more than they do, in place of them.
 
     In the second case the selection is back at the model without causes. None is sought in
-    estimated states, as their estimator adds structure of its own, nor in how `quiet` axes move.
+    estimated states, as their estimator adds structure of its own, nor in how `quiet` axes and
+    those without a measured velocity move.
     """
     if state.current.noise.estimated:
         return state, None
     problem, rng = state.problem, state.generator()
+    quiet = [*quiet, *(AXES[i] for i in problem.data.latent)]
     rows = [*parameters_of(problem.library, state.hypotheses), *nuisance]
     left = screened(problem, state.current, rows, alpha, rng, quiet)
     if left is None:

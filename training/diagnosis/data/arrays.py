@@ -12,7 +12,7 @@ from ....models.config.errors import UserError
 from ....models.effects.traits import Need, Region
 from ....models.recordings.kinematics import dead_reckoned
 from ....models.recordings.store import Recording
-from ....models.se3 import XYZ
+from ....models.se3 import AXES, TWIST, XYZ
 from ....models.vehicles.vehicle import Vehicle
 
 SEGMENT = 256
@@ -55,8 +55,11 @@ class Data:
         dt: mean step (s).
         command: kind of commands: thruster_force, pwm or F_Bo_B.
         has_voltage: whether the voltage was recorded.
-        unmeasured: coordinates of the position that are integrals of the velocity alone. Then no
-            error of position is used: in B the coordinates are mixed.
+        unmeasured: coordinates of the position that are integrals of the velocity alone (then no
+            error of position is used: in B the coordinates are mixed), and velocities that were not
+            recorded. These are latent: `filter.reference` fills them with a simulation.
+        specific_force: of the accelerometer (m/s²), where velocities are latent (N + 1, 3, R).
+        climb: vertical velocity in W (m/s), where w follows from it and the latent ones (N + 1, R).
     """
 
     X: Float[np.ndarray, "M 7 R"]
@@ -74,19 +77,54 @@ class Data:
     command: str
     has_voltage: bool
     unmeasured: tuple[str, ...] = ()
+    specific_force: Float[np.ndarray, "M 3 R"] | None = None
+    climb: Float[np.ndarray, "M R"] | None = None
 
     @property
     def measured(self) -> Float[np.ndarray, "12"]:
         """1 for errors (pose in B, twist) that are measured, 0 for others."""
         found = np.ones(12)
-        found[:3] = not self.unmeasured
+        found[:3] = not set(self.unmeasured) & set(XYZ)
+        found[6:] = [name not in self.unmeasured for name in TWIST]
         return found
+
+    @property
+    def latent(self) -> list[int]:
+        """Axes whose velocity was not measured, by index."""
+        return [i for i, name in enumerate(TWIST) if name in self.unmeasured]
+
+    @property
+    def felt(self) -> tuple[int, ...]:
+        """Those of them that an accelerometer tells of."""
+        if self.specific_force is None or self.measured[:3].any():
+            return ()
+        return tuple(self.latent)
+
+    @property
+    def used(self) -> Float[np.ndarray, "12"]:
+        """1 for errors that a filter uses: measured ones, and an accelerometer's in their place."""
+        found = self.measured
+        found[[6 + i for i in self.felt]] = 1.0
+        return found
+
+    @property
+    def unseen(self) -> list[str]:
+        """Axes of which no instrument tells."""
+        return [AXES[i] for i in self.latent if i not in self.felt]
+
+    @property
+    def compared(self) -> Float[np.ndarray, "12"]:
+        """1 for errors of simulations that are judged; dead-reckoned positions are, latent not."""
+        return self.measured if self.latent else np.ones(12)
 
     @property
     def offers(self) -> frozenset[Need]:
         """What of the `needs` of effects was recorded."""
         level = self.command != "F_Bo_B"
-        offered = {"voltage": self.has_voltage, "thrust": level, "pwm": self.command == "pwm"}
+        offered = {
+            "voltage": self.has_voltage, "thrust": level, "pwm": self.command == "pwm",
+            "velocity": not self.latent,
+        }  # fmt: skip
         return frozenset(need for need, there in offered.items() if there)  # pyright: ignore[reportReturnType]
 
     @property
@@ -174,12 +212,14 @@ def make_data(
     voltage; a wrench is allocated to the thrusters with the least effort. Runs `without` (by
     number, scenario by scenario) are left out, unless none would remain. Commands before a run are
     not known: its first `remembered` s (a tenth of it at most) only set the actuator states.
-    Positions that were not measured are dead-reckoned.
+    Positions that were not measured are dead-reckoned; velocities that were not are zero.
 
     Raises:
-        UserError: attitude or a channel of the twist is missing, or no run has two samples.
+        UserError: attitude or rates are missing, or no run has two samples.
     """
-    unmeasured = unmeasured_coordinates(recording)
+    unmeasured = unmeasured_channels(recording)
+    latent = [i for i, name in enumerate(TWIST) if name in unmeasured]
+    extra = _sensors_of_latent(recording, latent)
     data, lengths = recording.dataset, recording.lengths
     thrust, volts = recording.thrust(vehicle)
     has_voltage = "voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any())
@@ -192,11 +232,13 @@ def make_data(
     for number, (j, k) in enumerate(np.argwhere(kept).tolist()):
         length = int(lengths[j, k])
         times = recording.elapsed(j, k)
-        V = data["V_WB_B"].to_numpy()[j, k, :length]
+        V = data["V_WB_B"].to_numpy()[j, k, :length].copy()
+        V[:, latent] = 0.0
         X = dead_reckoned(times, data["X_WB"].to_numpy()[j, k, :length], V)
         of_run = X, V, thrust[j, k, :length], volts[j, k, :length], np.diff(times)
         first = min(behind, int(_OF_A_RUN * (length - 1))) if remembered else 0
-        pieces += _cut(*of_run, first, segment, behind)
+        sensors = {name: values[j, k, :length] for name, values in extra.items()}
+        pieces += _cut(*of_run, sensors, first, segment, behind)
         scenario += [j] * (len(pieces) - len(run))
         run += [number] * (len(pieces) - len(run))
     if not run:
@@ -232,23 +274,38 @@ def _kept(lengths: np.ndarray, without: Sequence[int]) -> np.ndarray:
     return kept if kept.any() else long
 
 
-def unmeasured_coordinates(recording: Recording) -> tuple[str, ...]:
-    """Coordinates of the position that were not measured; other channels are refused."""
+def unmeasured_channels(recording: Recording) -> tuple[str, ...]:
+    """Coordinates and velocities that were not measured; attitude and rates must be."""
     lacking = recording.missing
-    of_pose = lacking.get("X_WB", ())
-    unmeasured = tuple(c for c in of_pose if c in XYZ)
-    if "V_WB_B" in lacking or unmeasured != of_pose:
-        channels = ", ".join(f"{name} {'/'.join(which)}" for name, which in lacking.items())
+    free = {"X_WB": XYZ, "V_WB_B": TWIST[:3]}
+    needed = {name: [c for c in which if c not in free[name]] for name, which in lacking.items()}
+    if any(needed.values()):
+        channels = ", ".join(f"{name} {'/'.join(c)}" for name, c in needed.items() if c)
         raise UserError(
-            f"recording: {channels} is missing; a diagnosis needs attitude and all of the twist. "
-            "Without a DVL give u, v, w from measured positions (differences, turned into B)"
+            f"recording: {channels} is missing; a diagnosis needs attitude and the rates p, q, r. "
+            "Give rates from the attitude (differences, turned into B)"
         )
-    return unmeasured
+    return (*lacking.get("X_WB", ()), *lacking.get("V_WB_B", ()))
+
+
+def _sensors_of_latent(recording: Recording, latent: Sequence[int]) -> dict[str, np.ndarray]:
+    """Readings that tell of latent velocities, where every run has them."""
+    found = {}
+    wanted = {"specific_force": "imu_specific_force", "climb": "vertical_velocity"}
+    for name, variable in wanted.items() if latent else ():
+        if variable not in recording.dataset:
+            continue
+        values = recording.dataset[variable].to_numpy()
+        if np.isfinite(values[recording.mask]).all():
+            found[name] = values
+    if 2 in latent:
+        found.pop("climb", None)
+    return found
 
 
 def _cut(
     X: np.ndarray, V: np.ndarray, u: np.ndarray, volts: np.ndarray, held: np.ndarray,
-    first: int, segment: int, behind: int,
+    sensors: dict[str, np.ndarray], first: int, segment: int, behind: int,
 ) -> Iterator[dict[str, np.ndarray]]:  # fmt: skip
     """Pieces of a run from sample `first` on, with the commands of `behind` steps before each."""
     last = len(held)
@@ -259,6 +316,7 @@ def _cut(
         yield {
             "X": X[a : b + 1], "V": V[a : b + 1], "u": u[a:b], "past": u[before],
             "past_step": held[before], "voltage": volts[a:b], "step": held[a:b],
+            **{name: values[a : b + 1] for name, values in sensors.items()},
         }  # fmt: skip
 
 

@@ -20,7 +20,7 @@ _STUCK = 0.5  # s
 _FILLED = 3  # samples on a straight line
 _HELD = 0.25
 """Share of the samples that repeat the one before where an instrument is slower than the rows."""
-_INSTRUMENTS = {"x,y,z": slice(4, 7), "u,v,w": slice(7, 10), "p,q,r": slice(10, 13)}
+_INSTRUMENTS = {"x,y,z": (4, 5, 6), "u,v,w": (7, 8, 9), "p,q,r": (10, 11, 12)}
 _LEAST_ROWS, _LEAST_SECONDS = 60, 3.0
 """Least data that a diagnosis needs."""
 _NAMED = 3
@@ -128,7 +128,8 @@ def _faults_of(run: Trajectory, dt: float) -> _Faults:
                 stuck.append(label)
     state = np.concatenate([run.X_WB, run.V_WB_B], axis=1)
     for columns in _INSTRUMENTS.values():
-        same = (np.diff(state[:, columns], axis=0) == 0).all(axis=1)
+        there = [c for c in columns if c < 7 or np.isfinite(state[:, c]).all()]
+        same = (np.diff(state[:, there], axis=0) == 0).all(axis=1) & bool(there)
         held.append(float((same & run.V_WB_B[1:].any(axis=1)).mean()))
     elapsed = run.sensors.get(UNEVEN)
     step = np.full(len(state) - 1, dt) if elapsed is None else np.diff(elapsed)
@@ -143,8 +144,9 @@ def _faults_of(run: Trajectory, dt: float) -> _Faults:
     excess = excess[np.isfinite(excess)]
     jumps = bool(excess.size and np.any(excess > 30 * np.median(excess) + 0.1))
     late = 0.0 if jumps else clock_jump(moved, expected, step)
-    bend = np.abs(np.diff(run.V_WB_B, 2, axis=0)).max(axis=1, initial=0.0)
-    line = _longest(bend < 1e-7 * np.nanstd(run.V_WB_B))
+    V = run.V_WB_B[:, np.isfinite(run.V_WB_B).all(axis=0)]
+    bend = np.abs(np.diff(V, 2, axis=0)).max(axis=1, initial=0.0)
+    line = _longest(bend < 1e-7 * np.nanstd(V))
     filled = (line + 1) * dt if line >= _FILLED else 0.0
     spiked = bool(spikes(run.V_WB_B.T).any())
     return _Faults(stuck, held, jumps, late, spiked, filled, agreeing)
@@ -254,6 +256,27 @@ def unexcited(data: Data, wrench_of: np.ndarray) -> list[str]:
     return [a for a, f, s in zip(AXES, rms, scale, strict=True) if f <= _STILL * s]
 
 
+def _of_latent(data: Data) -> list[str]:
+    """What velocities that were not measured leave unknown."""
+    names = ", ".join(TWIST[i] for i in data.latent)
+    found = [
+        f"{names} were not measured: they are simulated by the model, other motions compared with "
+        "the records; errors of a DVL, currents and the tether are not identifiable"
+    ]
+    if data.felt:
+        axes = ", ".join(AXES[i] for i in data.felt)
+        found.append(
+            f"{axes}: the accelerometer tells of accelerations alone, so drag there, and speeds, "
+            "are known no better than the thrust that the model believes"
+        )
+    if data.unseen:
+        found.append(
+            f"{', '.join(data.unseen)}: no instrument tells of this motion, so drag, inertia and "
+            "thrust there stay as believed; log u, v (a DVL) or the accelerometer"
+        )
+    return found
+
+
 def limits(
     data: Data,
     quiet: list[str],
@@ -274,7 +297,9 @@ def limits(
         )
     if data.command == "F_Bo_B":
         found.append("commands are wrenches: single thrusters are not identifiable")
-    if data.unmeasured:
+    if data.latent:
+        found += _of_latent(data)
+    elif data.unmeasured:
         found.append(
             f"{', '.join(data.unmeasured)} of the position were not measured (dead-reckoned from "
             "the velocities): scale and direction of the DVL and errors of the heading, which need "

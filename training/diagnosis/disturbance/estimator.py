@@ -39,7 +39,7 @@ def is_estimators(law: Law, problem: DiagnosisProblem, evaluation: Evaluation) -
 def imitated_wrench(problem: DiagnosisProblem, evaluation: Evaluation) -> Float[np.ndarray, "6"]:
     """Standard deviation of the wrench that the estimator's errors imitate (N, N·m)."""
     p, data = evaluation.predictions, problem.data
-    steps = Transition.along(np.asarray(p.jacobian), data.weight, p.late)
+    steps = Transition.along(np.asarray(p.jacobian), data.weight, p.late, p.latent)
     attitude = evaluation.noise.slip[3:] * np.sqrt(_LASTS / 2)
     errors = np.concatenate([np.zeros(3), attitude, np.full(3, _VELOCITY), np.zeros(3)])
     apart = steps.mean - np.eye(12)

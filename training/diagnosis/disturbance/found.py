@@ -56,7 +56,7 @@ def laws_of(problem: DiagnosisProblem, evaluation: Evaluation) -> list[Law]:
     )
     rows = problem.library.at(CurrentSteady.name, "W")
     evidence = evaluation.plain
-    if set(rows) <= set(evidence.design.owner.tolist()) and len(evidence.runs) > 2:
+    if rows and set(rows) <= set(evidence.design.owner.tolist()) and len(evidence.runs) > 2:
         columns = [evidence.column(i) for i in rows]
         sizes = np.array([problem.library.entries[i].parameter.probes[0] for i in rows])
         gain, values, loss = run_constants(evidence.runs, columns, sizes, evidence.fold)
@@ -77,14 +77,18 @@ def best_law(problem: DiagnosisProblem, evaluation: Evaluation) -> float:
 def all_laws(problem: DiagnosisProblem, evaluation: Evaluation, least: float) -> list[Law]:
     """Disturbance laws of the residual, waves and level included, largest gain first.
 
-    Slow laws that an estimator's errors imitate are left out.
+    Slow laws that an estimator's errors imitate are left out, and laws of axes whose velocity was
+    not measured: an accelerometer's own errors look like them.
     """
+    unmeasured = {AXES[i] for i in problem.data.latent}
     found = [
-        law for law in laws_of(problem, evaluation) if not is_estimators(law, problem, evaluation)
+        law
+        for law in laws_of(problem, evaluation)
+        if law.where not in unmeasured and not is_estimators(law, problem, evaluation)
     ]
     alike = repeating(evaluation.z, problem.data)
     slow = [law for law in found if law.name == DisturbanceColour.name]
-    if max((law.heldout_gain for law in slow), default=0.0) > least:
+    if not unmeasured and max((law.heldout_gain for law in slow), default=0.0) > least:
         waves, current = find_waves(problem, evaluation), find_current(problem, evaluation)
         if are_waves(waves, slow):
             found.append(waves)
@@ -203,7 +207,9 @@ def _without_impacts(problem: DiagnosisProblem, evaluation: Evaluation) -> Float
     near[1:] |= hit[:-1]
     near[:-1] |= hit[1:]
     weight = data.weight * ~near
-    steps = Transition.along(jacobian, weight, evaluation.predictions.late)
+    steps = Transition.along(
+        jacobian, weight, evaluation.predictions.late, evaluation.predictions.latent
+    )
     mass = problem.mass(evaluation.theta)
     return estimate(error, weight, steps, mass, data.dt, estimated=False).diffusion
 

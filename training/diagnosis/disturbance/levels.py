@@ -10,8 +10,9 @@ from jaxtyping import Float
 
 from ....models.effects.noise import DisturbanceLevel
 from ....models.se3 import AXES
+from ..filter.kalman import score_of
 from ..filter.likely_noise import fit_with_slow_noise
-from ..filter.noise import Noise, estimate, score_of, unit_processes
+from ..filter.noise import Noise, estimate, unit_processes
 from ..filter.problem import DiagnosisProblem, Evaluation
 from ..filter.transition import Transition
 from .laws import Law
@@ -21,7 +22,7 @@ LEVEL = DisturbanceLevel.name
 
 def believed_levels(problem: DiagnosisProblem) -> Float[np.ndarray, "6"]:
     """Diffusion b of the believed model; zero where it has none."""
-    return np.asarray(problem.model.base.mass_and_diffusion(jnp.zeros(6))[1])
+    return np.array(problem.model.base.mass_and_diffusion(jnp.zeros(6))[1])
 
 
 def find_levels(problem: DiagnosisProblem, evaluation: Evaluation, least: float) -> list[Law]:
@@ -32,10 +33,11 @@ def find_levels(problem: DiagnosisProblem, evaluation: Evaluation, least: float)
     believed one held, for measurement noise may compensate for it. The error of a level is
     that of its likelihood or, if larger, that by the jackknife over folds.
     """
-    believed = believed_levels(problem)
+    believed, data = believed_levels(problem), problem.data
+    believed[data.latent] = 0.0
     if not np.any(believed > 0):
         return []
-    data = problem.data
+    latent = evaluation.predictions.latent
     error, jacobian = (
         np.asarray(evaluation.predictions.error),
         np.asarray(evaluation.predictions.jacobian),
@@ -48,12 +50,13 @@ def find_levels(problem: DiagnosisProblem, evaluation: Evaluation, least: float)
 
     def score(own: np.ndarray, noise: Noise, steps: Transition) -> Float[np.ndarray, " r"]:
         given = data.dt, data.step[:, own], data.weight[:, own]
-        return score_of(error[:, :, own], jacobian[..., own], noise, steps, inverse, *given)
+        some = None if latent is None else latent.of(own)
+        return score_of(error[:, :, own], jacobian[..., own], noise, steps, inverse, *given, some)
 
     for k, label in enumerate(labels):
         own = data.fold == label
         rest = data.weight * (~own if not own.all() else 1)
-        steps = Transition.along(jacobian, rest, evaluation.predictions.late)
+        steps = Transition.along(jacobian, rest, evaluation.predictions.late, latent)
         noise = estimate(error, rest, steps, mass, data.dt, estimated=False)
         levels[k] = noise.diffusion
         best = score(own, noise, steps)
@@ -85,7 +88,7 @@ def levels_with_slow_noise(
     """
     data, believed = problem.data, believed_levels(problem)
     p = evaluation.predictions
-    steps = Transition.along(np.asarray(p.jacobian), data.weight, p.late)
+    steps = Transition.along(np.asarray(p.jacobian), data.weight, p.late, p.latent)
     inverse = np.linalg.inv(problem.mass(evaluation.theta))
     left, lost = fit_with_slow_noise(
         np.asarray(p.error),
@@ -111,7 +114,7 @@ def levels_with_slow_noise(
 def process_share(problem: DiagnosisProblem, evaluation: Evaluation) -> Float[np.ndarray, "6"]:
     """Share of the variance of each twist's innovation due to process noise on its axis."""
     p = evaluation.predictions
-    steps = Transition.along(np.asarray(p.jacobian), problem.data.weight, p.late)
+    steps = Transition.along(np.asarray(p.jacobian), problem.data.weight, p.late, p.latent)
     inverse = np.linalg.inv(problem.mass(evaluation.theta))
     own = unit_processes(steps, inverse, problem.data.dt)
     own *= evaluation.noise.diffusion[:, None, None] ** 2

@@ -14,6 +14,8 @@ from ....models.effects.library import Library
 from ....models.effects.recent import Recent
 from ..data.arrays import Data
 from .along_records import AlongRecords, Records, State, Step, scan, substeps
+from .latent import levels, specific_force_errors
+from .transition import Latent
 
 
 class Predictions(NamedTuple):
@@ -28,6 +30,8 @@ class Predictions(NamedTuple):
         start: pose and twist at the samples, with the effects of instruments removed.
         first: history of the twist before the first sample.
         late: delay of recorded poses against twists, by axis (s).
+        latent: of velocities that were not measured: the records have those of a simulation under
+            these effects, in which all other velocities and the pose are reset at every sample.
     """
 
     error: Float[Array, "N 12 R"]
@@ -38,6 +42,7 @@ class Predictions(NamedTuple):
     start: tuple[Float[Array, "N 7 R"], Float[Array, "N 6 R"]]
     first: Recent | None = None
     late: Any = None
+    latent: Latent | None = None
 
 
 def difference(
@@ -48,13 +53,18 @@ def difference(
 
 
 @eqx.filter_jit
-def _predict(model: Extended, effects: Any, records: Records, count: int) -> Predictions:
+def _predict(
+    model: Extended, effects: Any, records: Records, count: int, measured: Array | None = None
+) -> Predictions:
     along = AlongRecords.of(model.with_effects(effects), count)
     plain = model.with_effects(())
     rest = plain.inertia()
 
     def predicted(state: State, given: Step) -> tuple[State, Predictions]:
-        start = along.restart(state, given.X, given.V)
+        V = given.V
+        if measured is not None:
+            V = jnp.where(measured[6:, None] > 0, V, along.observe(state)[1])
+        start = along.restart(state, given.X, V)
         end = along.step(start, given)
         middle = (start.V + end.V) / 2
         jacobian, slope = _jacobian(plain, rest, start.X, middle, given.command, given.length[0])
@@ -103,10 +113,17 @@ def _jacobian(
 def predict(model: Extended, library: Library, theta: np.ndarray, data: Data) -> Predictions:
     """Predictions of all samples with the effects' values `theta`: (p,), or (p, R) by piece."""
     effects = library.filled(theta.reshape(len(theta), -1))
-    found = _predict(model, effects, Records.of(data), substeps(data.longest))
+    measured = jnp.asarray(data.measured) if data.latent else None
+    found = _predict(model, effects, Records.of(data), substeps(data.longest), measured)
     found = found._replace(late=sum((e.pose_delay() for e in effects), np.zeros(6)))
-    return (
-        found._replace(error=found.error * data.measured[None, :, None])
-        if data.unmeasured
-        else found
-    )
+    if not data.unmeasured:
+        return found
+    found = found._replace(error=found.error * data.measured[None, :, None])
+    if not data.latent:
+        return found
+    assumed = levels(model, data)
+    if not data.felt:
+        return found._replace(latent=Latent(assumed))
+    error, jacobian, carried = specific_force_errors(found, data)
+    latent = Latent(assumed, data.felt, carried)
+    return found._replace(error=error, jacobian=jacobian, latent=latent)

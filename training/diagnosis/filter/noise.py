@@ -10,14 +10,13 @@ then taken as process noise, with slip of the pose against the twist, and their 
 is kept: it lowers the effective number of samples.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from ..data.arrays import all_equal
 from .likely_noise import most_likely
 from .transition import Transition
 
@@ -38,16 +37,20 @@ _DRIFTS = 3e-4
 of it, by the integration of their rates; the angle random walk of a gyro is 1e-4 at most."""
 _LONGEST = 0.98
 """Upper limit of the correlation of neighbouring errors."""
-_DEAF = 10.0
-"""Standard deviation (m, rad) given to a pose that was not measured, so that it has no weight."""
+_DEAF = np.array([10.0] * 6 + [1e4] * 6)
+"""Standard deviation (m, rad, m/s, rad/s) given to what was not measured, so that it has no weight:
+velocities act on other errors, so theirs must have none at all."""
+_OF_INSTRUMENT = 0.5
+"""Share of the one-step variance of an accelerometer that counts as the instrument's. A white force
+looks like its noise, so the share is not identifiable; innovations hardly depend on it."""
+_FORGETS = 10.0
+"""Time (s) after which drag has at the latest ended a velocity's error."""
+_BIAS, _WANDERS = 0.1, 10.0
+"""Bias of an accelerometer against the attitude (m/s²), and time (s) in which it wanders: half a
+degree of tilt, as an autopilot's attitude errs without a velocity."""
 _BELOW = 0.1
 """Share of `FLOOR` that bounds the most likely noise from below: a floor of the order of the
 process noise of a pose over one step would be subtracted from the process."""
-_MUCH = 0.03
-"""Share of an innovation's variance due to the spread of Jacobians above which each piece has a
-filter of its own."""
-_NODES = 8
-"""Nodes of interpolation between uneven steps."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,8 @@ class Noise:
         memory: number of samples with the information of one independent sample (12,).
         error: standard error of b; half of b where data are too few, zero for estimated states.
         estimated: whether the records are states that a filter has estimated.
-        silent: poses without any one-step error (12,), such as those that were not measured.
+        silent: records without any one-step error (12,), such as those that were not measured.
+        first: standard deviations of the errors at the first sample, where they are not `trusted`.
     """
 
     record: Float[np.ndarray, "12"]
@@ -71,6 +75,7 @@ class Noise:
     error: Float[np.ndarray, "6"] = field(default_factory=lambda: np.zeros(6))
     estimated: bool = False
     silent: Bool[np.ndarray, "12"] = field(default_factory=lambda: np.zeros(12, bool))
+    first: Float[np.ndarray, "12"] | None = None
 
     @property
     def trusted(self) -> Float[np.ndarray, "12"]:
@@ -82,30 +87,6 @@ class Noise:
         b = self.diffusion.copy()
         b[list(values)] = list(values.values())
         return replace(self, diffusion=b)
-
-
-@dataclass(frozen=True)
-class Filter:
-    """Gains and whitening of the first N innovations, by piece, or the same for all (R = 1).
-
-    Attributes:
-        keep: I - K_n before step n (N, 12, 12, R).
-        whiten: L_n⁻¹ with L Lᵀ the innovations' covariance after step n (N, 12, 12, R).
-        log_det: ½ log det of that covariance (N, R).
-        memory: by which the whitened squares are divided already (`Noise.memory`) (12,).
-    """
-
-    keep: Float[np.ndarray, "N 12 12 R"]
-    whiten: Float[np.ndarray, "N 12 12 R"]
-    log_det: Float[np.ndarray, "N R"]
-    memory: Float[np.ndarray, "12"] = field(default_factory=lambda: np.ones(12))
-
-    def of(self, pieces: Int[np.ndarray, " K"]) -> "Filter":
-        """The filter of some pieces."""
-        if self.keep.shape[-1] == 1:
-            return self
-        parts = (a[..., pieces] for a in (self.keep, self.whiten, self.log_det))
-        return Filter(*parts, memory=self.memory)
 
 
 def process_covariance(
@@ -154,9 +135,12 @@ def estimate(
     The diffusion b of some axes may be `held`. Whether the records are states that a filter has
     `estimated` is decided from the errors unless it is given.
     """
-    held = {} if held is None else held
+    held, latent = {} if held is None else held, transition.latent
     silent = np.zeros(12, bool)
     silent[:6] = np.max(np.abs(error[:, :6] * weight[:, None]), axis=(0, 2)) == 0
+    if latent is not None:
+        silent[[6 + i for i in latent.silent]] = True
+        held = {i: latent.levels[i] for i in latent.silent} | dict(held)
     C = []
     for lag in range(3):
         w = weight[lag:] * weight[: len(weight) - lag]
@@ -168,12 +152,16 @@ def estimate(
     units = unit_processes(transition, inverse, dt)
     unit = np.diag(units.sum(axis=0))[6:]
     alike = np.diag(C[1]) > _ALIKE * np.diag(C[0])
+    if latent is not None:
+        alike[[6 + i for i in latent.felt]] = False
     none, near = (alike & ((times * FLOOR) ** 2 >= R) for times in (1.0, _NEAR))
     if estimated is None:
-        estimated = bool(np.sum(none[6:]) >= _SMOOTH or np.sum(near) >= _SMOOTH_OF_ALL)
+        of = 1.0 if latent is None else 1 - len(latent.levels) / 6  # share of twists measured
+        estimated = bool(np.sum(none[6:]) >= _SMOOTH * of or np.sum(near) >= _SMOOTH_OF_ALL * of)
     if estimated:
         of_estimates = _of_estimates(C[0], C[1], variance, transition, inverse, unit, dt)
-        return replace(of_estimates.with_diffusion(held), silent=silent)
+        found = replace(of_estimates.with_diffusion(held), silent=silent)
+        return _with_latent(found, transition, inverse, unit, dt, C)
     C0 = C[0] - (C[2] + C[2].T) / 2
     Q = C0 - np.diag(variance) - transition.of(np.diag(variance))
     least = 1e-8 * np.diag(C[0])[6:] / unit
@@ -189,7 +177,45 @@ def estimate(
     slip = slip_of(error, weight, dt)
     if not (np.any(record[6:] > _NEAR * FLOOR[6:]) or np.any(slip[3:] > _DRIFTS)):
         slip = np.zeros(6)  # exact states
-    return Noise(record, b, slip, error=errors / (2 * b), silent=silent)
+    noise = Noise(record, b, slip, error=errors / (2 * b), silent=silent)
+    return _with_latent(noise, transition, inverse, unit, dt, C)
+
+
+def _with_latent(
+    noise: Noise,
+    transition: Transition,
+    mass_inverse: Float[np.ndarray, "6 6"],
+    unit: Float[np.ndarray, "6"],
+    dt: float,
+    C: list[np.ndarray],
+) -> Noise:
+    """The noise with that of accelerometers, their biases and the start of latent velocities.
+
+    Such a velocity starts as uncertain as the assumed diffusion keeps it against drag. Readings
+    that share samples are correlated and count for fewer; C are autocovariances of the errors.
+    """
+    latent = transition.latent
+    if latent is None:
+        return noise
+    record, b, slip = noise.record.copy(), noise.diffusion.copy(), noise.slip.copy()
+    memory = noise.memory.copy()
+    slip[:3] = 0.0
+    first = np.where(noise.silent, _DEAF, record)
+    levels = np.zeros(6)
+    for i, level in latent.levels.items():
+        levels[i] = level
+    made = np.diag(process_covariance(transition.mean, mass_inverse, levels, dt))
+    for i in latent.levels:
+        lost = 1 - min(transition.mean[6 + i, 6 + i], 1 - dt / _FORGETS) ** 2
+        first[6 + i] = np.sqrt(made[6 + i] / lost)
+    for i in latent.felt:
+        record[6 + i] = np.sqrt(_OF_INSTRUMENT * unit[i]) * b[i]
+        b[i] *= np.sqrt(1 - _OF_INSTRUMENT)
+        first[i], slip[i] = _BIAS, _BIAS * np.sqrt(2 / _WANDERS)
+        alike = C[1][6 + i, 6 + i] / max(C[0][6 + i, 6 + i], 1e-300)
+        alike = float(np.clip(alike, 0.0, _LONGEST))
+        memory[6 + i] = (1 + alike) / (1 - alike)
+    return replace(noise, record=record, diffusion=b, slip=slip, first=first, memory=memory)
 
 
 def slip_of(
@@ -237,136 +263,3 @@ def _of_estimates(
         memory=(1 + correlation) / (1 - correlation),
         estimated=True,
     )
-
-
-def make_filter(
-    noise: Noise,
-    transition: Transition,
-    mass_inverse: Float[np.ndarray, "6 6"],
-    dt: float,
-    step: Float[np.ndarray, "N R"],
-    jacobian: Float[np.ndarray, "N 12 12 R"] | None = None,
-) -> Filter:
-    """The Kalman filter that starts from the first record: gains of every step.
-
-    The transition is that of a step of `dt` s. Where all steps are equal, all pieces share one
-    filter, unless the spread of Jacobians adds much to the innovations: then each has its own.
-    """
-    process = _process(noise, transition, mass_inverse, dt, step)
-    if all_equal(step, dt):
-        found, P = _filter(noise, process, step[:, :1], dt, transition)
-        share = np.diag(transition.added(P)) / (np.diag(transition.of(P)) + noise.trusted**2)
-        if jacobian is None or np.max(share[~noise.silent]) < _MUCH:
-            return found
-    return _filter(noise, process, step, dt, transition, jacobian)[0]
-
-
-def judging_filter(
-    noise: Noise,
-    transition: Transition,
-    mass_inverse: Float[np.ndarray, "6 6"],
-    dt: float,
-    step: Float[np.ndarray, "N R"],
-    jacobian: Float[np.ndarray, "N 12 12 R"],
-) -> Filter:
-    """`make_filter` with correlated innovations weighted down by `Noise.memory`."""
-    kalman = make_filter(noise, transition, mass_inverse, dt, step, jacobian)
-    less = kalman.whiten / np.sqrt(noise.memory)[:, None, None]
-    return replace(kalman, whiten=less, memory=noise.memory)
-
-
-Process = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Ā and Q (R, 12, 12) of steps (R,) in s."""
-
-
-def _filter(
-    noise: Noise,
-    process: Process,
-    step: Float[np.ndarray, "N R"],
-    dt: float,
-    transition: Transition,
-    jacobian: Float[np.ndarray, "N 12 12 R"] | None = None,
-) -> tuple[Filter, Float[np.ndarray, "12 12"]]:
-    """A filter for each column of `step`, and the first one's last covariance."""
-    R, eye = np.diag(noise.trusted**2), np.eye(12)
-    count = step.shape[1]
-    P = np.repeat(R[None], count, 0)
-    gap = np.zeros_like(P)  # I - K: the filter starts at the first record
-    keep, whiten = np.zeros((2, len(step), count, 12, 12))
-    log_det = np.zeros(step.shape)
-    for n in range(len(step)):
-        keep[n] = gap
-        A, prior = process(step[n])
-        if jacobian is None:
-            prior = prior + (step[n] / dt)[:, None, None] ** 2 * transition.added(P)
-        else:
-            own = np.moveaxis(jacobian[n], -1, 0).astype(float)
-            A = np.where(np.isfinite(own), own, A)  # a piece without samples has none
-        prior = A @ P @ A.swapaxes(1, 2) + prior
-        L = np.linalg.cholesky(prior + R)
-        whiten[n] = np.linalg.inv(L)
-        log_det[n] = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
-        K = np.linalg.solve(prior + R, prior).swapaxes(1, 2)
-        gap = eye - K
-        # Joseph's form stays positive where exact records meet a long step (Bucy and Joseph 1968)
-        P = gap @ prior @ gap.swapaxes(1, 2) + K @ R @ K.swapaxes(1, 2)
-    return Filter(np.moveaxis(keep, 1, -1), np.moveaxis(whiten, 1, -1), log_det), P[0]
-
-
-def _process(
-    noise: Noise, transition: Transition, mass_inverse: np.ndarray, dt: float, step: np.ndarray
-) -> Process:
-    """Ā and Q of any steps among these, interpolated between Chebyshev nodes."""
-
-    def of_step(A: np.ndarray, h: float) -> np.ndarray:
-        late = transition.late
-        return process_covariance(A, mass_inverse, noise.diffusion, h, noise.slip, late)
-
-    A = transition.mean
-    if all_equal(step, dt):
-        alone = A[None], of_step(A, dt)[None]
-        return lambda h: alone
-    J = np.real(scipy.linalg.logm(A)) / dt
-    low, high = float(step.min()), float(step.max())
-    at = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
-    nodes = (low + high) / 2 + (high - low) / 2 * at
-    each = [scipy.linalg.expm(J * h) for h in nodes]
-    values = np.stack([each, [of_step(a, h) for a, h in zip(each, nodes, strict=True)]], axis=1)
-    inverse = np.linalg.inv(np.polynomial.chebyshev.chebvander(at, _NODES - 1))
-    series = np.tensordot(inverse, values, 1)
-
-    def of_steps(h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = (2 * h - low - high) / (high - low)
-        both = np.tensordot(np.polynomial.chebyshev.chebvander(x, _NODES - 1), series, 1)
-        return both[:, 0], both[:, 1]
-
-    return of_steps
-
-
-def filtered(
-    error: Float[np.ndarray, "N 12 R"], jacobian: Float[np.ndarray, "N 12 12 R"], kalman: Filter
-) -> Float[np.ndarray, "N 12 R"]:
-    """Whitened innovations of one-step errors."""
-    nu, found = np.zeros(error.shape[1:]), np.empty(error.shape)
-    for n in range(len(error)):
-        kept = np.einsum("ijr,jr->ir", kalman.keep[n], nu)
-        nu = error[n] + np.einsum("ijr,jr->ir", jacobian[n], kept)
-        found[n] = np.einsum("ijr,jr->ir", kalman.whiten[n], nu)
-    return found
-
-
-def score_of(
-    error: Float[np.ndarray, "N 12 R"],
-    jacobian: Float[np.ndarray, "N 12 12 R"],
-    noise: Noise,
-    transition: Transition,
-    mass_inverse: Float[np.ndarray, "6 6"],
-    dt: float,
-    step: Float[np.ndarray, "N R"],
-    weight: Float[np.ndarray, "N R"],
-) -> Float[np.ndarray, " R"]:
-    """Log density of the innovations by piece (nats)."""
-    kalman = make_filter(noise, transition, mass_inverse, dt, step, jacobian)
-    z = filtered(error, jacobian, kalman) * weight[:, None]
-    found = -(z**2).sum(axis=(0, 1)) / 2 - (kalman.log_det * weight).sum(axis=0)
-    return found - 6 * np.log(2 * np.pi) * weight.sum(axis=0)

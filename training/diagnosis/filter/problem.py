@@ -22,7 +22,9 @@ from ..selection.hypotheses import Design, Evidence, Fit
 from ..selection.model_selection import parameters_of
 from .gram import gram
 from .innovations import Predictions, predict
-from .noise import Filter, Noise, estimate, judging_filter
+from .kalman import Filter, judging_filter
+from .noise import Noise, estimate
+from .reference import with_latent
 from .sensitivities import whitened_sensitivities
 from .transition import Transition
 
@@ -105,7 +107,9 @@ class DiagnosisProblem:
         effects = believed.effects if isinstance(believed, Extended) else ()
         core = believed.base if isinstance(believed, Extended) else believed
         library, theta = _library(data, effects)
-        return cls(data, vehicle, Extended.create(core, (), vehicle.thrusters()), library, theta)
+        model = Extended.create(core, (), vehicle.thrusters())
+        data = with_latent(data, model, library, theta)
+        return cls(data, vehicle, model, library, theta)
 
     def with_effect(self, effect: Effect) -> "DiagnosisProblem":
         """The problem with one more effect, zero in θ, appended to the library."""
@@ -114,6 +118,10 @@ class DiagnosisProblem:
         theta = np.zeros(library.size)
         theta[old] = self.believed
         return replace(self, library=library, believed=theta)
+
+    def along(self, theta: Float[np.ndarray, " p"]) -> "DiagnosisProblem":
+        """The problem with velocities that were not measured as they are under θ."""
+        return replace(self, data=with_latent(self.data, self.model, self.library, theta))
 
     def within(self, bounds: Mapping[int, tuple[float, float]]) -> "DiagnosisProblem":
         """The problem with narrower bounds of some parameters, by index in θ."""
@@ -157,13 +165,14 @@ class DiagnosisProblem:
         if not np.isfinite(error[:, :, weight.any(axis=0)]).all():
             raise FloatingPointError("predictions diverge")
         jacobian = np.asarray(p.jacobian)
-        steps = Transition.along(jacobian, weight, p.late)
+        steps = Transition.along(jacobian, weight, p.late, p.latent)
         mass = self.mass(theta)
         noise = estimate(error, weight, steps, mass, self.data.dt)
         if kalman is not None:
             return p, noise, kalman
         data, inverse = self.data, np.linalg.inv(mass)
-        return p, noise, judging_filter(noise, steps, inverse, data.dt, data.step, jacobian)
+        given = data.dt, data.step, jacobian, p.latent
+        return p, noise, judging_filter(noise, steps, inverse, *given)
 
     def errors(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "N 12 R"]:
         """Errors of one-step predictions, zero where a piece has no sample."""
@@ -276,7 +285,7 @@ class DiagnosisProblem:
         C = np.einsum("nir,njr->ij", error, error) / self.data.weight.sum()
         if apart:
             C[:6, 6:], C[6:, :6] = 0.0, 0.0
-        return C + np.diag(self.data.measured == 0)
+        return C + np.diag(np.diag(C) == 0) if self.data.unmeasured else C
 
     def merit(self, C: Float[np.ndarray, "12 12"]) -> float:
         """Negative log likelihood of errors with the sample covariance C."""

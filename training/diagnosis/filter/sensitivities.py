@@ -19,7 +19,7 @@ from ....models.effects.recent import Recent
 from ..data.arrays import Data
 from .along_records import Records, settle
 from .innovations import Predictions
-from .noise import Filter
+from .kalman import Filter
 
 LANES, FEW, INSTRUMENTS = 28, 8, 18
 """Probes that one call of the compiled program evaluates in parallel, besides the base."""
@@ -40,22 +40,25 @@ def _whitened(
     predictions: Predictions,
     records: Records,
     filters: tuple[Array, Array, Array],
+    instead: tuple[Array, Array] | None,
     lanes: int,
     instruments: bool,
 ) -> Float[Array, "L N12 R"]:
     """Whitened innovations of lane 0 (the base) and changes of them in the other lanes."""
     model = model.with_effects(effects)
     if not instruments:
-        model, predictions, records, filters = _single((model, predictions, records, filters))
-    first, predictions = predictions.first, predictions._replace(first=None, late=None)
+        single = _single((model, predictions, records, filters, instead))
+        model, predictions, records, filters, instead = single
+    first = predictions.first
+    predictions = predictions._replace(first=None)
     (X, V, u, voltage, step, past, past_step), (keep, whiten, weight) = records, filters
     inertia = model.inertia()
 
     def body(carry: Any, given: Any) -> Any:
-        memory, nu, recent = carry
-        p, X0, V0, command, volts, h, gap, white, exists = given
+        memory, nu, carried, recent = carry
+        p, X0, V0, command, volts, h, gap, white, exists, before = given
         dt = h[None, None]
-        kept = through(gap, nu)
+        kept = through(gap, nu) + carried
         if instruments:
             # propagate the state differences that instrument effects imply, then observe them
             away = _apart(model.infer(X0[:, None], V0[:, None], _wide(recent)))
@@ -63,6 +66,8 @@ def _whitened(
             x, v = se3.retract(p.X[:, None], away[:6]), p.V[:, None] + away[6:]
             recent = recent.after(p.latest)
             direct = _apart(model.observe(x, v, _wide(recent)))
+            if instead is not None:  # an accelerometer and its bias have these places
+                direct = direct * (1 - instead[0]).at[:3].set(0.0)[:, None, None]
             moved = kept
         else:
             x, v = (a[:, None] for a in p.start)
@@ -75,13 +80,18 @@ def _whitened(
             moved = kept - direct
         nu = jnp.sum(p.jacobian[:, :, None] * moved[None], axis=1) - direct
         nu = nu.at[:, 0].add(p.error)
+        if instead is not None:
+            passed = jnp.sum(before[:, :, None] * kept[None], axis=1)
+            nu = nu - passed
+            carried = passed.at[:, 0].add(-instead[0][:, None] * p.error)
         # lane 0, the base, carries the innovation itself
-        return (memory, nu, recent), through(white, nu) * exists[None, None]
+        return (memory, nu, carried, recent), through(white, nu) * exists[None, None]
 
     zero = jnp.zeros((12, lanes, V.shape[2]), V.dtype)
     memory = () if instruments else settle(model, past[:, :, None], past_step[:, None, None])
-    start = (memory, zero, first)
-    xs = (predictions, X[:-1], V[:-1], u, voltage, step, keep, whiten, weight)
+    start = (memory, zero, zero, first)
+    before = None if instead is None else instead[1]
+    xs = (predictions, X[:-1], V[:-1], u, voltage, step, keep, whiten, weight, before)
     z = jax.lax.scan(body, start, xs)[1].astype(jnp.float32)
     return jnp.moveaxis(z, 2, 0).reshape(lanes, -1, z.shape[3])
 
@@ -118,7 +128,16 @@ def whitened_sensitivities(
     double precision, which poses need, all others one in single precision, `LANES` (or `FEW`) at a
     time. Up to `AHEAD` calls run in parallel.
     """
-    records = Records.of(data)
+    records, latent = Records.of(data), predictions.latent
+    predictions = predictions._replace(late=None, latent=None)
+    instead = None
+    if latent is not None:
+        # latent velocities are those of the predictions
+        own = np.array(data.latent)
+        V = records.V.at[:-1, own].set(predictions.start[1][:, own])
+        records = records._replace(V=V.at[-1, own].set(predictions.V[-1, own]))
+        if latent.carried is not None:
+            instead = jnp.asarray(latent.instead), jnp.asarray(latent.carried)
     filters = (jnp.asarray(kalman.keep), jnp.asarray(kalman.whiten), jnp.asarray(data.weight))
     reads = np.array([kind(e.cause).family == "measurement" for e in library.entries])
     of_instruments = np.any((probes != 0) & reads, axis=1)
@@ -146,7 +165,7 @@ def whitened_sensitivities(
             chunk[1 : 1 + len(some)] = probes[some]
             lanes = library.filled((theta + chunk).T[:, :, None])
             effects = _of_family(lanes, believed, instruments)
-            arguments = predictions, records, filters, size + 1, instruments
+            arguments = predictions, records, filters, instead, size + 1, instruments
             call = _threads().submit(run, model, effects, *arguments)
             running.append((some, call))
             if len(running) > AHEAD:

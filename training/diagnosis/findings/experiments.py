@@ -24,7 +24,7 @@ from ....models.effects.noise import DisturbanceStateDependence
 from ..disturbance.laws import Law
 from ..filter.gram import gram
 from ..filter.innovations import predict
-from ..filter.noise import judging_filter
+from ..filter.kalman import judging_filter
 from ..filter.problem import WILD, DiagnosisProblem, Evaluation
 from ..filter.sensitivities import whitened_sensitivities
 from ..filter.transition import Transition
@@ -135,8 +135,8 @@ def _products_of_maneuvers(
         data = replace(data, weight=data.weight * tame)
         if not data.weight.any():
             continue
-        steps = Transition.along(jacobian, data.weight, p.late)
-        kalman = judging_filter(final.noise, steps, inverse, data.dt, data.step, jacobian)
+        steps = Transition.along(jacobian, data.weight, p.late, p.latent)
+        kalman = judging_filter(final.noise, steps, inverse, data.dt, data.step, jacobian, p.latent)
         z = whitened_sensitivities(
             problem.model, problem.library, final.theta, design.probes, data, p, kalman
         )

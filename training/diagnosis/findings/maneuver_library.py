@@ -17,6 +17,7 @@ from ....models.se3 import AXES
 from ....models.thrusters import Thrusters
 from ...data.maneuvers import largest
 from ..data.arrays import Data
+from ..filter.latent import specific_force
 from ..filter.problem import DiagnosisProblem
 from ..validation.forecast import forecast
 
@@ -217,4 +218,5 @@ def _flown(model: Extended, data: Data) -> Data:
     last = np.maximum(there.sum(axis=0) - 1, 0)  # its repetitions have no weight
     at = np.minimum(np.arange(len(X))[:, None], last)[:, None]
     X, V = (np.take_along_axis(states, at, axis=0) for states in (X, V))
-    return replace(data, X=X, V=V, weight=data.weight * there[1:])
+    force = None if data.specific_force is None else specific_force(X, V, data.step)
+    return replace(data, X=X, V=V, weight=data.weight * there[1:], specific_force=force, climb=None)

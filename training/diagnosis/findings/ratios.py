@@ -78,6 +78,8 @@ def ratios(
             slopes[key].append((after - mean[key]) / _STEP)
     found = []
     for (name, where), value in mean.items():
+        if where in problem.data.unseen:
+            continue
         slope = np.array(slopes[name, where])
         error = 1.96 * float(np.sqrt(max(slope @ slope, np.sum((scores @ slope) ** 2))))
         unit = _UNITS[name][where in AXES[3:]]

@@ -267,18 +267,22 @@ def _law_values(
 def noise_levels(problem: DiagnosisProblem, evaluation: Evaluation) -> dict[str, float]:
     """Levels of noise, mean over the axes of a sensor."""
     groups = ("position_m", "attitude_rad", "velocity_m_s", "rate_rad_s")
-    found = {
-        g: float(np.mean(evaluation.noise.record[3 * i : 3 * i + 3])) for i, g in enumerate(groups)
-    }
-    if problem.data.unmeasured:
-        del found["position_m"]
+    found, measured = {}, problem.data.measured > 0
+    for i, group in enumerate(groups):
+        own = slice(3 * i, 3 * i + 3)
+        if measured[own].any():
+            found[group] = float(np.mean(evaluation.noise.record[own][measured[own]]))
+    for i in problem.data.felt:
+        found[f"specific_force_{AXES[i]}"] = float(evaluation.noise.record[6 + i] / problem.data.dt)
     for name, slip in zip(
         ("position", "attitude"), np.split(evaluation.noise.slip, 2), strict=True
     ):
-        if np.any(slip > 0):
+        if np.any(slip > 0) and not (name == "position" and problem.data.felt):
             found[f"slip_{name}"] = float(np.mean(slip))
     return found | {
-        f"diffusion_{a}": float(b) for a, b in zip(AXES, evaluation.noise.diffusion, strict=True)
+        f"diffusion_{a}": float(b)
+        for a, b in zip(AXES, evaluation.noise.diffusion, strict=True)
+        if a not in problem.data.unseen
     }
 
 

@@ -40,6 +40,11 @@ class Choice:
         return replace(self, ties=tuple(h for h in self.ties if h[0] not in taken))
 
 
+def acts_unseen(where: str, unseen: Sequence[str]) -> bool:
+    """Whether a place is an axis, or couples one, of which no instrument tells."""
+    return any(axis in unseen for axis in where.split("_from_"))
+
+
 def admissible(library: Library, theta: Float[np.ndarray, " p"], fit: Fit) -> bool:
     """Whether every estimate lies in its range; a sign that physics forbids vetoes a cause."""
     for i, change, error in zip(fit.parameters, fit.values, fit.errors, strict=True):

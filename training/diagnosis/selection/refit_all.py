@@ -19,9 +19,10 @@ from ....models.effects.library import COEFFICIENTS, Entry, kind
 from ....models.effects.traits import Group
 from ...least_squares import Damping, LocalModel, minimise
 from ..filter.gram import least_within
-from ..filter.noise import Filter
+from ..filter.kalman import Filter
 from ..filter.problem import DiagnosisProblem, Evaluation
 from .hypotheses import known_within
+from .model_selection import acts_unseen
 
 _ROUNDS = 40
 _DAMPING, _FULL_STEP = Damping(start=0.0, after_failure=1.0, least=0.0), 0.1
@@ -67,6 +68,8 @@ def coefficients(problem: DiagnosisProblem) -> list[Coefficient]:
         cls, p = kind(entry.cause), entry.parameter
         prior = cls.refit_prior(base, entry.where) or (p.refit or p.spread, p.low)
         if not is_coefficient(entry, "all") or entry.cause in replaced or not prior[0]:
+            continue
+        if acts_unseen(entry.where, problem.data.unseen):
             continue
         if cls.refit_needs <= problem.data.offers:
             start = problem.believed[i]
@@ -156,13 +159,19 @@ def _as_coefficients(problem: DiagnosisProblem, rows: Sequence[int]) -> list[Coe
 
 
 def one_step(problem: DiagnosisProblem, theta: Float[np.ndarray, " p"]) -> Filter:
-    """The filter with the gain K = I: its innovations are one-step errors, whitened."""
+    """The filter with the gain K = I: its innovations are one-step errors, whitened.
+
+    Latent velocities have no gain: they are simulated, and depend on θ through all steps before.
+    """
     error = problem.errors(theta)
     C, _ = _by_piece(problem, error, problem.covariance(error, apart=True))
     whiten = np.moveaxis(np.linalg.inv(np.linalg.cholesky(C)), 0, -1)
     whiten = np.repeat(whiten[None], len(problem.data.u), axis=0)
     log_det = np.broadcast_to(np.linalg.slogdet(C)[1] / 2, problem.data.weight.shape)
-    return Filter(np.zeros_like(whiten), whiten, log_det)
+    keep = np.zeros_like(whiten)
+    for i in problem.data.latent:
+        keep[:, 6 + i, 6 + i] = 1.0
+    return Filter(keep, whiten, log_det)
 
 
 def _by_piece(

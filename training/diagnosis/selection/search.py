@@ -13,13 +13,14 @@ from ....models.effects.traits import Group
 from ....models.se3 import AXES
 from ..disturbance.found import laws_of, won_by
 from ..disturbance.waves import correlated_noise_of
-from ..filter.noise import Filter
+from ..filter.kalman import Filter
 from ..filter.problem import DiagnosisProblem, Evaluation
 from ..validation.validation import Contender, scores
 from .hypotheses import Fit
 from .model_selection import (
     Choice,
     Hypothesis,
+    acts_unseen,
     admissible,
     choose,
     is_itself,
@@ -51,7 +52,11 @@ def refitted(problem: DiagnosisProblem, refit: Refit) -> list[int]:
         return [c.row for c in coefficients(problem)]
     if refit in ("none", "auto"):
         return []
-    return [i for i, e in enumerate(problem.library.entries) if is_coefficient(e, refit)]
+    return [
+        i
+        for i, e in enumerate(problem.library.entries)
+        if is_coefficient(e, refit) and not acts_unseen(e.where, problem.data.unseen)
+    ]
 
 
 def _asks_for_commands(named: Hypothesis, quiet: Sequence[str]) -> bool:
@@ -86,7 +91,9 @@ class Search:
         return [
             h
             for h in problem.library.hypotheses(single=False)
-            if h[0] not in free and not _asks_for_commands(h, self.quiet)
+            if h[0] not in free
+            and not _asks_for_commands(h, self.quiet)
+            and not acts_unseen(h[1], problem.data.unseen)
         ]
 
     def run(

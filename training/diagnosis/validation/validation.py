@@ -5,6 +5,7 @@ judged on; of a single scenario runs are left out in turn, of a single run block
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,8 @@ from ...evaluation.metrics import BANDS, order_statistics
 from ..data.arrays import Data
 from ..disturbance.laws import Law
 from ..filter.innovations import predict
-from ..filter.noise import estimate, score_of
+from ..filter.kalman import log_density, make_filter, with_states
+from ..filter.noise import estimate
 from ..filter.problem import DiagnosisProblem
 from ..filter.transition import Transition
 from ..findings import result
@@ -54,12 +56,15 @@ class Scores(NamedTuple):
         density: log density of the innovations (nats) (R,).
         record, diffusion, slip: noise of the records, of the disturbance, and slip of the poses
             (12, R), (6, R), (6, R).
+        latent: filtered velocities that were not measured, in all records of the twist; None where
+            all were measured. Their `record` is the standard deviation of the filter.
     """
 
     density: Float[np.ndarray, " R"]
     record: Float[np.ndarray, "12 R"]
     diffusion: Float[np.ndarray, "6 R"]
     slip: Float[np.ndarray, "6 R"]
+    latent: Float[np.ndarray, "M 6 R"] | None = None
 
 
 def scores(problem: DiagnosisProblem, contender: Contender, estimated: bool) -> Scores:
@@ -70,21 +75,31 @@ def scores(problem: DiagnosisProblem, contender: Contender, estimated: bool) -> 
     if contender.black_box is not None:
         h = data.step[:, None]
         a = np.asarray(contender.black_box.acceleration(*arguments(data))).swapaxes(0, 1) * h
-        error = error - np.concatenate([a * h / 2, a], axis=1) * data.measured[:, None]
+        error = error - np.concatenate([a * h / 2, a], axis=1) * data.used[:, None]
     mass = problem.mass(theta.mean(axis=1))
     density = np.zeros(len(data.fold))
     record = np.zeros((12, len(density)))
     diffusion, slip = np.zeros((2, 6, len(density)))
+    own_V = data.V.copy() if data.latent else None
     for label in np.unique(data.fold):
         own = data.fold == label
         rest = data.weight * (~own if not own.all() else 1)
-        steps = Transition.along(jacobian, rest, p.late)
+        steps = Transition.along(jacobian, rest, p.late, p.latent)
         noise = estimate(error, rest, steps, mass, data.dt, estimated=estimated)
         record[:, own], diffusion[:, own] = noise.record[:, None], noise.diffusion[:, None]
         slip[:, own] = noise.slip[:, None]
-        given = np.linalg.inv(mass), data.dt, data.step[:, own], data.weight[:, own]
-        density[own] = score_of(error[:, :, own], jacobian[..., own], noise, steps, *given)
-    return Scores(density, record, diffusion, slip)
+        latent = None if p.latent is None else p.latent.of(own)
+        given = np.linalg.inv(mass), data.dt, data.step[:, own], jacobian[..., own], latent
+        kalman = make_filter(noise, steps, *given)
+        z, states = with_states(error[:, :, own], jacobian[..., own], kalman, latent)
+        density[own] = log_density(z, kalman, data.weight[:, own])
+        if own_V is not None:
+            at = 6 + np.array(data.latent)
+            start = np.asarray(p.start[1])[..., own] - states[:, 6:]
+            for i in data.latent:
+                own_V[:-1, i, own] = start[:, i]
+            record[at[:, None], own] = kalman.state[at, None]
+    return Scores(density, record, diffusion, slip, own_V)
 
 
 def judge(
@@ -102,7 +117,9 @@ def judge(
     the same for all folds and contenders.
     """
     data, theta = problem.data, contender.theta
-    density, record, diffusion, slip = scores(problem, contender, estimated)
+    density, record, diffusion, slip, V = scores(problem, contender, estimated)
+    if V is not None:
+        problem = replace(problem, data=replace(data, V=V))
     kept = _spread(data.fold, _PIECES)
     levels = record[:, kept], diffusion[:, kept] * contender.white_share[:, None], slip[:, kept]
     kinds = {problem.library.entries[i][:2] for i in in_use}
@@ -149,9 +166,11 @@ def _judged(simulated: Simulated, score: np.ndarray, data: Data, horizon: float)
     square = np.zeros((len(at), len(GROUPS), len(labels)))
     energy, count = np.zeros((len(at), len(labels))), np.zeros((len(at), len(labels)))
     inside = np.zeros((len(BANDS), len(at), len(labels)))
+    parts = _compared(data)
     for h, steps in enumerate(at):
         rows = np.arange(steps - 1, len(e), every)
         own, exists = e[rows], weight[rows] > 0  # (K, 12, 1 + S, R), (K, R)
+        own = own[:, data.compared > 0]
         drawn = own[:, :, 1:]
         apart = np.abs(drawn[:, :, 1:] - drawn[:, :, :-1])
         with np.errstate(invalid="ignore", over="ignore"):  # of forecasts that diverge
@@ -162,7 +181,7 @@ def _judged(simulated: Simulated, score: np.ndarray, data: Data, horizon: float)
             w = exists * (fold == label)
             count[h, f] = w.sum()
             energy[h, f] = (np.where(w, far, 0)).sum()
-            for g, group in enumerate(GROUPS.values()):
+            for g, group in enumerate(parts):
                 total = (own[:, group, 0] ** 2).sum(axis=1)
                 square[h, g, f] = np.where(w, total, 0).sum()
             for b, band in enumerate(BANDS):
@@ -170,6 +189,15 @@ def _judged(simulated: Simulated, score: np.ndarray, data: Data, horizon: float)
                 hit = (ordered[:, :, low] <= 0) & (ordered[:, :, high] >= 0)
                 inside[b, h, f] = (hit.mean(axis=1) * w).sum()
     return Judged(score, square, energy, inside, count, simulated)
+
+
+def _compared(data: Data) -> list[list[int]]:
+    """Places of each group's errors among those that are compared."""
+    kept = np.flatnonzero(data.compared)
+    return [
+        [k for k, i in enumerate(kept) if group.start <= i < group.stop]
+        for group in GROUPS.values()
+    ]
 
 
 def horizons(longest: float, every: int, dt: float) -> list[int]:
@@ -207,7 +235,10 @@ def model_gain(
     steps = np.array([data.weight[:, data.fold == f].sum() for f in labels])
     score = np.array([judged.score[data.fold == f].sum() for f in labels])
     before = np.array([base.score[data.fold == f].sum() for f in labels])
-    rmse = {g: by_horizon(judged.square[:, k], True) for k, g in enumerate(GROUPS)}
+    parts = _compared(data)
+    rmse = {
+        g: by_horizon(judged.square[:, k], True) if parts[k] else {} for k, g in enumerate(GROUPS)
+    }
     return result.ModelGain(
         log_score=ratio(score, steps),
         log_score_gain=ratio(score - before, steps),

@@ -111,24 +111,30 @@ class Messages:
         name = bits.lower()
         return self.make(f"std_msgs/msg/{bits}MultiArray", data=np.ascontiguousarray(values, name))
 
-    def write(self, path: Path, rows: Iterable[tuple[int, str, Any]], **settings: Any) -> Path:
-        """Write (received in ns, topic, message) as a bag; returns what an import reads."""
+    def write(self, path: Path, rows: Iterable[tuple[int, str, Any]], packed: str = "") -> Path:
+        """Write (received in ns, topic, message) as a bag; returns what an import reads.
+
+        `packed` is a compression of ROS 1, or what ROS 2 compresses.
+        """
         rows = sorted(rows, key=lambda row: row[0])
         if self.kind == "ros1":
             writer: Any = rosbag1.Writer(path.with_suffix(".bag"))
             into, code = path.with_suffix(".bag"), self.store.serialize_ros1
+            if packed:
+                writer.set_compression(rosbag1.Writer.CompressionFormat[packed.upper()])
         else:
             storage = rosbag2.StoragePlugin[self.kind.upper()]
             writer = rosbag2.Writer(path, version=9, storage_plugin=storage)
             into, code = path, self.store.serialize_cdr
+            if packed:
+                mode = rosbag2.CompressionMode[packed]
+                writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
         connections: dict[str, Any] = {}
         with writer:
             for received, topic, message in rows:
                 type_ = message.__msgtype__
                 if topic not in connections:
-                    connections[topic] = writer.add_connection(
-                        topic, type_, typestore=self.store, **settings
-                    )
+                    connections[topic] = writer.add_connection(topic, type_, typestore=self.store)
                 writer.write(connections[topic], received, code(message, type_))
         return into
 

@@ -410,6 +410,8 @@ def test_refusals_name_the_remedy(tmp_path, capsys, monkeypatch):
     empty.mkdir()
     (empty / "metadata.yaml").write_text("a: 1\n")
     assert "damaged" in _fails(capsys, empty)
+    (idle / "metadata.yaml").unlink()
+    assert "has no metadata.yaml, so the bag was not closed" in _fails(capsys, idle)
     tlog = tmp_path / "dive.tlog"
     tlog.write_bytes(dive(duration=1.0).bytes())
     assert "--topics is for ROS bags" in _fails(capsys, tlog, "--topics", "map.yaml")
@@ -459,3 +461,50 @@ def test_the_extra_is_named_where_it_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(UserError, match=r"install spinndrift\[ros\]"):
         import_log(path)
+
+
+def test_an_odometry_with_its_twist_in_the_world(tmp_path):
+    messages = Messages("mcap")
+    rows = commands(messages)
+    for t in times(50.0):
+        X, V, v_W = truth(t)
+        w_W = rotations(X[:4, None]).apply(V[3:])[0]
+        rows.append((ns(t), "/pose_gt", messages.odometry(ns(t), X[:4], X[4:], v_W, w_W, "world")))
+    path = messages.write(tmp_path / "bag", rows)
+    recording, report = imported(path)
+    assert max(against_truth(recording)) < _INTERPOLATION
+    assert "as the positions tell" in str(report)
+    with open_bag(path) as bag:
+        (tmp_path / "map.yaml").write_text(written(bag, propose(bag)))
+    with pytest.raises(UserError, match="`expressed: world` in the topic map"):
+        imported(path, topics=tmp_path / "map.yaml")
+
+
+def test_axes_that_contradict_the_motion_are_refused(tmp_path):
+    """FRD velocities under a name of FLU, and an accelerometer with z down."""
+    messages = Messages("mcap")
+    rows = commands(messages)
+    upside = commands(messages)
+    for t in times(50.0):
+        X, V, _ = truth(t)
+        F = frames.twist_frd_to_flu(V)
+        rows.append((ns(t), "/odom", messages.odometry(ns(t), X[:4], X[4:], F[:3], F[3:])))
+        a = rotations(X[:4, None]).inv().apply([0.0, 0.0, -9.81])[0]
+        upside.append((ns(t), "/odom", messages.odometry(ns(t), X[:4], X[4:], V[:3], V[3:])))
+        upside.append((ns(t), "/imu", messages.imu(ns(t), None, V[3:], a)))
+    path = messages.write(tmp_path / "bag", rows)
+    with pytest.raises(UserError, match=r"wrong-frame|in ENU/FRD, expressed in the body, they fit"):
+        imported(path)
+    accepted, _ = import_log(path, accept=["wrong-frame"])
+    assert accepted.duration > 5
+    with pytest.raises(UserError, match="does not point up"):
+        imported(messages.write(tmp_path / "upside", upside))
+
+
+@pytest.mark.parametrize("form", ["bz2", "lz4", "FILE", "MESSAGE", "STORAGE"])
+def test_packed_bags(form, tmp_path):
+    messages = Messages("ros1" if form.islower() else "mcap" if form == "STORAGE" else "sqlite3")
+    rows = odometry(messages) + commands(messages)
+    plain, _ = imported(messages.write(tmp_path / "plain", rows))
+    packed, _ = imported(messages.write(tmp_path / "packed", rows, packed=form))
+    assert packed.dataset.drop_attrs().identical(plain.dataset.drop_attrs())

@@ -16,6 +16,7 @@ WORDS: dict[str, tuple[Severity, str]] = {
     "not-a-submarine": ("severe", "the log is of another kind of vehicle or autopilot"),
     "frame-contradiction": ("severe", "the log's frame and its outputs contradict each other"),
     "frame-without-preset": ("severe", "no preset has the thrusters of the log's frame"),
+    "wrong-frame": ("severe", "axes of a topic contradict the motion"),
     "no-commands": ("severe", "no command ever differs from zero"),
     "no-answer": ("severe", "the commands are large, and the motion answers none of them"),
     "columns-exchanged": ("severe", "columns of commands stand in another order"),

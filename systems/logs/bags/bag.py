@@ -37,7 +37,8 @@ _LATEST_NS = 1 << 62
 def bag_kind(path: Path) -> Kind | None:
     """What kind of bag a path holds by its content; None if none."""
     if path.is_dir():
-        return "folder" if (path / METADATA).is_file() else None
+        inside = (path / METADATA).is_file() or any(p.suffix in _STORAGE for p in path.iterdir())
+        return "folder" if inside else None
     try:
         with path.open("rb") as handle:
             head = handle.read(16)
@@ -219,6 +220,11 @@ def open_bag(path: Path) -> Iterator[Bag]:
     kind = bag_kind(path)
     if kind is None:
         raise UserError(f"{path}: no ROS bag; give a .bag, .db3 or .mcap file, or the bag's folder")
+    if kind == "folder" and not (path / METADATA).is_file():
+        raise UserError(
+            f"{path}: has no {METADATA}, so the bag was not closed after recording; repair it with "
+            f"{_REPAIR[kind]}, or give one of its files"
+        )
     reader, broken = _reader(path, kind)
     try:
         reader.open()

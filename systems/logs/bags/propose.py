@@ -19,6 +19,8 @@ _ORDERED = re.compile(r"cmd|command|setpoint|desired|target|reference|goal|plann
 """Names of topics that say what shall be, not what is."""
 _GRAVITY, _APART = 9.81, 5.0
 _PULSES_US = (800.0, 2200.0)
+_USUAL = re.compile(r"odom", re.I)
+"""In the names of topics of the vehicle's own estimate (REP 105), before fixes of a GPS."""
 _FASTER = 3.0
 _STICKS = "mavros_msgs/msg/OverrideRCIn"
 _NAMES: dict[Quantity, re.Pattern[str]] = {
@@ -192,13 +194,14 @@ def _space(seen: Seen) -> str:
 
 
 def _best(seen: Sequence[Seen], quantity: Quantity) -> Seen | None:
-    """The topic of the preferred type with the highest rate; the first by name of equal ones."""
+    """The topic of the preferred type, of a usual name, with the highest rate."""
     order = _FIRST.get(quantity, ())
 
-    def rank(one: Seen) -> tuple[int, int]:
+    def rank(one: Seen) -> tuple[int, bool, int]:
         name = one.column.type.rsplit("/", 1)[-1]
         place = next((i for i, start in enumerate(order) if name.startswith(start)), len(order))
-        return place, -round(one.rate)
+        unusual = quantity in ("position", "velocity") and _USUAL.search(one.topic) is None
+        return place, unusual, -round(one.rate)
 
     return min((s for s in seen if s.has(quantity)), key=rank, default=None)
 

@@ -65,18 +65,22 @@ class Quantities:
         one, t, p = found
         return series(t, ned_to_enu(p) if one.world_down else p, one.topic, "position")
 
-    def velocity(self, attitude: Series) -> Series | None:
-        """Velocity of Bo in W (m/s), turned by the message's own attitude if it has one."""
+    def velocity(self, attitude: Series, topic: Topic | None = None) -> Series | None:
+        """Velocity of Bo in W (m/s), turned by the message's own attitude if it has one.
+
+        `topic` has other axes than the map's.
+        """
         found = self.taken("velocity")
         if found is None:
             return None
         one, t, v = found
+        mapped, one = one, one if topic is None else topic
         if one.expressed == "world":
             v_W = ned_to_enu(v) if one.world_down else v
         else:
             column = self.columns[one.topic]
             own = FORMS[column.type].gives.get("attitude")
-            q = None if own is None else _attitude(column.x[own], one)
+            q = None if own is None else _attitude(column.x[own], mapped)
             if q is None or not np.isfinite(q).all():
                 q = slerp(t, attitude.t, attitude.x)
             v_W = rotations(q).apply((frd_to_flu(v) if one.body_down else v).T).T

@@ -25,6 +25,7 @@ from ..signals import (
 from ..signals_tlog import UNAIDED
 from ..streams import missing_states
 from ..wiring import PRESETS, Wiring, direction_findings, thruster_outputs, wiring
+from .axes import axes_findings, velocity_axes
 from .bag import Bag, Column, open_bag
 from .clocks import Clock
 from .messages import COMMANDS, PRESSURE, SAMPLED, Quantity
@@ -57,7 +58,7 @@ def read_bag(
         try:
             used = propose(bag) if given is None else given
             columns = bag.read([one.topic for one in used.topics], progress)
-            found = _signals(bag, used, columns, vehicle, density)
+            found = _signals(bag, used, columns, vehicle, density, given is None)
         except UserError as error:
             raise UserError(f"{path}: {error}") from error
         return replace(found, notes=(*bag.notes, *told, *found.notes))
@@ -69,6 +70,7 @@ def _signals(
     columns: Mapping[str, Column],
     vehicle: str | None,
     density: float | None,
+    proposed: bool,
 ) -> Signals:
     reference = used.of("attitude")
     if reference is None or reference.topic not in columns:
@@ -85,6 +87,8 @@ def _signals(
     known = {p.name: p.value for p in parameters}
     outputs, command, wired, wire_notes = _outputs(bag, taken, parameters, (first, last), vehicle)
     autopilot = taken.topic("parameters")
+    if proposed:
+        taken = _by_motion(taken, attitude)
     position, velocity, motion_notes = _motion(taken, attitude)
     rates = taken.rates(attitude)
     if rates is None:
@@ -102,7 +106,8 @@ def _signals(
     spans = {"wiring": wired.spans, **_states(taken), **_aiding(taken, velocity)}
     voltage = _voltage(taken)
     batteries = [one.topic for one in (taken.topic("voltage"),) if one is not None]
-    findings = [*missing_states(spans, voltage, batteries, "mavros_msgs/State"), *_broken(columns)]
+    findings = axes_findings(taken, attitude, taken.position(), force)
+    findings += [*missing_states(spans, voltage, batteries, "mavros_msgs/State"), *_broken(columns)]
     return Signals(
         attitude=attitude,
         rates=rates,
@@ -121,6 +126,22 @@ def _signals(
         findings=(*findings, *direction_findings(wired)),
         turned=wired.turned,
     )
+
+
+def _by_motion(taken: Quantities, attitude: Series) -> Quantities:
+    """The quantities, with a twist in the world's axes if only that fits the positions.
+
+    Some simulators publish so, against nav_msgs/Odometry. Other contradictions are findings.
+    """
+    found, given = velocity_axes(taken, attitude, taken.position()), taken.topic("velocity")
+    if found is None or given is None or found[0].frame != given.frame:
+        return taken
+    one = found[0]
+    taken.notes.append(
+        f"{one.topic}: its twist is expressed in the {one.expressed}, as the positions tell."
+    )
+    others = [one if t.topic == one.topic else t for t in taken.map.topics]
+    return replace(taken, map=TopicMap(tuple(others)))
 
 
 def _same(one: Topic | None, other: Topic | None) -> bool:
@@ -151,7 +172,8 @@ def _outputs(
     if quantity is None or found is None:
         raise UserError(
             f"no topic tells what the thrusters did ({listed(bag)}); record mavros_msgs/RCOut or "
-            f"the commands of the thrusters, or {_HOW}"
+            f"the commands of the thrusters, or {_HOW}; numbers within ±1 need `scale` and "
+            "`offset` there"
         )
     one, t, x = found
     if quantity == "wrench":

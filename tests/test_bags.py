@@ -508,3 +508,38 @@ def test_packed_bags(form, tmp_path):
     plain, _ = imported(messages.write(tmp_path / "plain", rows))
     packed, _ = imported(messages.write(tmp_path / "packed", rows, packed=form))
     assert packed.dataset.drop_attrs().identical(plain.dataset.drop_attrs())
+
+
+def test_a_topic_of_each_thruster(tmp_path):
+    """As Gazebo has them: numbered from 0, each with its own times."""
+    messages = Messages("mcap")
+    rows, given = odometry(messages), []
+    for k in range(8):
+        t = times(10.0 + k, 0.01 * k)
+        given.append((t, 5.0 * np.sin(t + k)))
+        for s, force in zip(*given[-1], strict=True):
+            message = messages.make("std_msgs/msg/Float64", data=float(force))
+            rows.append((ns(s), f"/bluerov2/thruster{k}/cmd_thrust", message))
+    recording, _ = imported(messages.write(tmp_path / "bag", rows))
+    (run,) = recording.trajectories()
+    grid = START + run.start + recording.dt * np.arange(len(run))
+    expected = np.stack([hold(grid, t, x, recording.dt) for t, x in given], axis=1)
+    np.testing.assert_allclose(run.commands["thruster_force"][4:], expected[4:], atol=1e-6)
+
+
+def test_a_plain_vehicle_without_a_horizontal_estimate(tmp_path):
+    messages = Messages("ros1")
+    rows = commands(messages)
+    for t in times(50.0):
+        X, V, _ = truth(t)
+        height = messages.make("std_msgs/msg/Float64", data=float(X[6]))
+        rows.append((ns(t), "/mavros/imu/data", messages.imu(ns(t), X[:4], V[3:])))
+        rows.append((ns(t), "/mavros/global_position/rel_alt", height))
+    recording, report = imported(messages.write(tmp_path / "bag", rows))
+    (run,) = recording.trajectories()
+    X, V, v_W = truth(START + run.start + recording.dt * np.arange(len(run)))
+    assert recording.missing == {"X_WB": ("x", "y"), "V_WB_B": ("u", "v")}
+    np.testing.assert_allclose(run.X_WB[:, 6], X[6], atol=_INTERPOLATION)
+    climb = run.sensors["vertical_velocity"]
+    np.testing.assert_allclose(climb, v_W[2], atol=0.05**2 / 6 * 8 + _INTERPOLATION)
+    assert "Height and climb from /mavros/global_position/rel_alt" in str(report)

@@ -24,6 +24,11 @@ _MAP = """topics:
 - {topic: /pwm, gives: [pwm], scale: 1.0, channels: [1, 2, 3, 4, 5, 6, 7, 8]}
 - {topic: /mavros/state, gives: [state]}
 """
+_SINGLE = """topics:
+- {topic: /odom, gives: [attitude, position, velocity, rates]}
+- {topic: /t1, gives: [forces], thruster: 1, delay: 0.1}
+- {topic: /t2, gives: [forces], thruster: 8}
+"""
 
 
 def _rows(messages: Messages, rng: Rng | None) -> list[tuple[int, str, Any]]:
@@ -49,6 +54,8 @@ def _rows(messages: Messages, rng: Rng | None) -> list[tuple[int, str, Any]]:
             (n, "/odom", messages.odometry(stamp, X[:4], X[4:], V[:3], V[3:])),
             (n, "/imu", messages.imu(n, None, V[3:], V[:3] + np.array([0, 0, 9.81]))),
             (n, "/pwm", array),
+            (n, "/t1", messages.make("std_msgs/msg/Float64", data=float(pwm[0]))),
+            (n, "/t2", messages.make("std_msgs/msg/Float64", data=float(pwm[1]))),
             (n, "/mavros/state", messages.make("mavros_msgs/msg/State", header=(n, ""), **state)),
         ]
     return rows
@@ -80,7 +87,8 @@ def _spoil(rng: Rng, folder: Path) -> Path:
             data = bytes_spoiled(rng, data)
         path.write_bytes(data)
     if rng.random() < 0.3:
-        text = yaml_spoiled(rng, _MAP) if rng.random() < 0.6 else _MAP
+        text = pick(rng, (_MAP, _SINGLE))
+        text = yaml_spoiled(rng, text) if rng.random() < 0.6 else text
         text = text_spoiled(rng, text) if rng.random() < 0.3 else text
         text = text.encode("utf-8", "replace").decode()
         (folder / "fuzz.topics.yaml").write_text(text, encoding="utf-8")

@@ -109,7 +109,16 @@ def _aided(m: Any) -> tuple[float]:
 
 _POSE: Mapping[Quantity, slice] = {"attitude": slice(0, 4), "position": slice(4, 7)}
 _TWIST: Mapping[Quantity, slice] = {"velocity": slice(0, 3), "rates": slice(3, 6)}
-_NUMBER = Form(lambda m: (m.data,), {"depth": _ALL, "height": _ALL, "voltage": _ALL})
+_NUMBER = Form(
+    lambda m: (m.data,),
+    {"depth": _ALL, "height": _ALL, "voltage": _ALL, "pwm": _ALL, "forces": _ALL},
+)
+NUMBERS = (
+    "std_msgs/msg/Float32",
+    "std_msgs/msg/Float64",
+    "uuv_gazebo_ros_plugins_msgs/msg/FloatStamped",
+)
+"""Types of a single number: of a sensor, or of one thruster."""
 _ARRAY = Form(lambda m: m.data, {"pwm": _ALL, "forces": _ALL, "wrench": _ALL})
 
 FORMS: dict[str, Form] = {
@@ -142,7 +151,7 @@ FORMS: dict[str, Form] = {
     "mavros_msgs/msg/ParamEvent": Form(
         _parameter_event, {"parameters": _ALL}, lambda m: m.param_id
     ),
-    **{f"std_msgs/msg/Float{bits}": _NUMBER for bits in (32, 64)},
+    **dict.fromkeys(NUMBERS, _NUMBER),
     **{f"std_msgs/msg/Float{bits}MultiArray": _ARRAY for bits in (32, 64)},
     **{
         f"std_msgs/msg/{sign}Int{bits}MultiArray": Form(lambda m: m.data, {"pwm": _ALL})

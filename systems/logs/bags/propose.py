@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from ....models.config.errors import UserError
 from ....models.config.yaml_text import emit
 from .bag import Bag, Column
-from .messages import COMMANDS, FORMS, PRESSURE, Quantity
+from .messages import COMMANDS, FORMS, NUMBERS, PRESSURE, Quantity
 from .topics import Topic, TopicMap, frames_of
 
 _LOOKED_AT, _COMMANDS_LOOKED_AT = 200, 5000
@@ -22,6 +22,8 @@ _PULSES_US = (800.0, 2200.0)
 _USUAL = re.compile(r"odom", re.I)
 """In the names of topics of the vehicle's own estimate (REP 105), before fixes of a GPS."""
 _FASTER = 3.0
+_NUMBERED = re.compile(r"(?:thrust|motor|propeller)\D*(\d+)", re.I)
+"""In the name of a topic that drives one thruster."""
 _STICKS = "mavros_msgs/msg/OverrideRCIn"
 _NAMES: dict[Quantity, re.Pattern[str]] = {
     "depth": re.compile(r"depth", re.I),
@@ -70,6 +72,8 @@ class Seen:
         x = self.column.x[form.gives[quantity]]
         if not x.size or not np.isfinite(x).any():
             return False
+        if quantity in COMMANDS and self.column.type in NUMBERS:  # one thruster's: `_singles`
+            return False
         bare = self.column.type.startswith("std_msgs")
         test: Callable[[np.ndarray], bool] | None = _TESTS.get(quantity)
         if test is not None and (bare or quantity not in COMMANDS) and not test(x):
@@ -88,8 +92,8 @@ def _are_pulses(x: np.ndarray) -> bool:
 
 def _are_normal(x: np.ndarray) -> bool:
     """Whether numbers are likely parts of full thrust, not N: within ±1 but not all zero."""
-    most = float(np.nanmax(np.abs(x)))
-    return 0 < most <= 1
+    known = np.abs(x[np.isfinite(x)])
+    return known.size > 0 and 0 < float(known.max()) <= 1
 
 
 def _is_turned(q: np.ndarray) -> bool:
@@ -122,7 +126,7 @@ def inspect(bag: Bag) -> list[Seen]:
     found = []
     for topic in known:
         try:
-            array = bag.topics[topic].endswith("MultiArray")
+            array = bag.topics[topic].endswith("MultiArray") or bag.topics[topic] in NUMBERS
             columns = bag.read([topic], most=_COMMANDS_LOOKED_AT if array else _LOOKED_AT)
         except UserError:
             continue  # its messages can't be read, so it gives nothing
@@ -170,6 +174,7 @@ def propose(bag: Bag) -> TopicMap:
     first: Quantity | None = next((q for q in COMMANDS if commands[q] is not None), None)
     if first is not None:
         chosen[first] = commands[first]
+    singles = _singles(seen) if first is None else []
     chosen["parameters"] = next(
         (s for s in seen if "parameters" in FORMS[s.column.type].gives), None
     )
@@ -177,7 +182,27 @@ def propose(bag: Bag) -> TopicMap:
     for quantity, one in chosen.items():
         if one is not None:
             gives.setdefault(one.topic, []).append(quantity)
-    return TopicMap(tuple(_topic(s, gives[s.topic]) for s in seen if s.topic in gives))
+    found = [_topic(s, gives[s.topic]) for s in seen if s.topic in gives]
+    pulses = all(_are_pulses(s.column.x) for _, s in singles)
+    alone: Quantity = "pwm" if pulses else "forces"
+    return TopicMap((*found, *(replace(_topic(s, [alone]), thruster=k) for k, s in singles)))
+
+
+def _singles(seen: Sequence[Seen]) -> list[tuple[int, Seen]]:
+    """Topics that drive one thruster each, by a number in their names; thrusters from 1.
+
+    Numbers within ±1 throughout are parts of full thrust, not N, and are left to the user.
+    """
+    numbered = [
+        (int(match[1]), s)
+        for s in seen
+        if s.column.type in NUMBERS and (match := _NUMBERED.search(s.topic))
+    ]
+    numbered.sort(key=lambda pair: pair[0])
+    alike = len({number for number, _ in numbered}) == len(numbered) > 1
+    if not alike or _are_normal(np.concatenate([s.column.x for _, s in numbered], axis=1)):
+        return []
+    return [(k, s) for k, (_, s) in enumerate(numbered, 1)]
 
 
 def _rates(measured: Sequence[Seen], own: Sequence[Seen]) -> Seen | None:
@@ -233,4 +258,5 @@ def _told(one: Topic) -> dict[str, Any]:
         told["frame"] = one.frame
     if {"velocity", "rates"} & set(one.gives):
         told["expressed"] = one.expressed
-    return {**told, "delay": one.delay}
+    driven = {"thruster": one.thruster} if one.thruster else {}
+    return {**told, "delay": one.delay, **driven}

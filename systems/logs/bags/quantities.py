@@ -38,8 +38,26 @@ class Quantities:
     def taken(self, quantity: Quantity) -> tuple[Topic, np.ndarray, np.ndarray] | None:
         """Topic, times (s) and numbers (k, n) of a quantity, scaled; None if it is not there."""
         one = self.topic(quantity)
-        if one is None:
-            return None
+        if one is not None and one.thruster:
+            return self._thrusters(quantity, one)
+        return None if one is None else self._numbers(quantity, one)
+
+    def _thrusters(self, quantity: Quantity, first: Topic) -> tuple[Topic, np.ndarray, np.ndarray]:
+        """The commands of thrusters with a topic each, held to all their times; 0 without one."""
+        parts = [
+            self._numbers(quantity, one)
+            for one in self.map.topics
+            if quantity in one.gives and one.topic in self.columns
+        ]
+        sorted_ = [(one, *_in_order(t, x[0])) for one, t, x in parts]
+        t = np.unique(np.concatenate([t for _, t, _ in sorted_]))
+        t = t[t >= max(own[0] for _, own, _ in sorted_)]
+        held = np.zeros((max(one.thruster for one, _, _ in sorted_), t.size))
+        for one, own, x in sorted_:
+            held[one.thruster - 1] = x[np.searchsorted(own, t, side="right") - 1]
+        return first, t, held
+
+    def _numbers(self, quantity: Quantity, one: Topic) -> tuple[Topic, np.ndarray, np.ndarray]:
         column = self.columns[one.topic]
         t, told = self.clock.times(column)
         self.notes.extend(note for note in told if note not in self.notes)
@@ -123,6 +141,11 @@ class Quantities:
             return None
         one, t, x = found
         return series(t, sign * x[0], one.topic, limits)
+
+
+def _in_order(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    order = np.argsort(t, kind="stable")
+    return t[order], x[order]
 
 
 def _chosen(x: np.ndarray, channels: tuple[int, ...], absent: float) -> np.ndarray:

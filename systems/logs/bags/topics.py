@@ -41,6 +41,7 @@ class Topic:
         offset: added to its scaled numbers.
         channels: number of the element, from 1, that drives each thruster; 0 for none.
         directions: 1 or −1 of each thruster, as MOT_n_DIRECTION.
+        thruster: of a topic with a single number, the thruster (from 1) that it drives.
     """
 
     topic: str
@@ -53,11 +54,13 @@ class Topic:
     offset: float = 0.0
     channels: tuple[int, ...] = ()
     directions: tuple[int, ...] = ()
+    thruster: int = 0
 
     def __post_init__(self) -> None:
         late = abs(self.delay) <= _LARGEST_DELAY_S
         require(late, self, "delay", f"give seconds, at most {_LARGEST_DELAY_S:g}")
         require(self.scale != 0, self, "scale", "give a number other than 0")
+        require(0 <= self.thruster <= 32, self, "thruster", "give a number from 1 to 32")
         require(len(self.gives) > 0, self, "gives", "name what the topic tells, or leave it out")
         channels = all(0 <= c <= 32 for c in self.channels)
         require(channels, self, "channels", "give numbers from 1 to 32, or 0")
@@ -78,12 +81,16 @@ class Topic:
 
 @dataclass(frozen=True)
 class TopicMap:
-    """Every topic that is used; a quantity comes from one topic."""
+    """Every topic that is used; a quantity comes from one topic, or one of each thruster."""
 
     topics: tuple[Topic, ...]
 
     def __post_init__(self) -> None:
-        given = [q for one in self.topics for q in one.gives]
+        driven = [one.thruster for one in self.topics if one.thruster]
+        if len(set(driven)) < len(driven):
+            raise UserError("give each `thruster` to one topic, not to several")
+        given = [q for one in self.topics for q in one.gives if not one.thruster]
+        given += {q for one in self.topics for q in one.gives if one.thruster}
         for quantity in given:
             if given.count(quantity) > 1:
                 raise UserError(f"take {quantity} from one topic, not from several")

@@ -86,7 +86,6 @@ def _signals(
     parameters, strange = _parameters(taken)
     known = {p.name: p.value for p in parameters}
     outputs, command, wired, wire_notes = _outputs(bag, taken, parameters, (first, last), vehicle)
-    autopilot = taken.topic("parameters")
     if proposed:
         taken = _by_motion(taken, attitude)
     position, velocity, motion_notes = _motion(taken, attitude)
@@ -94,14 +93,8 @@ def _signals(
     if rates is None:
         rates = turning(attitude)
         motion_notes.append(f"{attitude.source}: body rates are differences of the attitude.")
-    force = taken.acceleration()
-    delays: list[str] = []
-    if _same(autopilot, taken.topic("rates")):
-        rates, delays = undelayed(rates, known, "INS_GYRO_FILTER")
-    if force is not None and _same(autopilot, taken.topic("acceleration")):
-        force, delay = undelayed(force, known, "INS_ACCEL_FILTER")
-        delays += delay
-    if _same(autopilot, taken.topic("position")):
+    rates, force, delays = _undelayed(taken, rates, known)
+    if _same(taken.topic("parameters"), taken.topic("position")):
         position, velocity = in_water(position, velocity, known, density)
     spans = {"wiring": wired.spans, **_states(taken), **_aiding(taken, velocity)}
     voltage = _voltage(taken)
@@ -126,6 +119,20 @@ def _signals(
         findings=(*findings, *direction_findings(wired)),
         turned=wired.turned,
     )
+
+
+def _undelayed(
+    taken: Quantities, rates: Series, known: Mapping[str, float]
+) -> tuple[Series, Series | None, list[str]]:
+    """Body rates and specific force without the delays of the autopilot's own filters."""
+    autopilot, force = taken.topic("parameters"), taken.acceleration()
+    delays: list[str] = []
+    if _same(autopilot, taken.topic("rates")):
+        rates, delays = undelayed(rates, known, "INS_GYRO_FILTER")
+    if force is not None and _same(autopilot, taken.topic("acceleration")):
+        force, delay = undelayed(force, known, "INS_ACCEL_FILTER")
+        delays += delay
+    return rates, force, delays
 
 
 def _by_motion(taken: Quantities, attitude: Series) -> Quantities:

@@ -37,10 +37,25 @@ axis, and number of such axes at most."""
 
 
 def groups(
-    problem: DiagnosisProblem, evaluation: Evaluation, quiet: Sequence[str] = ()
+    problem: DiagnosisProblem,
+    evaluation: Evaluation,
+    quiet: Sequence[str] = (),
+    of_commands: bool = False,
 ) -> Iterator[Group]:
-    """All groups that are tried; dependence on motion of `quiet` axes is not identifiable."""
+    """All groups that are tried, or those of the way from commands to forces alone.
+
+    Dependence on motion of `quiet` axes is not identifiable.
+    """
     d = problem.data
+    level = d.command != "F_Bo_B"
+    if level:
+        yield _of_exchange(problem)
+        for where in ("thrusters", *(str(k + 1) for k in range(d.u.shape[1]))):
+            for kind, numbers in FOLLOWED.items():
+                yield _of_follower(problem, kind, where, numbers)
+        yield _of_follower(problem, "steps", "thrusters", STEPS)
+    if of_commands:
+        return
     nodes = [(time, f) for time, frequencies in NODES.items() for f in frequencies]
     moving = [i for i, axis in enumerate(AXES) if axis not in quiet]
     for i in _correlated(evaluation):
@@ -52,15 +67,8 @@ def groups(
         yield _memory(problem, i, i, nodes)
         yield _of_state(problem, Unknown.neutral(kind="motion", acts_on=axis, numbers=_ALL_MOTION))
         yield _of_state(problem, Unknown.neutral(kind="pose", acts_on=axis))
-    level = d.command != "F_Bo_B"
     for k in range(d.u.shape[1] if level else 0):
         yield _of_thruster(problem, k)
-    if level:
-        yield _of_exchange(problem)
-        for where in ("thrusters", *(str(k + 1) for k in range(d.u.shape[1]))):
-            for kind, numbers in FOLLOWED.items():
-                yield _of_follower(problem, kind, where, numbers)
-        yield _of_follower(problem, "steps", "thrusters", STEPS)
     z = d.X[:-1, 6][d.weight > 0]
     numbers = (float(z.mean()), float(z.std() + 1e-3))
     yield _of_state(problem, Unknown.neutral(kind="depth", acts_on="W", numbers=numbers))
@@ -229,7 +237,7 @@ def _bumps(x: np.ndarray, y: np.ndarray, most: int = 16) -> tuple[float, ...]:
 
 
 _FINER = (1.4, 1.18, 1.08)
-_FINER_STEPS = (1.03, 1.015, 1.007)
+_FINER_STEPS = (1.03, 1.012, 1.005, 1.002, 1.0008)
 """Factors of successive refinements between nodes."""
 
 

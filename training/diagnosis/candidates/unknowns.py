@@ -63,10 +63,14 @@ def screened(
     rng: np.random.Generator,
     quiet: Sequence[str] = (),
 ) -> tuple[Screen, Matched, float] | None:
-    """The structure that wins most with `rows` free, of those significant against noise alone."""
+    """The structure that wins most with `rows` free, of those significant against noise alone.
+
+    In estimated states it is sought on the way from commands to forces alone: the estimator adds
+    structure of its own to motion, and none to commands.
+    """
     screen = Screen(problem, evaluation, sensitivities_of(problem, evaluation, rows))
     share = problem.data.steps / problem.data.weight[:, screen.kept].sum()
-    tried = list(groups(problem, evaluation, quiet))
+    tried = list(groups(problem, evaluation, quiet, of_commands=evaluation.noise.estimated))
     best: Matched | None = None
     for group in tried:
         m = screen.match(group, alpha / len(tried), rng)
@@ -100,12 +104,9 @@ def find_structure(
 ) -> tuple[Selection, FoundStructure | None]:
     """Structure in the residual of the causes; where it wins more than they do, in place of them.
 
-    In the second case the selection is back at the model without causes. None is sought in
-    estimated states, as their estimator adds structure of its own, nor in how `quiet` axes and
-    those without a measured velocity move.
+    In the second case the selection is back at the model without causes. None is sought in how
+    `quiet` axes and those without a measured velocity move.
     """
-    if state.current.noise.estimated:
-        return state, None
     problem, rng = state.problem, state.generator()
     quiet = [*quiet, *(AXES[i] for i in problem.data.latent)]
     rows = [*parameters_of(problem.library, state.hypotheses), *nuisance]

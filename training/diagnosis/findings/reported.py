@@ -23,6 +23,7 @@ from ..selection.model_selection import Choice, parameters_of
 from ..selection.state import Selection
 from . import result
 from .experiments import Experiment, of_law
+from .sentences import OF_THRUST
 
 _NAN = float("nan")
 _SCALE = 0.01
@@ -149,7 +150,8 @@ def left_over(
             "there that follows the commands"
         )
     gain, std = thrust_by_run(problem, evaluation)
-    if gain > max(least, *(c.evidence.heldout_gain for c in causes if _is_random(c.name)), 0.0):
+    laws = (c.evidence.heldout_gain for c in causes if _is_random(c.name))
+    if std > OF_THRUST and gain > max(least, *laws, 0.0):
         when = "within runs" if problem.data.left_out == "block" else "from run to run"
         left.append(
             f"thrust differs {when} (by {100 * std:.1f} %, standard deviation), as with a supply "

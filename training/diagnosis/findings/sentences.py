@@ -16,8 +16,8 @@ _NONE = 0.05
 """Share of the believed value below which a coefficient counts as absent."""
 _LOST = 0.25
 """Share of the believed thrust of an axis below which commands do not explain the motion there."""
-_OF_THRUST = 0.02
-"""Least difference of net buoyancy that is worth a word, as a share of heave's thrust."""
+OF_THRUST = 0.02
+"""Least share of the thrust that is worth a word: net buoyancy in heave, spread between runs."""
 _THRUST = ("half_thrust", "thrust")
 _WORDS = {
     "half_thrust": "thrust at half command in {}",
@@ -131,7 +131,7 @@ def coefficients_off(diagnosis_ratios: Sequence[result.Ratio], added: Sequence[s
         if low <= r.believed <= high:
             continue
         if r.name == NetBuoyancy.name:
-            least = _OF_THRUST * thrust.get(r.where, 0.0)
+            least = OF_THRUST * thrust.get(r.where, 0.0)
             if abs(r.found.value - r.believed) > least:
                 off.setdefault(r.name, []).append(r)
         elif _size(r) > np.log1p(_OFF) and r.believed:

@@ -1,7 +1,7 @@
 """From a recording to a learned model, evaluated on held-out data."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,11 @@ from ..training.config import TrainingConfig, WindowConfig
 from ..training.data.windows import Normalisation, Windows, make_windows
 from ..training.evaluation.evaluate import Evaluation, evaluate
 from ..training.fitting.fit import TrainingResult, fit
+from ..training.fitting.hidden_start import HiddenStart
 from ..training.fitting.run_folder import TRAINING
 from ..training.fitting.start import begun_with, estimate_diffusion, starting_model, with_diffusion
+from ..training.smoothing.complete import Completed
+from ..training.smoothing.fitted import Told, completed_as_it_is
 
 FINE_SUBSTEPS = 5
 """Steps per sample for models without a trained step of their own, such as presets."""
@@ -51,6 +54,8 @@ class Learned:
     evaluation: Evaluation
     substeps: int
     """Integration steps per sample in training."""
+    told: tuple[Told, ...] = ()
+    """What data without some channels tell of each coefficient of a constant model."""
 
 
 @dataclass(frozen=True)
@@ -84,11 +89,16 @@ def windowing(model: Dynamics | None, normalise: Normalisation) -> dict[str, Any
 
 
 def split_parts(
-    recording: Recording, vehicle: Vehicle, config: WindowConfig, model: Dynamics | None = None
+    recording: Recording,
+    vehicle: Vehicle,
+    config: WindowConfig,
+    model: Dynamics | None = None,
+    completed: Callable[[Recording], Completed] | None = None,
 ) -> Parts:
     """Split a recording into parts that do not overlap in time in any run (`Recording.split`).
 
-    `model` is to be trained or evaluated on them.
+    `model` is to be trained or evaluated on them. Each part is `completed` by itself, if it lacks
+    channels.
 
     Raises:
         UserError: it is too short for training windows and held-out windows.
@@ -108,6 +118,7 @@ def split_parts(
                 vehicle,
                 length_s=config.length_s,
                 stride_s=stride,
+                completed=None if completed is None else completed(part),
                 **windowing(model, config.normalise),
             )
         except UserError as error:
@@ -123,15 +134,61 @@ def split_parts(
     return Parts(cut(first, config.stride_s, "training"), validation, held_out)
 
 
-def compare(models: Mapping[str, tuple[Dynamics, int]], windows: Windows) -> Evaluation:
-    """Errors of models on the same windows, each with its own substeps per sample."""
+def compare(
+    models: Mapping[str, tuple[Dynamics, int]], windows: Windows | Mapping[str, Windows]
+) -> Evaluation:
+    """Errors of models on the same windows, each with its own substeps per sample.
+
+    Windows of a recording that lacks channels start from each model's own estimate of them.
+    """
     parts = [
-        evaluate({name: model}, windows, substeps=substeps)
+        evaluate(
+            {name: model},
+            windows if isinstance(windows, Windows) else windows[name],
+            substeps=substeps,
+        )
         for name, (model, substeps) in models.items()
     ]
     return Evaluation(
         xr.concat([part.dataset for part in parts], dim="model", combine_attrs="drop_conflicts")
     )
+
+
+def prepared(
+    recording: Recording, vehicle: Vehicle, start: Start, length_s: float
+) -> tuple[dict[str, tuple[Dynamics, int]], dict[str, Windows]]:
+    """Preset and learned model with their substeps, and the windows on which each is judged.
+
+    Raises:
+        UserError: no run is as long as a window, or a model with effects lacks channels.
+    """
+    models: dict[str, tuple[Dynamics, int]] = {
+        "preset": (vehicle.dynamics(), FINE_SUBSTEPS),
+        "learned": (start.model, start.substeps),
+    }
+    if recording.missing and isinstance(start.model, Extended):
+        raise UserError(
+            "model: one with effects is judged on recordings with all channels; give one without"
+        )
+    shared, windows = None, {}
+    for name, (model, substeps) in models.items():
+        completed = None
+        if recording.missing:
+            completed = completed_as_it_is(recording, vehicle, model)
+            if isinstance(model, FossenDynamics) and not bool(jnp.any(model.diffusion > 0)):
+                model = with_diffusion(model, completed.levels.diffusion)
+        if shared is None or completed is not None:
+            shared = make_windows(
+                recording,
+                vehicle,
+                length_s=length_s,
+                stride_s=length_s,
+                completed=completed,
+                **windowing(start.model, "heading"),
+            )
+        windows[name] = shared
+        models[name] = judged(model, shared), substeps
+    return models, windows
 
 
 def judged(model: Dynamics, windows: Windows) -> Dynamics:
@@ -171,7 +228,13 @@ def learn(
     """
     given = None if start is None else start.model
     config = begun_with(config, given)
-    parts = split_parts(recording, vehicle, config.windows, given)
+    hidden = None
+    if recording.missing:
+        progress(0.0, "estimating what was not recorded")
+        hidden = HiddenStart.of(recording, vehicle, config, given)
+        parts = split_parts(recording, vehicle, config.windows, given, hidden.completed)
+    else:
+        parts = split_parts(recording, vehicle, config.windows, given)
     claim(out, TRAINING)
     kept = out / "start.spinn"
     if resume and kept.exists() and (out / "checkpoint.npz").exists():
@@ -181,9 +244,13 @@ def learn(
         def first(step: int, total: int, loss: float) -> None:
             progress(_DRIFT * step / total, "drift first")
 
-        model = starting_model(config, vehicle, parts.learn, first, given, parts.validation)
+        model = starting_model(
+            config, vehicle, parts.learn, first, given, parts.validation,
+            None if hidden is None else hidden.fitted.model,
+        )  # fmt: skip
         save_model(kept, model)
-    preset = judged(vehicle.dynamics(), parts.learn)
+    preset = vehicle.dynamics() if hidden is None else hidden.preset
+    preset = judged(preset, parts.learn)
     substeps = config.objective.substeps
     metadata = _metadata(recording, vehicle, config)
     result = fit(
@@ -201,11 +268,16 @@ def learn(
     models = {"preset": (preset, FINE_SUBSTEPS), "learned": (result.model, substeps)}
     if start is not None:
         models["start"] = judged(start.model, parts.learn), start.substeps
-    evaluation = compare(models, parts.held_out)
+    windows = parts.held_out
+    if hidden is not None:
+        windows = {name: hidden.held_out(model) for name, (model, _) in models.items()}
+        parts = replace(parts, held_out=windows["learned"])
+    evaluation = compare(models, windows)
     evaluation.save(out / "evaluation.csv")
     evaluation.save(out / "evaluation.json")
     save_model(out / "preset.spinn", preset, metadata | {"substeps": FINE_SUBSTEPS})
-    return Learned(result.model, preset, parts, result, evaluation, substeps)
+    told = () if hidden is None else hidden.fitted.told
+    return Learned(result.model, preset, parts, result, evaluation, substeps, told)
 
 
 def _metadata(recording: Recording, vehicle: Vehicle, config: TrainingConfig) -> dict[str, Any]:

@@ -4,14 +4,21 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from spinndrift.models import se3
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.recordings.build import Trajectory
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.data.generate import GenerateConfig, generate
+from spinndrift.training.data.windows import make_windows
+from spinndrift.training.evaluation.evaluate import evaluate
+from spinndrift.training.losses.base import Batch
 from spinndrift.training.smoothing.complete import complete
+from spinndrift.training.smoothing.fitted import with_scales
 from spinndrift.training.smoothing.levels import Belief
+from spinndrift.training.smoothing.states import Scaled
 
 FINE, EVERY = 100.0, 5
 """Rate of the simulation (Hz), and samples of it per sample of the recording."""
@@ -103,3 +110,44 @@ def test_what_was_recorded_is_kept():
     for name, columns in (("X_WB", [0, 1, 2, 3, 6]), ("V_WB_B", [3, 4, 5])):
         kept, before = (d[name].to_numpy()[..., columns] for d in (found, recording.dataset))
         np.testing.assert_array_equal(kept, before)
+
+
+def test_scales_of_the_smoother_are_those_of_the_fitted_model():
+    model = load_vehicle("bluerov2_heavy").dynamics()
+    rng = np.random.default_rng(0)
+    scales = rng.normal(0, 0.3, 22)
+    X = se3.exp(jnp.asarray(rng.normal(0, 0.5, 6)))
+    V, F = jnp.asarray(rng.normal(0, 0.5, 6)), jnp.asarray(rng.normal(0, 10, 6))
+    expected = with_scales(model, scales, np.ones(6)).acceleration(X, V, F)
+    found = Scaled.of(model).acceleration(X, V, F, jnp.asarray(scales))
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_windows_of_hidden_channels_judge_what_was_recorded():
+    """A prediction that is wrong in u, v, x and y alone has no error; one wrong in yaw has."""
+    vehicle = load_vehicle("bluerov2_heavy")
+    recording, _ = simulated(vehicle)
+    found = complete(recording, vehicle, vehicle.dynamics(), rounds=1)
+    windows = make_windows(recording, vehicle, length_s=1.0, completed=found)
+    np.testing.assert_array_equal(windows.hidden.seen[0, :, 0], [0, 0, 1, 0, 0, 1, 1, 1, 1])
+    spread = windows.hidden.spread[..., 0]
+    covariance = np.asarray(found.causal_cov[0, 0, 0], np.float32)
+    np.testing.assert_allclose(spread @ spread.T, covariance, atol=1e-6)
+    batch = Batch.of(windows)
+    X, V = batch.X[1:, :, None], batch.V[1:, :, None]
+    shown = batch.shown(X.at[:, 4:6].add(1.0), V.at[:, :2].add(1.0).at[:, 5].add(0.5))
+    np.testing.assert_allclose(shown[0], X)
+    np.testing.assert_allclose(shown[1][:, :5], V[:, :5])
+    np.testing.assert_allclose(shown[1][:, 5], V[:, 5] + 0.5)
+    physics = vehicle.dynamics(np.ones(6), dtype=np.float32)
+    judged = evaluate({"preset": physics}, windows, samples=19).dataset["rmse_axis"]
+    measured = np.isfinite(judged.sel(model="preset")).all("horizon")
+    axes = measured["axis"].to_numpy()[measured.to_numpy()]
+    assert set(axes) == {"z", "roll", "pitch", "yaw", "w", "p", "q", "r"}
+
+
+def test_a_recording_with_hidden_channels_is_completed_before_it_is_cut():
+    vehicle = load_vehicle("bluerov2_heavy")
+    recording, _ = simulated(vehicle)
+    with pytest.raises(UserError, match="u/v/w is missing"):
+        make_windows(recording, vehicle, length_s=1.0)

@@ -144,7 +144,7 @@ def test_what_is_missing_is_named():
         make_windows(short, length_s=0.01)
     blind = run("a", 101, 0)
     blind = Trajectory("a", blind.X_WB, blind.V_WB_B * np.nan, blind.commands)
-    with pytest.raises(UserError, match=r"V_WB_B u/v/w.*DVL"):
+    with pytest.raises(UserError, match=r"V_WB_B u/v/w.*complete it"):
         make_windows(recording(blind))
 
 

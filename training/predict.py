@@ -23,12 +23,14 @@ def predict(
     with_path_of_drift: bool = False,
     place: Int[Array, " W"] | None = None,
     commands: Commands | None = None,
+    spread: Float[Array, "6 6 W"] | None = None,
 ) -> tuple[Float[Array, "T 7 P W"], Float[Array, "T 6 P W"]]:
     """Draw `samples` motions from each window's initial state and commands, at t_1 … t_T.
 
     `with_path_of_drift` appends the noise-free motion as one more sample. Increments depend on
     `key` and the windows' places (0, 1 … W - 1 by default). A model with effects takes the
     thrusters' `commands`, if given, and returns simulated measurements (`simulate_recorded`).
+    With `spread`, L, the samples' first twists are drawn with the covariance L Lᵀ about `V_0`.
     """
     T, _, W = F.shape
     count = samples + with_path_of_drift
@@ -45,16 +47,23 @@ def predict(
             w = jnp.concatenate([w, jnp.zeros((*w.shape[:4], 1), F.dtype)], axis=4)
         return w.reshape(steps, parts, components, W * count)
 
+    start = flat(V_0)
+    if spread is not None:
+        w = normal_by_window(jax.random.fold_in(key, 1), place, (6,), samples, F.dtype)
+        w = jnp.einsum("ijw,jwp->iwp", spread, w)
+        if with_path_of_drift:
+            w = jnp.concatenate([w, jnp.zeros((6, W, 1), F.dtype)], axis=2)
+        start = start + w.reshape(6, W * count)
     if isinstance(model, Extended) and commands is not None:
         w = drawn(T, substeps, gaussians(model))
         Xs, Vs = simulate_recorded(
-            model, flat(X_0), flat(V_0), jax.tree.map(flat, commands), dt, w, substeps
+            model, flat(X_0), start, jax.tree.map(flat, commands), dt, w, substeps
         )
         return _by_sample(Xs, W), _by_sample(Vs, W)
     # substeps become steps, so that one step is compiled for any number of them
     dt = dt / substeps
     dW = jnp.asarray(dt**0.5, F.dtype) * drawn(T * substeps, 1, model.brownian_size)
-    Xs, Vs = rollout(model, flat(X_0), flat(V_0), jnp.repeat(flat(F), substeps, axis=0), dt, dW)
+    Xs, Vs = rollout(model, flat(X_0), start, jnp.repeat(flat(F), substeps, axis=0), dt, dW)
     return _by_sample(Xs[substeps - 1 :: substeps], W), _by_sample(Vs[substeps - 1 :: substeps], W)
 
 

@@ -57,8 +57,7 @@ class Evaluate:
             from ...models.recordings.checks.finding import check_accepted
             from ...models.vehicles.vehicle import load_vehicle
             from ...systems.logs.load import load_data
-            from ...training.data.windows import make_windows
-            from ..learning import FINE_SUBSTEPS, Start, compare, judged, windowing
+            from ..learning import Start, compare, prepared
             from ..reports.findings import print_findings
 
         if self.out is not None and self.out.suffix not in (".csv", ".json", ".nc"):
@@ -72,24 +71,14 @@ class Evaluate:
                 self.data, vehicle=self.vehicle, accept=self.accept, progress=update
             )
         recording = examine(recording, vehicle, str(self.data), self.accept)
-        windows = make_windows(
-            recording,
-            vehicle,
-            length_s=self.length,
-            stride_s=self.length,
-            **windowing(start.model, "heading"),
-        )
-        models = {
-            "preset": (judged(vehicle.dynamics(), windows), FINE_SUBSTEPS),
-            "learned": (judged(start.model, windows), start.substeps),
-        }
         with progress_bar("evaluating"):
+            models, windows = prepared(recording, vehicle, start, self.length)
             found = compare(models, windows)
         if self.out is not None:
             found.save(self.out)
         shown = console()
         print_findings(shown, recording)
-        shown.print(f"{len(windows)} windows of {self.length:g} s")
+        shown.print(f"{len(windows['learned'])} windows of {self.length:g} s")
         shown.print(found.summary())
         if self.out is not None:
             shown.print(f"wrote {self.out}")

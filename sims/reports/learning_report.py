@@ -10,6 +10,7 @@ from ...models.recordings.store import Recording
 from ...models.recordings.summary import summarize
 from ...models.se3 import AXES
 from ...training.fitting.fit import TrainingResult
+from ...training.smoothing.complete import CHANNELS
 from ..learning import FINE_SUBSTEPS, Learned
 from .figures_learning import (
     bands_figure,
@@ -65,9 +66,27 @@ def add_training(page: Page, learned: Learned) -> Page:
         "(N√s, N·m√s). The preset's diffusion is estimated from its prediction errors. "
         + scale_words(rows),
     )  # fmt: skip
+    if learned.told:
+        _add_told(page, learned)
     for event in result.events:
         page.text(f"Step {event['step']}: {event['text']}")
     return page
+
+
+def _add_told(page: Page, learned: Learned) -> None:
+    """Which coefficients the data determine, where some channels were not recorded."""
+    page.table(
+        [
+            (t.name, "the data" if t.learned else "the preset", t.change, t.before, t.after)
+            for t in learned.told
+        ],
+        ("coefficient", "known from", "change", "deviation before", "deviation given the data"),
+        "Coefficients of a constant model, with velocities and positions that were not recorded "
+        "integrated out. Of masses and drags the logarithm is shown (0.1 is about 10 %), of the "
+        "net buoyancy percent of the displacement, of the righting lever the relative change. "
+        "Where the data have less information than the preset, the preset stays. A common scale "
+        "of mass, drag and thrust is the preset's in any case.",
+    )
 
 
 def add_evaluation(page: Page, learned: Learned, window: int | None = None) -> Page:
@@ -77,6 +96,14 @@ def add_evaluation(page: Page, learned: Learned, window: int | None = None) -> P
         "Held-out error: preset against learned",
         f"{len(held_out)} windows of {held_out.length:g} s that do not overlap with training data.",
     )
+    hidden = held_out.hidden
+    if hidden is not None:
+        known = np.any(hidden.seen, axis=(0, 2))
+        unseen = [name for name, seen in zip(CHANNELS, known, strict=True) if not seen]
+        page.text(
+            f"Not measured, and not judged: {', '.join(unseen)}. The windows start from what each "
+            "model infers of them from the commands and sensors until then."
+        )
     page.figure(error_figure(evaluation), "Error of the noise-free prediction against its horizon.")
     shown = [key for key in next(iter(evaluation.overall().values())) if key not in _LEFT_OUT]
     page.table(

@@ -168,14 +168,14 @@ def _lacking(signals: Signals) -> list[str]:
     p = signals.position
     if p is None:
         told.append(
-            "No position or velocity at all: only rotation can be learned; stream "
-            "LOCAL_POSITION_NED or GLOBAL_POSITION_INT."
+            "No position or velocity at all: rotations are learned from data, the rest as far as "
+            "pressure and the accelerometer tell; stream LOCAL_POSITION_NED or GLOBAL_POSITION_INT."
         )
     elif not _moves_ahead(signals):
         told.append(
-            "No horizontal estimate: surge and sway velocity and position are missing and can't be "
-            "learned, heave is that of the vertical velocity; a DVL or GPS and an EKF origin give "
-            "the rest."
+            "No horizontal estimate: surge and sway velocity and position are missing. They are "
+            "inferred from commands, model and accelerometer, and are not judged; heave is that of "
+            "the vertical velocity. A DVL or GPS and an EKF origin measure them."
         )
     elif p.rate < _SLOW_STATE_HZ:
         told.append(
@@ -196,7 +196,7 @@ def _lacking(signals: Signals) -> list[str]:
     if signals.pressure_depth is None:
         told.append("No pressure: depth is the estimator's alone.")
     if signals.specific_force is None:
-        told.append("No accelerometer.")
+        told.append("No accelerometer: without a DVL, surge and sway are the preset's.")
     return told
 
 

@@ -17,7 +17,14 @@ PACKAGES = ("spinndrift", "jax", "jaxlib", "equinox", "optax", "diffrax", "numpy
 def fingerprint(windows: Windows) -> str:
     """A digest of the windows' numbers: equal data have equal digests."""
     digest = hashlib.sha256()
-    arrays = (windows.X, windows.V, windows.F, windows.start, *(windows.commands or ()))
+    arrays = (
+        windows.X,
+        windows.V,
+        windows.F,
+        windows.start,
+        *(windows.commands or ()),
+        *(windows.hidden or ()),
+    )
     for array in arrays:
         digest.update(repr((array.shape, str(array.dtype))).encode())
         digest.update(np.ascontiguousarray(array).tobytes())

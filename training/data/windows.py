@@ -6,18 +6,35 @@ commands. Arrays are time-major, component-first, windows last (`models.se3`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 from scipy.spatial.transform import Rotation
 
 from ...models.config.errors import UserError
 from ...models.effects.recorded_rollout import Commands
 from ...models.recordings.store import Recording
+from ..smoothing.complete import Completed
 
 Normalisation = Literal["heading", "identity", "none"]
+
+
+class Hidden(NamedTuple):
+    """What windows of a recording that lacks channels have of them.
+
+    Attributes:
+        seen: 1 for channels that were recorded (x, y, z, then the twist), else 0.
+        spread: factor L of the covariance L Lᵀ of the twist at t_0.
+        force: specific force at Bo at t_0 … t_T; zero with `felt` 0 where it was not recorded.
+        felt: 1 or 0.
+    """
+
+    seen: Float[Array | np.ndarray, "1 9 W"]
+    spread: Float[Array | np.ndarray, "6 6 W"]
+    force: Float[Array | np.ndarray, "N 3 W"]
+    felt: Float[Array | np.ndarray, "1 1 W"]
 
 
 @dataclass(frozen=True)
@@ -35,6 +52,7 @@ class Windows:
         names: scenario names.
         normalise: normalisation of the windows' first pose.
         commands: thruster commands in the windows and before them, for models with effects.
+        hidden: of recordings without some channels, for which X and V then hold estimates.
     """
 
     X: Float[np.ndarray, "N 7 W"]
@@ -47,6 +65,7 @@ class Windows:
     names: tuple[str, ...]
     normalise: Normalisation = "heading"
     commands: Commands | None = None
+    hidden: Hidden | None = None
 
     def __len__(self) -> int:
         return self.X.shape[2]
@@ -78,6 +97,7 @@ class Windows:
             run=self.run[i],
             start=self.start[i],
             commands=jax.tree.map(lambda a: a[..., i], self.commands),
+            hidden=jax.tree.map(lambda a: a[..., i], self.hidden),
         )
 
     def thin(self, count: int) -> "Windows":
@@ -98,6 +118,7 @@ class Windows:
                 F=self.F[k : k + steps],
                 start=self.start + k * self.dt,
                 commands=self._commands_from(k, steps),
+                hidden=self._hidden_from(k, steps),
             )
             for k in range(0, self.steps - steps + 1, steps)
         ]
@@ -113,7 +134,18 @@ class Windows:
             commands=jax.tree.map(
                 lambda *a: np.concatenate(a, axis=-1), *(part.commands for part in parts)
             ),
+            hidden=jax.tree.map(
+                lambda *a: np.concatenate(a, axis=-1), *(part.hidden for part in parts)
+            ),
         )
+
+    def _hidden_from(self, k: int, steps: int) -> Hidden | None:
+        """What is hidden in windows that begin k steps later; their starts count as known."""
+        h = self.hidden
+        if h is None:
+            return None
+        spread = h.spread if k == 0 else np.zeros_like(h.spread)
+        return Hidden(h.seen, spread, h.force[k : k + steps + 1], h.felt)
 
     def _commands_from(self, k: int, steps: int) -> Commands | None:
         """The commands of windows that begin k steps later."""
@@ -154,6 +186,7 @@ def make_windows(
     normalise: Normalisation = "heading",
     remembered: float | None = None,
     dtype: Any = np.float32,
+    completed: Completed | None = None,
 ) -> Windows:
     """Cut every trajectory of a recording into windows of `length_s`, one every `stride_s`.
 
@@ -162,7 +195,8 @@ def make_windows(
     `stride_s` defaults to a quarter of the length. Trajectories shorter than a window are left
     out; `vehicle` is as in `Recording.wrench`. With `remembered` (s) the windows also have the
     thruster commands, in the window and for that time before it; before the beginning of a run its
-    first command is assumed.
+    first command is assumed. A recording without some channels is given `completed`; its windows
+    start from what was known by then.
 
     Raises:
         UserError: no trajectory is long enough, or a channel of pose or twist is missing.
@@ -173,6 +207,19 @@ def make_windows(
         >>> make_windows(recording, length_s=1.0).steps
         20
     """
+    if completed is not None:
+        recording = completed.recording
+        if normalise == "identity":
+            raise UserError(
+                "windows: normalise: identity mixes the axes of positions, and some were not "
+                "recorded; use heading"
+            )
+    elif lacking := recording.missing:
+        channels = ", ".join(f"{name} {'/'.join(which)}" for name, which in lacking.items())
+        raise UserError(
+            f"recording: {channels} is missing in some trajectory; complete it first "
+            "(`training.smoothing`), or select the trajectories that have them"
+        )
     steps, places = window_places(recording, length_s, stride_s)
     data, lengths = recording.dataset, recording.lengths
     X, V = data["X_WB"].to_numpy(), data["V_WB_B"].to_numpy()
@@ -190,9 +237,13 @@ def make_windows(
         back = -max(1, round(remembered / recording.dt))
         parts = cut(level), cut(voltage)[:, None], cut(level, back, 0), cut(V, back, 0)
         commands = Commands(*(part.astype(dtype) for part in parts))
+    twists, hidden = cut(V, 0, steps + 1), None
+    if completed is not None:
+        twists[0] = cut(completed.causal, 0, 1)[0]
+        hidden = _hidden(completed, places, cut(completed.force, 0, steps + 1), dtype)
     return Windows(
         X=_normalised(cut(X, 0, steps + 1), normalise).astype(dtype),
-        V=cut(V, 0, steps + 1).astype(dtype),
+        V=twists.astype(dtype),
         F=cut(F).astype(dtype),
         dt=recording.dt,
         scenario=np.array([j for j, _, _ in places], int),
@@ -201,7 +252,23 @@ def make_windows(
         names=recording.scenarios,
         normalise=normalise,
         commands=commands,
+        hidden=hidden,
     )
+
+
+def _hidden(
+    completed: Completed,
+    places: list[tuple[int, int, int]],
+    force: Float[np.ndarray, "N 3 W"],
+    dtype: Any,
+) -> Hidden:
+    seen = np.stack([completed.followed[j, k] for j, k, _ in places], axis=-1)
+    P = np.stack([completed.causal_cov[place] for place in places])
+    values, vectors = np.linalg.eigh((P + np.swapaxes(P, 1, 2)) / 2)
+    spread = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+    felt = np.all(np.isfinite(force), axis=(0, 1), keepdims=True)
+    parts = seen[None], np.moveaxis(spread, 0, -1), np.nan_to_num(force), felt
+    return Hidden(*(part.astype(dtype) for part in parts))
 
 
 def window_places(
@@ -225,12 +292,6 @@ def window_places(
         raise UserError(
             f"recording: its longest trajectory lasts {(lengths.max() - 1) * recording.dt:g} s, "
             f"a window needs {steps * recording.dt:g} s; record longer or give a shorter length_s"
-        )
-    if lacking := recording.missing:
-        channels = ", ".join(f"{name} {'/'.join(which)}" for name, which in lacking.items())
-        raise UserError(
-            f"recording: {channels} is missing in some trajectory, and training needs pose and "
-            "twist; select the trajectories that have them or record with a DVL"
         )
     return steps, [
         (j, k, n)

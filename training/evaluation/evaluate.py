@@ -113,7 +113,7 @@ class Evaluation:
         ]
         for model, row in self.overall().items():
             numbers = "".join(
-                f"{row[f'rmse_{n}']:>10.4f}"
+                f"{row[f'rmse_{n}']:>10.4f}" if np.isfinite(row[f"rmse_{n}"]) else f"{'–':>10}"
                 for n in ("position", "rotation", "linear_velocity", "angular_velocity")
             )
             lines.append(
@@ -191,6 +191,7 @@ def _evaluate_one(
         for name, v in values.items():
             rows.setdefault(name, []).append(v[..., good])
     merged = {name: np.concatenate(parts, axis=-1).astype(float) for name, parts in rows.items()}
+    _without_hidden(merged, windows)
     horizon = windows.dt * np.arange(1, windows.steps + 1)
 
     def mean(name: str) -> np.ndarray:
@@ -215,6 +216,20 @@ def _evaluate_one(
             "horizon": ("horizon", horizon, {"units": "s"}),
         },
     )
+
+
+def _without_hidden(merged: dict[str, np.ndarray], windows: Windows) -> None:
+    """Set to NaN what no window has measured."""
+    if windows.hidden is None:
+        return
+    seen: np.ndarray = np.any(windows.hidden.seen, axis=(0, 2))
+    axes = np.concatenate([seen[:3], np.ones(3, bool), seen[3:]])
+    merged["square_axis"][~axes] = np.nan
+    merged["inside"][:, ~axes] = np.nan
+    for n, part in enumerate(GROUPS.values()):
+        if not axes[part].any():
+            for name in ("square", "square_samples", "square_mean"):
+                merged[name][n] = np.nan
 
 
 def _judge(
@@ -249,7 +264,9 @@ def _compare(
         substeps=substeps,
         with_path_of_drift=True,
         commands=batch.commands,
+        spread=batch.spread,
     )
+    X, V = batch.shown(X, V)
     y = batch.X[1:, :, None], batch.V[1:, :, None]
     e = displacement(X, V, *y)  # (12, T, P + 1, W), last one noise-free
     drift, sampled = e[:, :, samples], e[:, :, :samples]

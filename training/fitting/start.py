@@ -112,13 +112,15 @@ def starting_model(
     progress: Progress | None = None,
     given: Dynamics | None = None,
     validation: Windows | None = None,
+    fitted_to_hidden: FossenDynamics | None = None,
 ) -> Dynamics:
     """A SPINN at the vehicle's preset, its drift fitted to short pieces, b to the residuals.
 
     A `given` Fossen model replaces the preset. Its effects are kept, with a SPINN as their base;
     the windows then need commands (`make_windows`). A learned model is returned as it is. A given
     model may already be as good as the data allow: the fit of the drift is kept only if it predicts
-    `validation` windows better.
+    `validation` windows better. A model `fitted_to_hidden` states (`training.smoothing`) is neither
+    fitted again, nor is its b: the windows do not have all of the state.
 
     A function of its arguments alone, so that a resumed run starts from the same bits.
     """
@@ -127,6 +129,8 @@ def starting_model(
         given = given.for_steps_of(windows.dt)
     given = None if given is None else cast(given, dtype)
     reference = vehicle.dynamics(dtype=dtype) if given is None else core(given)
+    if fitted_to_hidden is not None:
+        reference = cast(fitted_to_hidden, dtype)
     if given is not None and isinstance(reference, Spinn):
         return given
     if not isinstance(reference, FossenDynamics):
@@ -134,6 +138,9 @@ def starting_model(
     model_key, pretrain_key = jax.random.split(jax.random.key(config.seed))
     spinn = create_spinn(config.model, reference, model_key, dtype)
     spinn = pretrain(spinn, reference, config.pretrain, pretrain_key)[0]
+    if fitted_to_hidden is not None:
+        b = np.asarray(fitted_to_hidden.diffusion, float)
+        return with_diffusion(spinn, b) if config.model.stochastic else spinn
     substeps = config.objective.substeps
     effects = given if isinstance(given, Extended) else None
     # effects may have memory, which a fit to one-step innovations does not model

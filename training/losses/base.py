@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from ...models.dynamics import Dynamics
 from ...models.effects.recorded_rollout import Commands
-from ..data.windows import Windows
+from ..data.windows import Hidden, Windows
 
 
 class Batch(NamedTuple):
@@ -30,19 +30,41 @@ class Batch(NamedTuple):
     F: Float[Array, "T 6 W"]
     place: Int[Array, " W"]
     commands: Commands | None = None
+    hidden: Hidden | None = None
 
     @classmethod
     def of(cls, windows: Windows) -> "Batch":
         """All windows as one batch."""
-        arrays = (windows.X, windows.V, windows.F)
-        X, V, F, commands = jax.tree.map(jnp.asarray, (*arrays, windows.commands))
-        return cls(X, V, F, jnp.arange(len(windows)), commands)
+        arrays = (windows.X, windows.V, windows.F, windows.commands, windows.hidden)
+        X, V, F, commands, hidden = jax.tree.map(jnp.asarray, arrays)
+        return cls(X, V, F, jnp.arange(len(windows)), commands, hidden)
 
     def take(self, indices: Int[Array, " B"]) -> "Batch":
         """The windows of some indices, with new places."""
-        arrays = (self.X, self.V, self.F, self.commands)
-        X, V, F, commands = jax.tree.map(lambda a: a[:, :, indices], arrays)
-        return Batch(X, V, F, jnp.arange(indices.size), commands)
+        arrays = (self.X, self.V, self.F, self.commands, self.hidden)
+        X, V, F, commands, hidden = jax.tree.map(lambda a: a[:, :, indices], arrays)
+        return Batch(X, V, F, jnp.arange(indices.size), commands, hidden)
+
+    @property
+    def spread(self) -> Float[Array, "6 6 W"] | None:
+        """Of the first twists that were not recorded (`predict`)."""
+        return None if self.hidden is None else jnp.asarray(self.hidden.spread)
+
+    def shown(
+        self, X: Float[Array, "T 7 P W"], V: Float[Array, "T 6 P W"]
+    ) -> tuple[Float[Array, "T 7 P W"], Float[Array, "T 6 P W"]]:
+        """Predicted motions as far as they were recorded: other channels are set to this batch's.
+
+        No difference of motions is then in channels that nobody has measured.
+        """
+        if self.hidden is None:
+            return X, V
+        seen = jnp.asarray(self.hidden.seen)[:, :, None] > 0
+        place = jnp.where(seen[:, :3], X[:, 4:], self.X[1:, 4:, None])
+        return (
+            jnp.concatenate([X[:, :4], place], axis=1),
+            jnp.where(seen[:, 3:], V, self.V[1:, :, None]),
+        )
 
 
 class Objective(eqx.Module):

@@ -27,6 +27,7 @@ from .kernels import (
     bandwidths_from_differences,
 )
 from .scores import kernel_score, time_pairs
+from .specific_force import ForceError
 
 _CHUNK = 128  # windows whose errors determine the scales
 
@@ -91,6 +92,7 @@ class Fdm:
                 jnp.ones((len(kernel.floors), steps), dtype), self.scales, self.profile
             ),
             velocity_kernel=VelocityKernel(jnp.ones((6, steps), dtype), self.scales, self.profile),
+            force=ForceError.build(model, windows, self.substeps) if self.mse_weight > 0 else None,
         )
         return unfitted.refit(model, windows)
 
@@ -110,7 +112,11 @@ class Mse:
 
     def build(self, model: Dynamics, windows: Windows) -> "MseObjective":
         """The objective with units from the errors of `model` on the windows."""
-        return MseObjective(self, SquaredError.build(self.unit, self.substeps, model, windows))
+        return MseObjective(
+            self,
+            SquaredError.build(self.unit, self.substeps, model, windows),
+            ForceError.build(model, windows, self.substeps),
+        )
 
 
 class SquaredError(eqx.Module):
@@ -165,13 +171,14 @@ class FdmObjective(Objective):
     error: SquaredError
     pose_kernel: Kernel
     velocity_kernel: Kernel
+    force: ForceError | None = None
 
     def loss(
         self, model: Dynamics, batch: Batch, key: Array
     ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
         c, P = self.config, self.config.samples
         noise_key, time_key, mass_key = jax.random.split(key, 3)
-        drift = c.mse_of == "drift" and c.mse_weight > 0
+        drift = (c.mse_of == "drift" and c.mse_weight > 0) or self.force is not None
         X, V = predict(
             model,
             batch.X[0],
@@ -184,7 +191,10 @@ class FdmObjective(Objective):
             with_path_of_drift=drift,
             place=batch.place,
             commands=batch.commands,
+            spread=batch.spread,
         )
+        path = X[:, :, P:], V[:, :, P:]
+        X, V = batch.shown(X, V)
         first, second = time_pairs(time_key, batch.F.shape[0], self.lags, c.time_pairs)
         pose = kernel_score(
             self.pose_kernel, X[:, :, :P], batch.X[1:], first, second, c.pair_shifts
@@ -195,9 +205,12 @@ class FdmObjective(Objective):
         parts = {"pose_score": jnp.mean(pose), "velocity_score": jnp.mean(velocity)}
         total = c.pose_weight * parts["pose_score"] + c.velocity_weight * parts["velocity_score"]
         if c.mse_weight > 0:
-            judged = slice(P, None) if drift else slice(None)
+            judged = slice(P, None) if c.mse_of == "drift" else slice(0, P)
             parts["mse"] = self.error(X[:, :, judged], V[:, :, judged], batch)
             total = total + c.mse_weight * parts["mse"]
+        if self.force is not None:
+            parts["force"] = self.force(model, *path, batch)
+            total = total + c.mse_weight * parts["force"]
         if c.mass_weight > 0:
             parts["mass_variation"] = _mass_variation(model, batch, mass_key)
             total = total + c.mass_weight * parts["mass_variation"]
@@ -226,16 +239,21 @@ class MseObjective(Objective):
     name: ClassVar[str] = "mse"
     config: Mse = eqx.field(static=True)
     error: SquaredError
+    force: ForceError | None = None
 
     def loss(
         self, model: Dynamics, batch: Batch, key: Array
     ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-        X, V = predict_drift(
+        path = predict_drift(
             model, batch.X[0], batch.V[0], batch.F, self.error.dt, substeps=self.error.substeps,
             commands=batch.commands,
         )  # fmt: skip
-        total = self.error(X[:, :, None], V[:, :, None], batch)
+        X, V = (a[:, :, None] for a in path)
+        total = self.error(*batch.shown(X, V), batch)
         parts = {"mse": total}
+        if self.force is not None:
+            parts["force"] = self.force(model, X, V, batch)
+            total = total + parts["force"]
         if self.config.mass_weight > 0:
             parts["mass_variation"] = _mass_variation(model, batch, key)
             total = total + self.config.mass_weight * parts["mass_variation"]
@@ -276,6 +294,8 @@ def typical_motion(
             f"windows at {windows.dt / substeps:g} s a step; give the objective more substeps "
             f"than {substeps} or start from another preset"
         )
+
+    X, V = (a[:, :, 0] for a in batch.shown(X[:, :, None], V[:, :, None]))
 
     def arranged(a: Array) -> Array:
         return jnp.moveaxis(a[..., kept], 1, 0)

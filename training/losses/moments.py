@@ -164,7 +164,7 @@ class MomentsObjective(Objective):
         self, model: Dynamics, batch: Batch, key: Array, with_path_of_drift: bool
     ) -> tuple[Float[Array, "T C P W"], Float[Array, "T 6 P W"]]:
         """Predicted configurations and twists of each window (`predict`)."""
-        return predict(
+        X, V = predict(
             model,
             batch.X[0],
             batch.V[0],
@@ -176,7 +176,9 @@ class MomentsObjective(Objective):
             with_path_of_drift=with_path_of_drift,
             place=batch.place,
             commands=batch.commands,
+            spread=batch.spread,
         )
+        return batch.shown(X, V)
 
     def pose_parts(self, X: Float[Array, "T C P W"], batch: Batch) -> dict[str, Array]:
         """Parts of the loss from the moments of the configurations."""

@@ -25,7 +25,7 @@ from ...models.se3 import TWIST as TWIST_NAMES
 from ...models.se3 import XYZ
 from .levels import Belief, Levels
 from .passes import Pass, final_covariances, given_scales, imposed, smooth_runs
-from .states import BIAS, FADING, POSE, PUSH, SCALES, SIZE, TWIST, Scaled, State, Track
+from .states import BIAS, FADING, LEVER, POSE, PUSH, SCALES, SIZE, TWIST, Scaled, State, Track
 from .track import track_of
 
 CHANNELS = (*XYZ, *TWIST_NAMES)
@@ -60,6 +60,9 @@ class Completed:
         deviation: standard deviation of each of `CHANNELS` (scenario, trajectory, time, 9), zero
             where it was recorded and NaN beyond a trajectory's end.
         observed: whether each of `CHANNELS` was recorded (scenario, trajectory, 9).
+        followed: whether each of `CHANNELS` is as good as recorded: also w where the climb was.
+        force: specific force at Bo, less the estimated bias (scenario, trajectory, time, 3); NaN
+            where it was not recorded.
         causal: twists estimated from what was recorded until then (scenario, trajectory, time, 6).
         causal_cov: their covariance; zero in recorded components.
         levels: most likely levels of all noise.
@@ -71,6 +74,8 @@ class Completed:
     recording: Recording
     deviation: Float[np.ndarray, "J K N 9"]
     observed: Bool[np.ndarray, "J K 9"]
+    followed: Bool[np.ndarray, "J K 9"]
+    force: Float[np.ndarray, "J K N 3"]
     causal: Float[np.ndarray, "J K N 6"]
     causal_cov: Float[np.ndarray, "J K N 6 6"]
     levels: Levels
@@ -294,15 +299,18 @@ class _Completion:
         J, K, N = self.recording.mask.shape
         X, V = data["X_WB"].to_numpy().copy(), data["V_WB_B"].to_numpy().copy()
         deviation = np.full((J, K, N, 9), np.nan)
-        observed = np.ones((J, K, 9), bool)
+        observed, followed = np.ones((J, K, 9), bool), np.ones((J, K, 9), bool)
+        force = np.full((J, K, N, 3), np.nan)
         causal, causal_cov = np.full((J, K, N, 6), np.nan), np.full((J, K, N, 6, 6), np.nan)
         for group, old, new, part in zip(groups, before, after, found, strict=True):
             spread, now, now_cov = final_covariances(part, jnp.asarray(shift), jnp.asarray(cov))
-            arrays = new.X, new.V, old.V + now, spread, now_cov
+            arrays = new.X, new.V, old.V + now, spread, now_cov, new.others
             for i, g in enumerate(group):
                 j, k = self.places[g]
                 at = j, k, slice(int(lengths[j, k]))
-                pose, twist, early, P, P_early = (np.asarray(a[i])[: at[2].stop] for a in arrays)
+                pose, twist, early, P, P_early, others = (
+                    np.asarray(a[i])[: at[2].stop] for a in arrays
+                )
                 own = self.observed[g, 0]
                 seen = V[at]
                 X[at] = np.concatenate(
@@ -314,7 +322,12 @@ class _Completion:
                 rest = np.diagonal(P[:, TWIST, TWIST], axis1=1, axis2=2)
                 sd = np.sqrt(np.maximum(np.concatenate([place, rest], axis=1), 0.0))
                 deviation[at] = np.where(own, 0.0, sd)
-                observed[j, k] = own
+                observed[j, k] = followed[j, k] = own
+                known = np.asarray(self.track.known[g, 0])
+                followed[j, k, 5] |= known[12]
+                if known[13:].all():
+                    felt = np.asarray(self.track.seen[g, : at[2].stop, 13:])
+                    force[at] = felt - _of_instrument(twist[:, 3:], others, self.recording.dt)
                 causal[at] = np.where(own[3:], seen, early)
                 causal_cov[at] = P_early * np.outer(~own[3:], ~own[3:])
         completed = {
@@ -322,9 +335,20 @@ class _Completion:
         }
         fit = float(sum(float(part.fit) for part in found))
         return Completed(
-            Recording(data.assign(completed)), deviation, observed, causal, causal_cov,
-            self.levels, self.scales, cov, fit,
+            Recording(data.assign(completed)), deviation, observed, followed, force, causal,
+            causal_cov, self.levels, self.scales, cov, fit,
         )  # fmt: skip
+
+
+def _of_instrument(
+    omega: Float[np.ndarray, "N 3"], others: Float[np.ndarray, "N 34"], dt: float
+) -> Float[np.ndarray, "N 3"]:
+    """The part of the accelerometer's reading that is due to its bias and place."""
+    bias, lever = (others[:, p.start - 12 : p.stop - 12] for p in (BIAS, LEVER))
+    turned = np.cross(omega, np.cross(omega, lever))
+    if len(omega) > 1:
+        turned = turned + np.cross(np.gradient(omega, dt, axis=0), lever)
+    return bias + turned
 
 
 def _factor(found: np.ndarray, expected: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from .states import BIAS, LEVER, SCALES, SIZE
+from .states import BIAS, FADING, LEVER, SCALES, SIZE
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,11 @@ class Belief:
         """Coefficients known to a factor of about e^0.7 = 2, masses to e^0.4 = 1.5."""
         return cls(np.array([0.4] * 6 + [0.7] * 12 + [1.0] + [0.1, 0.1, 0.7]))
 
+    @classmethod
+    def exact(cls) -> "Belief":
+        """A model that is judged as it is: its coefficients are not adapted to the data."""
+        return cls(np.full(22, 1e-3))
+
     def covariance(self) -> Float[np.ndarray, "46 46"]:
         """Of the start's components that are not pose and twist; push from its own law."""
         P = np.zeros((SIZE, SIZE))
@@ -54,3 +59,8 @@ class Levels:
     white: Float[np.ndarray, "6"]
     push: Float[np.ndarray, "6"]
     measured: Float[np.ndarray, "16"]
+
+    @property
+    def diffusion(self) -> Float[np.ndarray, "6"]:
+        """Of white noise, b, with the effect of both over times longer than the push's."""
+        return np.sqrt(self.white**2 + 2 * FADING * self.push**2)

@@ -81,7 +81,7 @@ class Scaled(NamedTuple):
     @classmethod
     def of(cls, model: Dynamics) -> "Scaled":
         """Units from the model: its righting moment at 90° of roll, 1 % of its displacement."""
-        heeled = jnp.zeros(7).at[:2].set(jnp.sqrt(0.5))
+        heeled = jnp.zeros(7, model.displaced_mass.dtype).at[:2].set(0.5**0.5)
         moment = jnp.linalg.norm(model.potential_wrench(heeled)[3:])
         weight = 0.01 * GRAVITY * model.displaced_mass
         return cls(model, jnp.maximum(moment, 0.01 * weight), weight)

@@ -8,8 +8,6 @@ import numpy as np
 from ...models.recordings.store import Recording
 from .states import Track
 
-_ROUND_UP = 64  # samples: runs of similar length share a compiled program
-
 
 def track_of(
     recording: Recording, vehicle: Any
@@ -17,7 +15,7 @@ def track_of(
     """Measurements of all runs, where they stand, and what of pose and twist was recorded."""
     data, lengths = recording.dataset, recording.lengths
     places = [(int(j), int(k)) for j, k in np.argwhere(lengths > 0)]
-    N = -(-int(lengths.max()) // _ROUND_UP) * _ROUND_UP
+    N = _padded(int(lengths.max()))
     wrench = recording.wrench(vehicle).to_numpy()
 
     def of(name: str, size: int) -> np.ndarray:
@@ -49,3 +47,9 @@ def track_of(
     filled = np.nan_to_num(X), np.nan_to_num(V)
     track = Track(*map(jnp.asarray, (np.nan_to_num(F), seen, X[..., :4], known, lasts)))
     return track, places, *filled, observed
+
+
+def _padded(samples: int) -> int:
+    """A power of two, or 1.5 times one: runs of similar length share a compiled program."""
+    whole = 1 << (samples - 1).bit_length()
+    return max(64, 3 * whole // 4 if samples <= 3 * whole // 4 else whole)

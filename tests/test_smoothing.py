@@ -129,6 +129,7 @@ def test_windows_of_hidden_channels_judge_what_was_recorded():
     recording, _ = simulated(vehicle)
     found = complete(recording, vehicle, vehicle.dynamics(), rounds=1)
     windows = make_windows(recording, vehicle, length_s=1.0, completed=found)
+    assert windows.hidden is not None
     np.testing.assert_array_equal(windows.hidden.seen[0, :, 0], [0, 0, 1, 0, 0, 1, 1, 1, 1])
     spread = windows.hidden.spread[..., 0]
     covariance = np.asarray(found.causal_cov[0, 0, 0], np.float32)

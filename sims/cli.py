@@ -20,6 +20,10 @@ way from a log that comes along to a dive.
 `spinndrift COMMAND --help` explains each."""
 
 
+LIVE_PORT = "7890"
+"""Where `--live` serves its page without a port."""
+
+
 @runtime_checkable
 class _Command(Protocol):
     def run(self) -> None: ...
@@ -50,7 +54,7 @@ def _run(given: list[str]) -> None:
         print(version("spinndrift"))  # noqa: T201 - the output of `--version`
         return
     with interrupts_held():
-        command = _parsed(given)
+        command = _parsed(_with_port(given))
         import jax
 
         from .compile_cache import keep_compiled
@@ -64,6 +68,16 @@ def _run(given: list[str]) -> None:
     place = getattr(command, "place", nullcontext)  # the others choose a folder in `run`
     with place():
         command.run()
+
+
+def _with_port(given: list[str]) -> list[str]:
+    """The arguments with a port after each `--live` that has none."""
+    found = []
+    for word, following in zip(given, [*given[1:], ""], strict=True):
+        found.append(word)
+        if word == "--live" and not following.rpartition(":")[2].isdecimal():
+            found.append(LIVE_PORT)
+    return found
 
 
 def _parsed(given: list[str]) -> _Command:

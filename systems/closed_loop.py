@@ -1,6 +1,6 @@
 """A station and a controller in one diagram, with a log of every signal."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -116,11 +116,14 @@ def seeded(diagram: Diagram, context: Context, seed: int) -> None:
     diagram.SetRandomContext(context, RandomGenerator(seed))
 
 
-def logged(diagram: Diagram, context: Context) -> dict[str, Signal]:
+def logged(
+    diagram: Diagram, context: Context, names: Container[str] | None = None
+) -> dict[str, Signal]:
     """All logs of a closed loop by the port's name, up to the last row that all of them have.
 
     After `AdvanceTo(t)` the updates of t are still pending, and so is its row. A Drake log that
-    `extend` has added under a name `log_…` is returned unchanged.
+    `extend` has added under a name `log_…` is returned unchanged. `names` are those to return, if
+    not all.
 
     Example:
         >>> scenario = load_scenario("trajectory_tracking_calm")
@@ -141,6 +144,8 @@ def logged(diagram: Diagram, context: Context) -> dict[str, Signal]:
     end = min(ends, default=0.0) - min(periods.values(), default=0.0) / 2
     signals = {}
     for name, log in found.items():
+        if names is not None and name not in names:
+            continue
         rows = log.FindLog(context)
         n = np.searchsorted(times[name], end) if name in times else None
         signals[name] = Signal(rows.sample_times()[:n].copy(), rows.data()[:, :n].T.copy())

@@ -1,11 +1,14 @@
 """Scenarios flown in real time on a simulated vehicle, which another process serves."""
 
+import json
 import os
 import re
 import signal
 import subprocess
 import sys
+import threading
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -21,7 +24,9 @@ from spinndrift.sims.run import flight
 from spinndrift.sims.run.collection import COLLECTION, collect, maneuver_scenario
 from spinndrift.sims.run.dead_man import dead_man_key
 from spinndrift.sims.run.flight import fly
+from spinndrift.sims.run.flight_log import AGES
 from spinndrift.sims.run.folder import write_files
+from spinndrift.sims.run.live import LivePage
 from spinndrift.sims.scenarios.maneuvers import Maneuvers
 from spinndrift.sims.scenarios.scenario import Scenario, load_scenario, overridden
 from spinndrift.systems.controllers.maneuvers import Steadiness
@@ -120,9 +125,9 @@ def test_a_guard_ends_a_collection_and_voids_the_trajectory_it_was_in(
     recording = Recording.load(folder / "recording.nc")
     (run,) = recording.trajectories()
     assert (run.scenario, run.sensors["repeat"][0]) == ("surge-forward", 1)
-    assert len(run) == 41
-    assert np.ptp(run.commands["F_Bo_B"][10:, 0]) < 1.0, "a constant wrench, after its ramp"
-    assert run.commands["F_Bo_B"][10:, 0].mean() > 20
+    assert len(run) == 10 + 41
+    assert np.ptp(run.commands["F_Bo_B"][20:, 0]) < 1.0, "a constant wrench, after its ramp"
+    assert run.commands["F_Bo_B"][20:, 0].mean() > 20
     assert run.V_WB_B[-1, 0] > run.V_WB_B[0, 0] + 0.2, "it moved as it was pushed"
     assert (folder / "dive-1" / "telemetry.tlog").stat().st_size > 10_000
 
@@ -132,8 +137,37 @@ def test_nothing_is_armed_without_being_asked(port: int):
         fly(scenario(port, 1.0))
 
 
-def test_a_dry_run_commands_nothing(port: int):
-    run = fly(scenario(port, 1.0, ", estimate: autopilot"), dry_run=True)
+def test_a_dry_run_commands_nothing_and_its_page_shows_the_log(port: int):
+    wanted, seen = scenario(port, 2.0, ", estimate: autopilot"), []
+    over = threading.Event()
+
+    def watch() -> None:
+        while not over.wait(0.1):
+            with urllib.request.urlopen(page.address + "state.json", timeout=10.0) as answer:
+                seen.append(json.load(answer))
+
+    with LivePage("0") as page:
+        page.begin(wanted)
+        browser = threading.Thread(target=watch)
+        browser.start()
+        run = fly(wanted, dry_run=True, live=page)
+        over.set()
+        browser.join()
+    states = {state["t"]: state for state in seen if "X_WB" in state}
+    assert len(states) >= 3
+    for t, state in states.items():
+        n = round(t / run.log.dt)
+        if abs(t - n * run.log.dt) < 1e-9 and 0 < n < len(run.log.time):
+            np.testing.assert_array_equal(state["X_WB"], run.log["X_WB"][n])
+            np.testing.assert_array_equal(state["pwm"], run.log["pwm"][n])
+            heard = next(g["value"] for g in state["guards"] if g["name"] == "silence")
+            assert heard == run.log["guard_ages"][n, AGES.index("vehicle")]
+    guards = {guard["name"]: guard for guard in seen[-1]["guards"]}
+    assert {"silence", "attitude", "depth", "loop", "depth_limits", "battery"} <= set(guards)
+    assert all(0 <= guard["share"] < 1 for guard in guards.values())
+    ages = run.log["guard_ages"]
+    assert np.isfinite(ages[:, AGES.index("vehicle")]).all()
+    assert np.isnan(ages[:, AGES.index("dead_man")]).all(), "there is none"
     assert run.outcome.reason == "duration"
     assert np.abs(run.log["F_Bo_B"]).max() > 0.1  # computed
     np.testing.assert_array_equal(run.log["pwm"], 1500.0)  # not sent

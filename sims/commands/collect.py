@@ -60,6 +60,9 @@ class Collect:
     """Engine that steps a simulation, as in spinndrift run."""
     arm: Annotated[bool, FlagCreatePairsOff] = False
     """Arm the vehicle of the scenario's vehicle_link and fly."""
+    live: str | None = None
+    """Serve a page that shows the dive while it goes on, a simulation in real time: a port of this
+    computer (7890 if none is given, 0 for a free one), or HOST:PORT to show it to others."""
     report: bool = True
     """Write report.html and meshcat.html of the dive."""
     quiet: Annotated[bool, FlagCreatePairsOff, arg(help="Show no progress and no summary.")] = False
@@ -68,7 +71,8 @@ class Collect:
         """Fly, write, summarise."""
         with interrupts_held():
             from ...models.files.owned import run_folder
-            from ..run.collection import COLLECTION, collect, maneuver_scenario
+            from ..run.collection import COLLECTION, maneuver_scenario
+            from ..run.live import live_page
             from ..scenarios.scenario import load_scenario
 
         scenario = load_scenario(self.scenario, self.scenario_text)
@@ -81,17 +85,27 @@ class Collect:
         with run_folder(out, COLLECTION) as folder:
             scenario = maneuver_scenario(scenario.with_changes(self.seed), self._settings())
             tell_code(self.scenario, scenario.code)
-            settings: dict[str, Any] = {
-                "arm": self.arm, "report": self.report, "engine": self.engine,
-            }  # fmt: skip
-            if self.quiet:
-                found = collect(scenario, folder, **settings)
-            else:
-                with progress_bar(f"collecting with {scenario.name}") as update:
-                    found = collect(scenario, folder, **settings, say=self._say, progress=update)
+            with live_page(self.live, scenario, self._say) as live:
+                found = self._collect(scenario, folder, live)
         self._summary(found, out)
         if found.outcome is not None and found.outcome.reason == "interrupted":
             raise KeyboardInterrupt
+
+    def _collect(self, scenario: Any, folder: Path, live: Any) -> "Collected":
+        from ..run.collection import collect
+
+        def say(text: str) -> None:
+            self._say(text)
+            if live is not None:
+                live.say(text)
+
+        settings: dict[str, Any] = {
+            "arm": self.arm, "report": self.report, "engine": self.engine, "say": say, "live": live,
+        }  # fmt: skip
+        if self.quiet:
+            return collect(scenario, folder, **settings)
+        with progress_bar(f"collecting with {scenario.name}") as update:
+            return collect(scenario, folder, **settings, progress=update)
 
     def _settings(self) -> Any:
         """The controller that flies the maneuvers."""

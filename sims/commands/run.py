@@ -59,6 +59,9 @@ class Run:
     """Run the loop on the vehicle's telemetry without arming or commanding it."""
     duration: Annotated[float | None, SECONDS] = None
     """Longest simulated time (s); by default that of the scenario."""
+    live: str | None = None
+    """Serve a page that shows the run while it goes on, a simulation in real time: a port of this
+    computer (7890 if none is given, 0 for a free one), or HOST:PORT to show it to others."""
     report: bool = True
     """Write report.html and meshcat.html."""
     quiet: Annotated[bool, FlagCreatePairsOff, arg(help="Show no progress and no summary.")] = False
@@ -67,6 +70,7 @@ class Run:
         """Simulate, write, summarise."""
         with interrupts_held():
             from ..run.folder import new_folder, write_files
+            from ..run.live import live_page
             from ..run.loop import simulate
             from ..scenarios.scenario import load_scenario
 
@@ -80,34 +84,47 @@ class Run:
             )
         if told := scenario.station.load_vehicle().limitation():
             console().print(f"{told} What the controller asks for there has no effect.")
-        with new_folder(self.out, scenario) as out:
+        with (
+            new_folder(self.out, scenario) as out,
+            live_page(self.live, scenario, self._say) as live,
+        ):
             if scenario.vehicle_link is not None:
-                flown = self._fly(scenario, out)
+                flown = self._fly(scenario, out, live)
             elif self.quiet:
-                flown = simulate(scenario, engine=self.engine)
+                flown = simulate(scenario, engine=self.engine, live=live)
             else:
                 with progress_bar(f"flying {scenario.name}") as update:
-                    flown = simulate(scenario, update, self.engine)
+                    flown = simulate(scenario, update, self.engine, live=live)
+            if live is not None:
+                live.end(flown.outcome.sentence)
             values = write_files(flown, out, self.report)
         if not self.quiet:
             self._summary(values, out)
         if flown.outcome.reason == "interrupted":
             raise KeyboardInterrupt
 
-    def _fly(self, scenario: Any, out: Path) -> Any:
+    def _fly(self, scenario: Any, out: Path, live: Any) -> Any:
         """Fly on the vehicle."""
         with interrupts_held():
             from ..run.flight import fly
 
-        settings = {"arm": self.arm, "dry_run": self.dry_run, "record": out / "telemetry.tlog"}
+        def say(text: str) -> None:
+            self._say(text)
+            if live is not None:
+                live.say(text)
+
+        settings: dict[str, Any] = {
+            "arm": self.arm, "dry_run": self.dry_run, "record": out / "telemetry.tlog",
+            "say": say, "live": live,
+        }  # fmt: skip
         if self.quiet:
             return fly(scenario, **settings)
-
-        def say(text: str) -> None:
-            console().print(text, markup=False, soft_wrap=True)
-
         with progress_bar(f"flying {scenario.name}") as update:
-            return fly(scenario, **settings, say=say, progress=update)
+            return fly(scenario, **settings, progress=update)
+
+    def _say(self, text: str) -> None:
+        if not self.quiet:
+            console().print(text, markup=False, soft_wrap=True)
 
     def _summary(self, values: dict, out: Path) -> None:
         shown, path, timing = console(), values["path"], values["timing"]

@@ -21,6 +21,7 @@ from ..scenarios.scenario import LogSettings, Scenario
 from .before_flight import Tell
 from .flight import fly
 from .folder import RUN, write_files
+from .live import LivePage
 from .loop import Engine, Progress, simulate
 
 COLLECTION = FolderKind("collection", ("scenario.yaml", "recording.nc"))
@@ -173,6 +174,7 @@ def collect(
     engine: Engine = "auto",
     say: Tell = lambda text: None,
     progress: Progress = lambda fraction, remark: None,
+    live: LivePage | None = None,
 ) -> Collected:
     """Fly what a folder (held) lacks of a `maneuver_scenario`, in one dive.
 
@@ -200,11 +202,19 @@ def collect(
         if left.vehicle_link is not None:
             record = dive / "telemetry.tlog"
             run = fly(
-                left, arm=arm, record=record, say=say, progress=progress, keep=collection.keep
+                left,
+                arm=arm,
+                record=record,
+                say=say,
+                progress=progress,
+                keep=collection.keep,
+                live=live,
             )
         else:
             seeded = left.with_changes(seed=(left.seed + number - 1) % 2**32)
-            run = simulate(seeded, progress, engine, collection.keep)
+            run = simulate(seeded, progress, engine, collection.keep, live)
+        if live is not None:
+            live.end(run.outcome.sentence)
         write_files(run, dive, report)
     there = collection.finished
     return Collected(run.outcome, len(there) - len(before), len(there), wanted)
@@ -236,8 +246,8 @@ def _notes(scenario: Scenario) -> list[str]:
     settings, station = scenario.controller, scenario.station
     assert isinstance(settings, Maneuvers)
     notes = [
-        f"Each trajectory begins at rest at its start pose; {settings.duration:g} s of its "
-        "maneuver follow without feedback.",
+        f"Each trajectory begins with the end of its rest at the start; {settings.duration:g} s of "
+        "its maneuver follow without feedback, where open_loop is 1.",
         "F_Bo_B and pwm are means over each step of what was commanded.",
     ]
     if scenario.vehicle_link is None:

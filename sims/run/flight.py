@@ -30,6 +30,7 @@ from ..scenarios.scenario import Scenario
 from .before_flight import Tell, as_granted, checked_link, preflight
 from .dead_man import dead_man_key
 from .flight_log import Journal, collect_flight
+from .live import LivePage, flight_view
 from .loop import Progress, Run, Timing, few_collections
 from .real_time import Clockwork, percentiles, short_turns, tick_of
 from .signals import PlanTap, log_commands, log_periods, plan_source
@@ -51,6 +52,7 @@ def fly(
     say: Tell = lambda text: None,
     progress: Progress = lambda fraction, remark: None,
     keep: Keep | None = None,
+    live: LivePage | None = None,
 ) -> Run:
     """Fly a scenario on the vehicle of its `vehicle_link`; stops and disarms it at the end.
 
@@ -58,7 +60,8 @@ def fly(
     again, arm, fly. With `dry_run` nothing is armed, changed or commanded; all is computed and
     logged. The run's scenario has the rates that the vehicle granted; its log has the estimate in
     place of the truth. `record` is a telemetry log (.tlog) to write. `say` gets sentences on what
-    is done. `keep` takes in each trajectory that the controller `!Maneuvers` finishes.
+    is done. `keep` takes in each trajectory that the controller `!Maneuvers` finishes,
+    `live` what is seen.
 
     Raises:
         UserError: the scenario has no `vehicle_link` or no safe plan, a check of the pre-flight
@@ -90,7 +93,7 @@ def fly(
                 cockpit.dead_man = held.enter_context(dead_man_key())
             driver.prepare()
             held.enter_context(short_turns())
-            outcome = cockpit.fly(progress, keep)
+            outcome = cockpit.fly(progress, keep, live)
         statistics = driver.link.statistics()
     return cockpit.flight(outcome, checks, statistics)
 
@@ -173,12 +176,14 @@ class Cockpit:
 
     # -------------------------------------------------------------------------------- the flight
 
-    def fly(self, progress: Progress, keep: Keep | None = None) -> Outcome:
+    def fly(
+        self, progress: Progress, keep: Keep | None = None, live: LivePage | None = None
+    ) -> Outcome:
         """Run from the present place on until monitor, guard, clock or user end the flight."""
         self.interface.commanding = True
         self.interface.on_act = self.journal.act
         try:
-            return self._fly(self._begin(), progress, keep)
+            return self._fly(self._begin(), progress, keep, live)
         finally:
             self._end_planner(wait=False)  # the vehicle is still armed
             self.interface.end()
@@ -192,18 +197,26 @@ class Cockpit:
         """Compile what the monitor computes."""
         self._monitor().check(0.0, *self.scenario.station.initial_state())
 
-    def _fly(self, clockwork: Clockwork, progress: Progress, keep: Keep | None) -> Outcome:
+    def _fly(
+        self, clockwork: Clockwork, progress: Progress, keep: Keep | None, live: LivePage | None
+    ) -> Outcome:
         s, monitor = self.scenario, self._monitor()
         context = clockwork.simulator.get_mutable_context()
         own = self.station.GetMyContextFromRoot(context)
-        ports = [self.station.GetOutputPort(name) for name in ("X_WB", "V_WB_B")]
+        ports = [self.station.GetOutputPort(name) for name in ("X_WB", "V_WB_B", "health")]
         self.tap = PlanTap(self.diagram, context, s.log.samples)
         maneuvers = ManeuverTap(s, self.diagram, context, keep, self.journal)
         self.context, self.clockwork = context, clockwork
         stride = max(1, round(1 / (s.log.rate * clockwork.tick)))
         ended: list[Outcome] = []
 
+        def view(t: float) -> dict[str, Any]:
+            seen = [value(port, own) for port in ports]
+            return flight_view(s, self.journal, self.tap, t, seen, maneuvers.words())
+
         def each(t: float) -> bool:
+            if live is not None:
+                live.show(t, lambda: view(t))
             if stopped.is_set():
                 words = f"The run was interrupted after {t:.1f} s."
                 ended[:] = ended or [Outcome("interrupted", t, words)]
@@ -214,7 +227,7 @@ class Cockpit:
                 return not self.journal.finished
             if round(t / clockwork.tick) % stride == 0:
                 self.tap.read(t)
-                found = monitor.check(t, *(value(port, own) for port in ports))
+                found = monitor.check(t, *(value(port, own) for port in ports[:2]))
                 found = found or maneuvers.read(t)
                 if found is not None:
                     ended.append(found)

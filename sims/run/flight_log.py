@@ -2,6 +2,7 @@
 
 import math
 import time
+from bisect import bisect_left
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -11,16 +12,21 @@ from jaxtyping import Float
 from ...systems.closed_loop import Signal
 from ...systems.mavlink import telemetry
 from ...systems.mavlink.driver import Acted, Driver
+from ...systems.mavlink.safety import AGED
 from ..scenarios.scenario import Scenario
 from .log import RunLog
 from .signals import PlanTap, consistency, mean_over
 
 ORDERS = ("fly", "neutral", "hold_depth", "disarm", "yield")
 """Orders of the guards, by their number in the log."""
+AGES = tuple(age for age, *_ in AGED.values())
+"""Names of the ages in the log, in their order."""
+_SAME = 1e-6  # s
 _NOTES = (
     "X_WB and V_WB_B are the estimate, flown on a vehicle; there is no truth.",
     "F_Bo_B is the mean over each step of the wrench that was sent, within the guards' limits. pwm "
     "is the output that the vehicle showed at the sample; pwm_commanded is what it was to show.",
+    f"guard_ages are the ages that the guards saw (s): {', '.join(AGES)}.",
 )
 
 
@@ -34,6 +40,7 @@ class Entry(NamedTuple):
     shown: Float[np.ndarray, " n"]
     voltage: float
     silence: float
+    ages: Mapping[str, float]
 
 
 class Journal:
@@ -46,6 +53,8 @@ class Journal:
         """Time from the planned instant of each command to its end (s)."""
         self.reason = ""
         """Why the dive has ended; empty while it goes on."""
+        self.tripped = ""
+        """Name of the guard that has ended it."""
         self.epoch: float | None = None
 
     def act(self, t: float, acted: Acted) -> None:
@@ -55,11 +64,16 @@ class Journal:
         shown = np.full(acted.expected.size, np.nan) if outputs is None else outputs.value
         order, volts = ORDERS.index(acted.order), telemetry.battery(driver.link)
         silence = driver.link.silence
-        entry = Entry(t, order, acted.F_Bo_B, acted.expected, shown, volts, silence)
+        entry = Entry(t, order, acted.F_Bo_B, acted.expected, shown, volts, silence, acted.ages)
         self.entries.append(entry)
-        self.reason = acted.reason
+        self.reason, self.tripped = acted.reason, acted.tripped
         if self.epoch is not None:
             self.late.append(now - self.epoch - t)
+
+    def before(self, t: float) -> Entry | None:
+        """The newest entry of time t (s) or before, which the log has at t."""
+        newest = reversed(self.entries[-3:])
+        return next((entry for entry in newest if entry.t <= t + _SAME), None)
 
     @property
     def finished(self) -> bool:
@@ -98,16 +112,15 @@ class Journal:
 
         With the voltage and the outputs that the vehicle showed at the step's begin.
         """
-        first = next((i for i, e in enumerate(self.entries) if e.t > grid[0] - 1.0), 0)
-        entries = self.entries[first:]
+        entries = self.entries[bisect_left(self.entries, grid[0] - 1.0, key=lambda e: e.t) :]
         times = np.array([entry.t for entry in entries])
-        index = np.clip(np.searchsorted(times, grid + 1e-6, side="right") - 1, 0, None)
+        index = np.clip(np.searchsorted(times, grid + _SAME, side="right") - 1, 0, None)
         ahead = times - grid[0]
         sent = {
             "F_Bo_B": np.stack([entry.F_Bo_B for entry in entries]),
             "pwm": np.stack([entry.expected for entry in entries]),
         }
-        inside = (ahead > -1e-6) & (ahead < grid[-1] - grid[0] + dt - 1e-6)
+        inside = (ahead > -_SAME) & (ahead < grid[-1] - grid[0] + dt - _SAME)
         found = {
             name: mean_over(Signal(ahead[inside], v[inside]), grid - grid[0], dt)
             for name, v in sent.items()
@@ -120,17 +133,24 @@ class Journal:
     def at(self, grid: Float[np.ndarray, " n"]) -> dict[str, np.ndarray]:
         """Variables of a log over the times of the grid."""
         times = np.array([entry.t for entry in self.entries])
-        index = np.clip(np.searchsorted(times, grid + 1e-6, side="right") - 1, 0, None)
+        index = np.clip(np.searchsorted(times, grid + _SAME, side="right") - 1, 0, None)
         columns = {
             "pwm": np.stack([entry.shown for entry in self.entries]),
             "pwm_commanded": np.stack([entry.expected for entry in self.entries]),
             "guard_order": np.array([[entry.order] for entry in self.entries], float),
             "voltage": np.array([entry.voltage for entry in self.entries]),
             "silence": np.array([[entry.silence] for entry in self.entries]),
+            "guard_ages": np.array([_ages(entry) for entry in self.entries]),
         }
         sent = Signal(times, np.stack([entry.F_Bo_B for entry in self.entries]))
         dt = float(grid[1] - grid[0]) if grid.size > 1 else 1.0
         return {"F_Bo_B": mean_over(sent, grid, dt)} | {n: c[index] for n, c in columns.items()}
+
+
+def _ages(entry: Entry) -> list[float]:
+    """Ages in the order of `AGES`; NaN for those that there are not, or that are infinite."""
+    found = [entry.ages.get(name, math.nan) for name in AGES]
+    return [math.nan if math.isinf(age) else age for age in found]
 
 
 def collect_flight(

@@ -21,6 +21,7 @@ from ...systems.drake import value
 from ...systems.planning.passage import Passage
 from ..scenarios.criteria import FollowPath, Monitor, Outcome
 from ..scenarios.scenario import Scenario
+from .live import LivePage, simulation_view
 from .log import RunLog
 from .signals import PlanTap, collect, log_commands, log_periods, plan_source
 from .trajectories import Keep, ManeuverTap
@@ -86,6 +87,7 @@ def simulate(
     progress: Progress | None = None,
     engine: Engine = "auto",
     keep: Keep | None = None,
+    live: LivePage | None = None,
 ) -> Run:
     """Simulate a scenario to its end. The same scenario gives the same log, bit for bit.
 
@@ -98,7 +100,7 @@ def simulate(
 
     If no path to the goal satisfies the allowed risk, a planner holds the vehicle's start pose, and
     the outcome is `no safe plan`. `keep` takes in each trajectory that the controller `!Maneuvers`
-    finishes.
+    finishes. `live` shows the run, which then goes on in real time at most.
 
     Raises:
         UserError: start or goal are in an obstacle, the scenario names what can't be read, its
@@ -110,7 +112,7 @@ def simulate(
         >>> simulate(scenario).outcome.reason
         'duration'
     """
-    return next(simulate_seeds(scenario, [scenario.seed], progress, engine, keep))
+    return next(simulate_seeds(scenario, [scenario.seed], progress, engine, keep, live))
 
 
 def simulate_seeds(
@@ -119,6 +121,7 @@ def simulate_seeds(
     progress: Progress | None = None,
     engine: Engine = "auto",
     keep: Keep | None = None,
+    live: LivePage | None = None,
 ) -> Iterator[Run]:
     """Simulate a scenario with one seed after the other, as `simulate`, with one diagram for all.
 
@@ -148,7 +151,8 @@ def simulate_seeds(
             simulator = _simulator(diagram, scenario, engine)
         else:
             simulator.reset_context(diagram.CreateDefaultContext())
-        run = _one(diagram, simulator, scenario.with_changes(seed=seed), warm, tell, passage, keep)
+        own = scenario.with_changes(seed=seed)
+        run = _one(diagram, simulator, own, warm, tell, passage, keep, live)
         yield run
         if run.outcome.reason == "interrupted":
             return
@@ -193,6 +197,7 @@ def _one(
     tell: Progress,
     passage: Passage | None,
     keep: Keep | None,
+    live: LivePage | None,
 ) -> Run:
     """Simulate a diagram once, in a new context; `warm` says that its programs are compiled."""
     context = simulator.get_mutable_context()
@@ -202,6 +207,7 @@ def _one(
     monitor = Monitor(vehicle, obstacles, scenario.success, scenario.goal, scenario.safety)
     tap = PlanTap(diagram, context, scenario.log.samples)
     maneuvers = ManeuverTap(scenario, diagram, context, keep)
+    watch = _watching(live, diagram, context, tap, maneuvers)
     timing = Timing(dt=1 / scenario.log.rate)
     started = time.perf_counter()
     with _ticking(tell, "compiling"):
@@ -212,7 +218,9 @@ def _one(
             _warm_up(diagram, min(scenario.duration, _WARM_UP))
     timing.compilation = time.perf_counter() - started
     with interrupt_noted() as stopped, few_collections():
-        outcome = _fly(scenario, diagram, simulator, monitor, tap, maneuvers, timing, tell, stopped)
+        outcome = _fly(
+            scenario, diagram, simulator, monitor, tap, maneuvers, timing, tell, stopped, watch
+        )
     if passage is not None and not passage.safe and outcome.reason in ("duration", "no progress"):
         outcome = Outcome("no safe plan", outcome.time, no_safe_plan(scenario, passage))
     log = collect(scenario, logged(diagram, context), tap, outcome.time, passage)
@@ -247,6 +255,7 @@ def _fly(
     timing: Timing,
     tell: Progress,
     stopped: threading.Event,
+    watch: Callable[[float], None],
 ) -> Outcome:
     """Advance sample by sample until the monitor, the clock or the user ends the run."""
     context = simulator.get_mutable_context()
@@ -255,8 +264,7 @@ def _fly(
     ports = [station.GetOutputPort(name) for name in ("X_WB_cheat", "V_WB_B_cheat")]
     sinks: list[Any] = [diagram.GetSubsystemByName(f"log_{port.get_name()}") for port in ports]
     dt = timing.dt
-    steps = max(1, round(scenario.duration / dt))
-    stride = _samples_at_once(simulator, tap, dt)
+    steps, stride = max(1, round(scenario.duration / dt)), _samples_at_once(simulator, tap, dt)
     k, done, outcome = 0, 0.0, None
 
     def called(k: int) -> bool:
@@ -278,15 +286,15 @@ def _fly(
             seen = [sink.FindLog(context).data() for sink in sinks]
             for n in range(k + 1, k + stride + 1):
                 outcome = outcome or monitor.check(round(n * dt, 9), *(v[:, n] for v in seen))
-            k += stride
-            t = round(k * dt, 9)
+            k, t = k + stride, round((k + stride) * dt, 9)
             outcome = outcome or maneuvers.read(t)
+            watch(t)
             if outcome is None and k >= steps:
                 outcome = Outcome("duration", t, f"The time limit of {t:.1f} s was reached.")
             elif outcome is None and k // 5 > (k - stride) // 5:
-                done = max(done, maneuvers.done, monitor.progress)
-                done = done if maneuvers.names else max(done, k / steps)
-                tell(done, f"{t:.0f} s, {timing.speed(200):.1f} × real time {maneuvers.words()}")
+                done = max(done, maneuvers.done if maneuvers.names else k / steps, monitor.progress)
+                words = f"{t:.0f} s, {timing.speed(200):.1f} × real time {maneuvers.words()}"
+                tell(done, words.rstrip())
             if outcome is None and stopped.is_set():
                 outcome = Outcome("interrupted", t, f"The run was interrupted after {t:.1f} s.")
         # complete the row of the last sample with the updates at its time
@@ -297,6 +305,22 @@ def _fly(
         _check_start(diagram, context, scenario.station.period, error)
         outcome = outcome or Outcome("not finite", round(float(last), 9), str(error))
     return outcome
+
+
+def _watching(
+    live: LivePage | None, diagram: Diagram, context: Context, tap: PlanTap, maneuvers: ManeuverTap
+) -> Callable[[float], None]:
+    """A function that shows the run at its time (s) and lets the clock catch up; or nothing."""
+    if live is None:
+        return lambda t: None
+    begun: list[float] = []
+
+    def watch(t: float) -> None:
+        live.show(t, lambda: simulation_view(diagram, context, tap, maneuvers.words()))
+        begun[:] = begun or [time.monotonic() - t]
+        time.sleep(max(0.0, begun[0] + t - time.monotonic()))
+
+    return watch
 
 
 def _samples_at_once(simulator: Simulator | CompiledSimulator, tap: PlanTap, dt: float) -> int:

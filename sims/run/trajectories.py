@@ -18,7 +18,11 @@ from .signals import mean_over
 
 Keep = Callable[[int, Trajectory], None]
 """Takes in a finished trajectory and its number among those of its maneuver; does not wait."""
+LEAD = 0.5
+"""Time at rest (s) that a trajectory has before its maneuver, so that it is known what thrusters
+did before: a diagnosis initialises their memory with that."""
 _TIMED = 1e-6  # s
+_NEEDED = ("maneuver", "X_WB", "V_WB_B", "X_WB_cheat", "V_WB_B_cheat", "F_acting", "pwm")
 
 
 class ManeuverTap:
@@ -45,6 +49,12 @@ class ManeuverTap:
             self.names = controller.program.names
             self._port = controller.GetOutputPort("maneuver")
             self._context = controller.GetMyContextFromRoot(root)
+
+    @property
+    def _lead(self) -> int:
+        """Samples at rest before the maneuver."""
+        assert isinstance(self._scenario.controller, Maneuvers)
+        return round(min(LEAD, self._scenario.controller.steady.time) * self._scenario.log.rate)
 
     @property
     def done(self) -> float:
@@ -91,14 +101,15 @@ class ManeuverTap:
 
     def _take(self, index: int) -> None:
         """Hand over the trajectories before the number `index` that were flown to their end."""
-        signals = logged(self._diagram, self._root)
+        signals = logged(self._diagram, self._root, _NEEDED)
         state = signals["maneuver"].value
         for number in range(self._index, index):
             rows = np.flatnonzero((state[:, 1] == number) & (state[:, 0] == Phase.OPEN_LOOP))
             end = rows[-1] + 1 if rows.size else 0
             if rows.size and end < len(state) and state[end, 4] == 0:
                 name, repeat = self.names[number]
-                self._keep(repeat, self._trajectory(name, signals, slice(rows[0], end + 1)))
+                first = max(int(rows[0]) - self._lead, 0)
+                self._keep(repeat, self._trajectory(name, signals, slice(first, end + 1)))
             else:
                 self._left_out += 1
         self._index = index
@@ -129,9 +140,12 @@ class ManeuverTap:
                 "V_WB_B_estimate": V,
             }
             X, V = (signals[f"{name}_cheat"].value[rows] for name in ("X_WB", "V_WB_B"))
+        sensors["open_loop"] = (signals["maneuver"].value[rows, 0] == Phase.OPEN_LOOP).astype(float)
         for values in commands.values():  # the last acts after the end: no part of the trajectory
             values[-1] = values[-2]
-        return Trajectory(name, X, V, commands, sensors, start)
+        sensors["dive_time"] = grid
+        # repeats begin at the same time of their clocks: training compares them instant by instant
+        return Trajectory(name, X, V, commands, sensors)
 
     @property
     def _estimated_here(self) -> bool:

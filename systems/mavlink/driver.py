@@ -4,7 +4,6 @@ It joins link, parameters, actuation and guards. The order of a dive is `connect
 `prepare`, then `sense` and `act` in the loop, and `stop` at its end, whatever the reason.
 """
 
-import hashlib
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -16,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from platformdirs import user_state_path
 
 from ...models.config.errors import UserError
 from ...models.thrusters import Thrusters
@@ -26,7 +24,7 @@ from .config import Mavlink
 from .dialect import mavlink
 from .guard_process import Guard, stop_thrusters
 from .link import Link
-from .parameters import Borrowed, Parameters
+from .parameters import Borrowed, Parameters, borrowed_file
 from .preflight import FAILSAFES, Facts, Finding, Requirements, preflight
 from .safety import Snapshot, State, Supervisor
 from .telemetry import Reading
@@ -73,6 +71,10 @@ class Acted(NamedTuple):
     """Outputs that the vehicle will show (µs)."""
     reason: str
     """Why the dive has ended; empty while it goes on."""
+    tripped: str = ""
+    """Name of the guard that ended it."""
+    ages: Mapping[str, float] = {}
+    """Those that the guards have seen (s)."""
 
 
 class Driver:
@@ -111,7 +113,7 @@ class Driver:
         except BaseException:
             self.link.close()
             raise
-        self._borrowed = Borrowed(self._parameters, _state_file(connection))
+        self._borrowed = Borrowed(self._parameters, borrowed_file(connection))
         self._guard: Guard | None = None
         self.use(config)
         self._state: State | None = None
@@ -260,9 +262,8 @@ class Driver:
         """
         if self._state is None:
             self._state = State(_FLY, np.asarray(p_WBo, float))
-        decision = self._supervisor.step(
-            self._state, self._snapshot(t, np.asarray(F_Bo_B, float), p_WBo, health, ages or {})
-        )
+        snapshot = self._snapshot(t, np.asarray(F_Bo_B, float), p_WBo, health, ages or {})
+        decision = self._supervisor.step(self._state, snapshot)
         self._state = decision.state
         if self._guard is not None:
             self._guard.beat()
@@ -272,7 +273,10 @@ class Driver:
         command = self._actuation.command(self.vehicle, decision.F_Bo_B, volts, gain)
         self._carry_out(decision.order, command)
         self._sent.append((time.monotonic(), command.pwm))
-        return Acted(decision.order, decision.F_Bo_B, command.pwm, decision.state.reason)
+        state = decision.state
+        return Acted(
+            decision.order, decision.F_Bo_B, command.pwm, state.reason, state.tripped, snapshot.ages
+        )
 
     def _carry_out(self, order: str, command: Command) -> None:
         status = telemetry.status(self.link, time.monotonic())
@@ -392,9 +396,3 @@ class Driver:
         while time.monotonic() < end:
             self.link.send(self._actuation.neutral(self.vehicle))
             time.sleep(0.05)
-
-
-def _state_file(connection: Connection) -> Path:
-    """The file of borrowed parameters of the vehicle behind a connection."""
-    name = hashlib.sha256(str(connection).encode()).hexdigest()[:16]
-    return user_state_path("spinndrift") / f"borrowed-{name}.param"

@@ -3,6 +3,7 @@
 ArduPilot sends every parameter as a 32-bit float of its value, whatever its type.
 """
 
+import hashlib
 import math
 import os
 import struct
@@ -11,11 +12,14 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from platformdirs import user_state_path
+
 from ...models.config.errors import UserError
 from ...models.files.atomic import atomic_path
 from .commands import VehicleRefused
 from .dialect import mavlink
 from .link import Link, Received
+from .transport import Connection
 
 _LONGEST = 16  # characters of a name
 _PATIENCE = 1.0  # s without an answer before a request is repeated
@@ -214,3 +218,9 @@ class Borrowed:
             raise VehicleRefused(f"{'; '.join(refused)}; {self.path} keeps the former values")
         self.path.unlink()
         return former
+
+
+def borrowed_file(connection: Connection) -> Path:
+    """The file of borrowed parameters of the vehicle behind a connection."""
+    name = hashlib.sha256(str(connection).encode()).hexdigest()[:16]
+    return user_state_path("spinndrift") / f"borrowed-{name}.param"

@@ -209,20 +209,31 @@ def _battery(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
     return f"battery {snapshot.voltage:.1f} V is below {config.min_voltage:g} V"
 
 
+AGED: dict[str, tuple[str, str, str]] = {
+    "silence": ("vehicle", "silence", "the vehicle was not heard"),
+    "attitude": ("attitude", "stale", "no new attitude came"),
+    "depth": ("depth", "stale", "no new depth came"),
+    "aid": ("aid", "stale_aid", "no new velocity or position came"),
+    "loop": ("loop", "late", "the loop on this computer has been late"),
+    "plan": ("plan", "plan_age", "the planner made no new plan"),
+    "dead_man": ("dead_man", "dead_man", "the dead-man key was not pressed"),
+}
+"""Guards on ages: the age in a `Snapshot`, the limit's field of `SafetyConfig`, the words."""
+
 GUARDS: dict[str, Guard] = {
     "pilot": _pilot,
     "disarmed": _disarmed,
     "rival": _rival,
     "outputs": _outputs,
     "failsafe": _failsafe,
-    "silence": _stale("vehicle", "silence", "the vehicle was not heard"),
-    "attitude": _stale("attitude", "stale", "no new attitude came"),
-    "depth": _stale("depth", "stale", "no new depth came"),
-    "aid": _stale("aid", "stale_aid", "no new velocity or position came"),
-    "loop": _stale("loop", "late", "the loop on this computer has been late"),
+    "silence": _stale(*AGED["silence"]),
+    "attitude": _stale(*AGED["attitude"]),
+    "depth": _stale(*AGED["depth"]),
+    "aid": _stale(*AGED["aid"]),
+    "loop": _stale(*AGED["loop"]),
     "estimate": _estimate,
-    "plan": _stale("plan", "plan_age", "the planner made no new plan"),
-    "dead_man": _stale("dead_man", "dead_man", "the dead-man key was not pressed"),
+    "plan": _stale(*AGED["plan"]),
+    "dead_man": _stale(*AGED["dead_man"]),
     "depth_limits": _depth_limits,
     "fence": _fence,
     "battery": _battery,

@@ -143,7 +143,7 @@ class Maneuvers(Controller):
         """The trajectories to be flown, in order.
 
         Raises:
-            UserError: a maneuver can't stay within the bounds.
+            UserError: a maneuver can't stay within the bounds, or all are finished.
         """
         return _planned(self, station)[0]
 
@@ -213,7 +213,7 @@ def _planned(
         which.append(kinds[key])
         starts.append(X)
     if not sequences:
-        return [], np.zeros((0, config.steps, 6)), np.zeros(0, int)
+        raise UserError("Maneuvers.finished: it holds all trajectories; give more `repeats`")
     low, high, rates = _paths(vehicle, sequences, 1 / config.rate)
     free = not station.sensing.horizontal
     flown, shares = [], []

@@ -53,7 +53,7 @@ def _diagnose(recording: Recording) -> str:
     velocities = [name for name in unmeasured if name in TWIST]
     dead = f"; {', '.join(unmeasured)} from the velocity" if unmeasured else ""
     if velocities:
-        dead = f"; {', '.join(velocities)} were not measured: no causes of their own are named"
+        dead = f"; {', '.join(velocities)} not measured, so simulated by the model"
     return f"{recording.duration:.0f} s{dead}"
 
 

@@ -25,7 +25,7 @@ from .causes import (
     supported,
 )
 from .data.arrays import Data
-from .data.checks import SPARSE, limits, problems, require_enough, unexcited
+from .data.checks import SPARSE, limits, problems, require_enough, settled, unexcited
 from .disturbance.found import OF_OTHERS, all_laws, reported_laws
 from .disturbance.laws import Law
 from .disturbance.levels import LEVEL
@@ -232,6 +232,8 @@ class Diagnoser:
 
     def _summary(self, problem: DiagnosisProblem, final: Evaluation) -> result.DataSummary:
         d, estimated = problem.data, final.noise.estimated
+        jacobian = np.einsum("njjr,nr->j", np.asarray(final.predictions.jacobian), d.weight)
+        kept = jacobian[6:] / d.weight.sum()
         return result.DataSummary(
             scenarios=list(d.names),
             runs=len(np.unique(d.run)),
@@ -239,7 +241,10 @@ class Diagnoser:
             step=d.dt,
             command=d.command,
             problems=self.faults,
-            limits=limits(d, self.quiet, self.resampled, estimated, self.command_period),
+            limits=[
+                *limits(d, self.quiet, self.resampled, estimated, self.command_period),
+                *(settled(kept, d.dt) if d.latent else []),
+            ],
             noise=reported.noise_levels(problem, final),
         )
 

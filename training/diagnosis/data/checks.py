@@ -238,6 +238,8 @@ def _longest(holds: np.ndarray) -> int:
 
 _ABOVE = 0.5
 """Median height (m) above the surface from which depth counts as unknown."""
+_SETTLED = 0.5
+"""Share of a velocity's error that is left after a step, below which it settles within the step."""
 SPARSE = 1.5
 """Steps between samples of commands from which these count as sparse."""
 
@@ -275,6 +277,18 @@ def _of_latent(data: Data) -> list[str]:
             "thrust there stay as believed; log u, v (a DVL) or the accelerometer"
         )
     return found
+
+
+def settled(kept: np.ndarray, dt: float) -> list[str]:
+    """Axes that settle within a step, by the share `kept` of their errors over one (6,)."""
+    fast = [axis for axis, share in zip(AXES, kept, strict=True) if share < _SETTLED]
+    if not fast:
+        return []
+    return [
+        f"{', '.join(fast)} settle within about a step of {1e3 * dt:.3g} ms: the data tell thrust "
+        "over drag there, but each alone is uncertain beyond its interval; log attitude, rates and "
+        "outputs at 50 Hz or more"
+    ]
 
 
 def limits(

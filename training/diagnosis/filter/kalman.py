@@ -27,7 +27,7 @@ class Filter:
         whiten: L_n⁻¹ with L Lᵀ the innovations' covariance after step n (N, 12, 12, R).
         log_det: ½ log det of that covariance (N, R).
         memory: by which the whitened squares are divided already (`Noise.memory`) (12,).
-        state: standard deviations of the filtered state after the last step (12,).
+        state: standard deviations of the filtered state, root mean square over the steps (12,).
     """
 
     keep: Float[np.ndarray, "N 12 12 R"]
@@ -105,11 +105,13 @@ def _filter(
     first = R if noise.first is None else np.diag(noise.first**2)
     P = np.repeat(first[None], count, 0)
     latent = transition.latent if latent is None else latent
+    variance = np.zeros(12)
     gap = np.zeros_like(P)  # I - K: the filter starts at the first record
     keep, whiten = np.zeros((2, len(step), count, 12, 12))
     log_det = np.zeros(step.shape)
     for n in range(len(step)):
         keep[n] = gap
+        variance += np.diagonal(P, axis1=1, axis2=2).mean(axis=0) / len(step)
         A, prior = process(step[n])
         if jacobian is None:
             prior = prior + (step[n] / dt)[:, None, None] ** 2 * transition.added(P)
@@ -136,9 +138,8 @@ def _filter(
             left = A - K @ M
             P = left @ P @ left.swapaxes(1, 2) + gap @ own_noise @ gap.swapaxes(1, 2)
             P = P + K @ R @ K.swapaxes(1, 2)
-    state = np.sqrt(np.diagonal(P, axis1=1, axis2=2)).mean(axis=0)
     moved = np.moveaxis(keep, 1, -1), np.moveaxis(whiten, 1, -1)
-    return Filter(*moved, log_det, state=state), P[0]
+    return Filter(*moved, log_det, state=np.sqrt(variance)), P[0]
 
 
 def _process(

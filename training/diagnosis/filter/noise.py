@@ -40,9 +40,10 @@ _LONGEST = 0.98
 _DEAF = np.array([10.0] * 6 + [1e4] * 6)
 """Standard deviation (m, rad, m/s, rad/s) given to what was not measured, so that it has no weight:
 velocities act on other errors, so theirs must have none at all."""
-_OF_INSTRUMENT = 0.5
-"""Share of the one-step variance of an accelerometer that counts as the instrument's. A white force
-looks like its noise, so the share is not identifiable; innovations hardly depend on it."""
+_READING, _MOST_OF_IT = 0.05, 0.5
+"""Noise of an accelerometer beside turning thrusters (m/s²), and the share of the variance of its
+one-step errors that it has at most. A white force looks like it, so no datum tells the two apart;
+innovations hardly depend on the share."""
 _FORGETS = 10.0
 """Time (s) after which drag has at the latest ended a velocity's error."""
 _BIAS, _WANDERS = 0.1, 10.0
@@ -191,8 +192,9 @@ def _with_latent(
 ) -> Noise:
     """The noise with that of accelerometers, their biases and the start of latent velocities.
 
-    Such a velocity starts as uncertain as the assumed diffusion keeps it against drag. Readings
-    that share samples are correlated and count for fewer; C are autocovariances of the errors.
+    Such a velocity starts as uncertain as the assumed diffusion keeps it against drag. Steps share
+    readings, so their errors are correlated, and the diffusion is that of their sum: by C, the
+    autocovariances of the errors. Those of an estimator's states count for fewer instead.
     """
     latent = transition.latent
     if latent is None:
@@ -209,12 +211,18 @@ def _with_latent(
         lost = 1 - min(transition.mean[6 + i, 6 + i], 1 - dt / _FORGETS) ** 2
         first[6 + i] = np.sqrt(made[6 + i] / lost)
     for i in latent.felt:
-        record[6 + i] = np.sqrt(_OF_INSTRUMENT * unit[i]) * b[i]
-        b[i] *= np.sqrt(1 - _OF_INSTRUMENT)
+        before, after, later = (max(c[6 + i, 6 + i], 0.0) for c in C)
+        if noise.estimated:
+            alike = min(after / max(before, 1e-300), _LONGEST)
+            memory[6 + i] = (1 + alike) / (1 - alike)
+        else:
+            shared = (after - later) / max(before - later, 1e-300)
+            b[i] *= np.sqrt(1 + 2 * np.clip(shared, 0.0, 1.0))
+        one_step = unit[i] * b[i] ** 2
+        share = min((_READING * dt) ** 2 / max(one_step, 1e-300), _MOST_OF_IT)
+        record[6 + i] = np.sqrt(share * one_step)
+        b[i] *= np.sqrt(1 - share)
         first[i], slip[i] = _BIAS, _BIAS * np.sqrt(2 / _WANDERS)
-        alike = C[1][6 + i, 6 + i] / max(C[0][6 + i, 6 + i], 1e-300)
-        alike = float(np.clip(alike, 0.0, _LONGEST))
-        memory[6 + i] = (1 + alike) / (1 - alike)
     return replace(noise, record=record, diffusion=b, slip=slip, first=first, memory=memory)
 
 

@@ -14,7 +14,7 @@ from ..filter.sensitivities import whitened_sensitivities
 from ..findings import result
 from ..selection.hypotheses import Design, Fit
 from ..selection.model_selection import Choice, Hypothesis, admissible, parameters_of
-from ..selection.state import Fits, Selection
+from ..selection.state import OF_ESTIMATES, Fits, Selection
 from .groups import described, groups, refined
 from .structures import Matched, Screen
 
@@ -116,7 +116,8 @@ def find_structure(
     screen, best, gain = left
     name = _best_name(problem, state.current, state.left)
     law = best_law(problem, state.current)
-    if gain < BEATS * name or gain < _OF_A_LAW * law:
+    least = OF_ESTIMATES * problem.data.steps if state.current.noise.estimated else 0.0
+    if gain < max(BEATS * name, _OF_A_LAW * law, least):
         return state.drawn(rng), None
     known = [h for h in state.hypotheses if h[0] != Unknown.name]
     if known and len(known) == len(state.hypotheses):

@@ -29,7 +29,7 @@ from .model_selection import (
     parameters_of,
 )
 from .refit_all import coefficients, is_coefficient
-from .state import Fits, Selection
+from .state import OF_ESTIMATES, Fits, Selection
 
 Refit = Group | Literal["none", "auto"]
 _CLOSE = 0.7
@@ -38,9 +38,6 @@ _OF_A_LAW = 0.02
 """Share of the best law's gain that a cause must win where the law wins more."""
 _LEFT = 0.05
 """Share of the laws' gain below which they count as explained."""
-_OF_ESTIMATES = 0.05
-"""Nats a sample that a cause must win where states were estimated: below that it may fit the
-estimator's own errors."""
 _HALVED = math.log(2.0)
 """Or nats a sample by which it makes one-step errors likelier: as if an axis' errors were halved.
 Records of a noise-free simulation look like estimates too, until the cause is found."""
@@ -233,7 +230,7 @@ class Search:
             first = best(least)
             if first is None or not current.noise.estimated or _halves(state, first):
                 return first
-            return best(max(least, _OF_ESTIMATES * problem.data.steps))
+            return best(max(least, OF_ESTIMATES * problem.data.steps))
 
         choice = chosen()
         if choice is not None and _about_thrust(problem, choice):

@@ -12,6 +12,9 @@ from .correlated_noise import CorrelatedNoise
 from .hypotheses import Chance, Fit
 from .model_selection import Choice, Hypothesis
 
+OF_ESTIMATES = 0.05
+"""Nats a sample that a cause or structure must win where states were estimated: below that it may
+fit the estimator's own errors."""
 _OF_A_DESCRIPTION = 0.02
 """Share of the gain of unmodelled structure that a further cause or law must win: a nonparametric
 fit (a few bumps, one frequency) may leave a residual of that size."""

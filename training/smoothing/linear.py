@@ -85,16 +85,9 @@ def smooth(
         r, N = H.T @ (inverse @ e) + L.T @ r, H.T @ inverse @ H + L.T @ N @ L
         return (r, N), (r, N, process, noise)
 
-    end = jnp.zeros(SIZE, R.dtype), jnp.zeros((SIZE, SIZE), R.dtype)
+    end = jnp.zeros(SIZE, R.dtype), jnp.zeros_like(eye)
     given = (linear.A, linear.H, e, inverse, K, L, known, lasts)
     _, (r, N, process, noise) = jax.lax.scan(backward, end, given, reverse=True)
     cov = P - P @ N @ P
-    return Smoothed(
-        now,
-        P_now,
-        mean + jnp.einsum("nij,nj->ni", P, r),
-        (cov + jnp.swapaxes(cov, 1, 2)) / 2,
-        jnp.sum(process, axis=0),
-        jnp.sum(noise, axis=0),
-        jnp.sum(fit),
-    )
+    smoothed = mean + jnp.einsum("nij,nj->ni", P, r), (cov + jnp.swapaxes(cov, 1, 2)) / 2
+    return Smoothed(now, P_now, *smoothed, *(jnp.sum(a, axis=0) for a in (process, noise, fit)))

@@ -228,7 +228,7 @@ def make_data(
     if kept.sum() == 1:
         segment = min(segment, max(int(lengths.max()) // _BLOCKS, _LEAST))
     pieces: list[dict[str, np.ndarray]] = []
-    scenario, run = [], []
+    scenario, run, mean = [], [], recording.dt
     for number, (j, k) in enumerate(np.argwhere(kept).tolist()):
         length = int(lengths[j, k])
         times = recording.elapsed(j, k)
@@ -245,9 +245,7 @@ def make_data(
         raise UserError("recording: no run is long enough for a diagnosis")
     _refuse_units(recording, vehicle, thrust)
     arrays = {name: _stack([piece[name] for piece in pieces]) for name in pieces[0]}
-    sizes = np.array([len(piece["u"]) for piece in pieces])
-    weight = (np.arange(sizes.max())[:, None] < sizes).astype(float)
-    mean = recording.dt
+    weight = _weight(np.array([len(piece["u"]) for piece in pieces]))
     if recording.uneven:
         mean = float((arrays["step"] * weight).sum() / weight.sum())
     else:
@@ -263,6 +261,11 @@ def make_data(
         has_voltage=has_voltage,
         unmeasured=unmeasured,
     )
+
+
+def _weight(sizes: np.ndarray) -> np.ndarray:
+    """1 for the steps that pieces of these sizes have, else 0 (N, R)."""
+    return (np.arange(sizes.max())[:, None] < sizes).astype(float)
 
 
 def _kept(lengths: np.ndarray, without: Sequence[int]) -> np.ndarray:

@@ -31,6 +31,7 @@ FINE_SUBSTEPS = 5
 """Steps per sample for models without a trained step of their own, such as presets."""
 _VALIDATION = 0.15
 _REMEMBERED = 10.0  # s of commands and motion before a window, at most
+Progress = Callable[[float, str], None]
 _DRIFT = 0.2  # approximate share of the time for the initial fit of the drift alone
 
 
@@ -214,7 +215,7 @@ def learn(
     *,
     start: Start | None = None,
     resume: bool = False,
-    progress: Callable[[float, str], None] = lambda fraction, remark: None,
+    progress: Progress = lambda fraction, remark: None,
 ) -> Learned:
     """Train a SPINN from a preset, or another `start`, and evaluate them on the held-out part.
 
@@ -228,30 +229,21 @@ def learn(
     """
     given = None if start is None else start.model
     config = begun_with(config, given)
-    hidden = None
+    hidden, fitted = None, None
     if recording.missing:
         progress(0.0, "estimating what was not recorded")
         hidden = HiddenStart.of(recording, vehicle, config, given)
-        parts = split_parts(recording, vehicle, config.windows, given, hidden.completed)
-    else:
-        parts = split_parts(recording, vehicle, config.windows, given)
+        fitted = hidden.fitted.model
+    parts = split_parts(recording, vehicle, config.windows, given, hidden and hidden.completed)
     claim(out, TRAINING)
     kept = out / "start.spinn"
     if resume and kept.exists() and (out / "checkpoint.npz").exists():
         model, _ = load_model(kept)
     else:
-
-        def first(step: int, total: int, loss: float) -> None:
-            progress(_DRIFT * step / total, "drift first")
-
-        model = starting_model(
-            config, vehicle, parts.learn, first, given, parts.validation,
-            None if hidden is None else hidden.fitted.model,
-        )  # fmt: skip
+        own = _drift_first(progress), given, parts.validation, fitted
+        model = starting_model(config, vehicle, parts.learn, *own)
         save_model(kept, model)
-    preset = vehicle.dynamics() if hidden is None else hidden.preset
-    preset = judged(preset, parts.learn)
-    substeps = config.objective.substeps
+    preset = judged(vehicle.dynamics() if hidden is None else hidden.preset, parts.learn)
     metadata = _metadata(recording, vehicle, config)
     result = fit(
         config,
@@ -265,19 +257,31 @@ def learn(
         resume=resume,
         metadata=metadata,
     )
+    substeps = config.objective.substeps
     models = {"preset": (preset, FINE_SUBSTEPS), "learned": (result.model, substeps)}
     if start is not None:
         models["start"] = judged(start.model, parts.learn), start.substeps
-    windows = parts.held_out
-    if hidden is not None:
-        windows = {name: hidden.held_out(model) for name, (model, _) in models.items()}
-        parts = replace(parts, held_out=windows["learned"])
-    evaluation = compare(models, windows)
-    evaluation.save(out / "evaluation.csv")
-    evaluation.save(out / "evaluation.json")
+    evaluation, parts = _held_out(models, parts, hidden)
+    for kind in ("csv", "json"):
+        evaluation.save(out / f"evaluation.{kind}")
     save_model(out / "preset.spinn", preset, metadata | {"substeps": FINE_SUBSTEPS})
     told = () if hidden is None else hidden.fitted.told
     return Learned(result.model, preset, parts, result, evaluation, substeps, told)
+
+
+def _drift_first(progress: Progress) -> Callable[[int, int, float], None]:
+    """Progress of the initial fit of the drift."""
+    return lambda step, total, loss: progress(_DRIFT * step / total, "drift first")
+
+
+def _held_out(
+    models: Mapping[str, tuple[Dynamics, int]], parts: Parts, hidden: HiddenStart | None
+) -> tuple[Evaluation, Parts]:
+    """Errors on the held-out windows, for hidden states completed with each model itself."""
+    if hidden is None:
+        return compare(models, parts.held_out), parts
+    windows = {name: hidden.held_out(model) for name, (model, _) in models.items()}
+    return compare(models, windows), replace(parts, held_out=windows["learned"])
 
 
 def _metadata(recording: Recording, vehicle: Vehicle, config: TrainingConfig) -> dict[str, Any]:

@@ -92,7 +92,8 @@ class Collect:
             raise KeyboardInterrupt
 
     def _collect(self, scenario: Any, folder: Path, live: Any) -> "Collected":
-        from ..run.collection import collect
+        with interrupts_held():
+            from ..run.collection import collect
 
         def say(text: str) -> None:
             self._say(text)
@@ -109,10 +110,11 @@ class Collect:
 
     def _settings(self) -> Any:
         """The controller that flies the maneuvers."""
-        from ...training.data.maneuvers import MANEUVERS
-        from ...training.diagnosis.findings.maneuver_library import VARIANTS
-        from ..run.experiment import chosen_maneuvers
-        from ..scenarios.maneuvers import TRAJECTORIES, Maneuvers
+        with interrupts_held():
+            from ...training.data.maneuvers import MANEUVERS
+            from ...training.diagnosis.findings.maneuver_library import VARIANTS
+            from ..run.experiment import chosen_maneuvers
+            from ..scenarios.maneuvers import TRAJECTORIES, Maneuvers
 
         names = chosen_maneuvers(self.maneuver, self._say) or tuple(MANEUVERS)
         usual = TRAJECTORIES if set(names) <= set(MANEUVERS) else VARIANTS

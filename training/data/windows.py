@@ -207,36 +207,21 @@ def make_windows(
         >>> make_windows(recording, length_s=1.0).steps
         20
     """
-    if completed is not None:
-        recording = completed.recording
-        if normalise == "identity":
-            raise UserError(
-                "windows: normalise: identity mixes the axes of positions, and some were not "
-                "recorded; use heading"
-            )
-    elif lacking := recording.missing:
-        channels = ", ".join(f"{name} {'/'.join(which)}" for name, which in lacking.items())
-        raise UserError(
-            f"recording: {channels} is missing in some trajectory; complete it first "
-            "(`training.smoothing`), or select the trajectories that have them"
-        )
+    recording = _whole(recording, completed, normalise)
     steps, places = window_places(recording, length_s, stride_s)
-    data, lengths = recording.dataset, recording.lengths
+    data = recording.dataset
     X, V = data["X_WB"].to_numpy(), data["V_WB_B"].to_numpy()
-    F = recording.wrench(vehicle).to_numpy()
-    runs = data["trajectory"].to_numpy() if "trajectory" in data.coords else None
-    clock = data["start_time"].to_numpy() if "start_time" in data else np.zeros(lengths.shape)
 
     def cut(values: np.ndarray, first: int = 0, last: int = steps) -> np.ndarray:
         at = np.arange(first, last)
         return np.stack([values[j, k, np.maximum(n + at, 0)] for j, k, n in places], axis=-1)
 
-    commands = None
-    if remembered is not None:
+    def commanded(remembered: float) -> Commands:
         level, voltage = recording.thrust(vehicle)
         back = -max(1, round(remembered / recording.dt))
-        parts = cut(level), cut(voltage)[:, None], cut(level, back, 0), cut(V, back, 0)
-        commands = Commands(*(part.astype(dtype) for part in parts))
+        kept = cut(level), cut(voltage)[:, None], cut(level, back, 0), cut(V, back, 0)
+        return Commands(*(part.astype(dtype) for part in kept))
+
     twists, hidden = cut(V, 0, steps + 1), None
     if completed is not None:
         twists[0] = cut(completed.causal, 0, 1)[0]
@@ -244,16 +229,47 @@ def make_windows(
     return Windows(
         X=_normalised(cut(X, 0, steps + 1), normalise).astype(dtype),
         V=twists.astype(dtype),
-        F=cut(F).astype(dtype),
+        F=cut(recording.wrench(vehicle).to_numpy()).astype(dtype),
         dt=recording.dt,
-        scenario=np.array([j for j, _, _ in places], int),
-        run=np.array([k if runs is None else runs[k] for _, k, _ in places], int),
-        start=np.array([clock[j, k] + n * recording.dt for j, k, n in places], float),
+        **_labels(recording, places),
         names=recording.scenarios,
         normalise=normalise,
-        commands=commands,
+        commands=None if remembered is None else commanded(remembered),
         hidden=hidden,
     )
+
+
+def _labels(recording: Recording, places: Sequence[tuple[int, int, int]]) -> dict[str, np.ndarray]:
+    """Scenario, number of the trajectory, and start time (s) of each window."""
+    data, lengths = recording.dataset, recording.lengths
+    named, timed = "trajectory" in data.coords, "start_time" in data
+    runs = data["trajectory"].to_numpy() if named else np.arange(lengths.shape[1])
+    clock = data["start_time"].to_numpy() if timed else np.zeros(lengths.shape)
+    return {
+        "scenario": np.array([j for j, _, _ in places], int),
+        "run": np.array([runs[k] for _, k, _ in places], int),
+        "start": np.array([clock[j, k] + n * recording.dt for j, k, n in places], float),
+    }
+
+
+def _whole(
+    recording: Recording, completed: Completed | None, normalise: Normalisation
+) -> Recording:
+    """The recording with all channels; refuses one that lacks some and was not completed."""
+    if completed is not None:
+        if normalise == "identity":
+            raise UserError(
+                "windows: normalise: identity mixes the axes of positions, and some were not "
+                "recorded; use heading"
+            )
+        return completed.recording
+    if lacking := recording.missing:
+        channels = ", ".join(f"{name} {'/'.join(which)}" for name, which in lacking.items())
+        raise UserError(
+            f"recording: {channels} is missing in some trajectory; complete it first "
+            "(`training.smoothing`), or select the trajectories that have them"
+        )
+    return recording
 
 
 def _hidden(

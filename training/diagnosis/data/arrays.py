@@ -222,7 +222,6 @@ def make_data(
     extra = _sensors_of_latent(recording, latent)
     data, lengths = recording.dataset, recording.lengths
     thrust, volts = recording.thrust(vehicle)
-    has_voltage = "voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any())
     kept = _kept(lengths, without)
     behind = max(1, round(remembered / recording.dt))
     if kept.sum() == 1:
@@ -231,8 +230,7 @@ def make_data(
     scenario, run, mean = [], [], recording.dt
     for number, (j, k) in enumerate(np.argwhere(kept).tolist()):
         length = int(lengths[j, k])
-        times = recording.elapsed(j, k)
-        V = data["V_WB_B"].to_numpy()[j, k, :length].copy()
+        times, V = recording.elapsed(j, k), data["V_WB_B"].to_numpy()[j, k, :length].copy()
         V[:, latent] = 0.0
         X = dead_reckoned(times, data["X_WB"].to_numpy()[j, k, :length], V)
         of_run = X, V, thrust[j, k, :length], volts[j, k, :length], np.diff(times)
@@ -258,7 +256,7 @@ def make_data(
         names=recording.scenarios,
         dt=mean,
         command=recording.thrust_from,
-        has_voltage=has_voltage,
+        has_voltage="voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any()),
         unmeasured=unmeasured,
     )
 

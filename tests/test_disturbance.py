@@ -92,6 +92,7 @@ def test_a_slow_push_is_taken_out_of_all_that_it_moves():
     np.testing.assert_allclose(doubled[1], 2 * doubled[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -113,6 +114,7 @@ def test_no_name_imitates_a_large_random_structure(problem_of, name):
     assert max(f.heldout_gain for f in fits.values()) < 0.3 * best
 
 
+@pytest.mark.slow
 def test_a_name_that_leaves_nothing_of_a_law_is_taken(tmp_path):
     """A minute of a tether: pull and lever multiply, so before they are fitted colour wins more."""
     case = draw(1024, names=("tether",), plan=Plan().short())
@@ -197,6 +199,7 @@ class Sea(Waves):
         return sum(v for v, _ in parts), sum(a for _, a in parts)
 
 
+@pytest.mark.slow
 def test_a_wind_sea_is_no_slow_push(tmp_path):
     """A sea of 0.4 m and 3 s (Hasselmann et al. 1973): waves, and not what only reverts."""
     omega = np.linspace(0.6, 3.0, 25) * 2 * np.pi / 3.0
@@ -319,6 +322,7 @@ def test_a_belief_that_diverges_on_the_data_is_told(tmp_path):
         Diagnoser(read_csv(tmp_path / "data"), VEHICLE, belief).run()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1.0, pytest.param(3.0, marks=pytest.mark.slow)])
 def test_a_current_that_wanders_is_one_motion_of_the_water(tmp_path, size):
     """Not pushes on every axis: its size and time constant within three standard errors."""

@@ -94,6 +94,7 @@ def test_a_flight_holds_its_pose_and_leaves_the_vehicle_as_it_was(port: int, tmp
         assert not status.armed
 
 
+@pytest.mark.slow
 def test_a_guard_ends_a_collection_and_voids_the_trajectory_it_was_in(
     port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -137,6 +138,7 @@ def test_nothing_is_armed_without_being_asked(port: int):
         fly(scenario(port, 1.0))
 
 
+@pytest.mark.slow
 def test_a_dry_run_commands_nothing_and_its_page_shows_the_log(port: int):
     wanted, seen = scenario(port, 2.0, ", estimate: autopilot"), []
     over = threading.Event()

@@ -80,6 +80,7 @@ def test_the_diffusion_is_found(data, found):
         assert fitted.white(CONFIG.white)
 
 
+@pytest.mark.slow
 def test_noisy_states_are_left_to_the_fit_of_pieces(model, data):
     windows = data[0]
     size = np.std(np.diff(windows.V, axis=0), axis=(0, 2))[:, None]

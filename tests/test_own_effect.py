@@ -69,6 +69,7 @@ def recording():
     return Recording.from_trajectories(runs, DT, vehicle="bluerov2_heavy")
 
 
+@pytest.mark.slow
 def test_an_own_effect_is_found_by_its_name(few):
     finding = diagnose(recording(), VEHICLE, config=DiagnoseConfig(refit="none"))
     (cause,) = finding.diagnosis.causes

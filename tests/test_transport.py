@@ -171,7 +171,9 @@ def test_losses_are_counted_by_sequence_numbers():
     assert counted(lambda p: p[:100] + p[107:]).lost == 7
     assert counted(lambda p: [*p[:99], p[100], p[99], *p[101:]]).lost == 0  # late, not lost
     assert counted(lambda p: [*p[:100], p[99], *p[100:]]).lost == 0  # twice
+    assert counted(lambda p: [*p[:100], p[90], *p[100:]]).lost == 0  # twice, and late
     assert counted(lambda p: p[:110] + p[:50]).lost == 0  # the sender began anew
+    assert counted(lambda p: p[:60] + p[10:50]).lost == 0  # also a little before
 
 
 def test_damaged_packets_are_skipped_and_the_next_are_read():

@@ -32,7 +32,7 @@ def command_long(vehicle: Peer, number: int, *parameters: float, attempt: int = 
 
 
 def command(
-    link: Link, number: int, *parameters: float, timeout: float = 1.0, attempts: int = 3
+    link: Link, number: int, *parameters: float, timeout: float = 0.5, attempts: int = 6
 ) -> int | None:
     """Send COMMAND_LONG until it is acknowledged: its MAV_RESULT, None without an answer.
 

@@ -19,6 +19,34 @@ _LAST = 255  # sequence numbers count from 0 to this
 _LATE = 64  # places by which a packet can be late: 50 ms at a full rate and in a burst
 
 
+class _Sender:
+    """Sequence numbers of a sender: the last one, and those that were skipped shortly before."""
+
+    def __init__(self, last: int):
+        self.last, self.skipped, self.behind = last, set[int](), -1
+
+    def take(self, number: int) -> int:
+        """Packets that are lost more than before: those skipped, or -1 for one that was late."""
+        gap = (number - self.last - 1) % (_LAST + 1)
+        if gap >= _LAST - _LATE:
+            if number in self.skipped:
+                self.skipped.remove(number)
+                return -1
+            # a repetition, unless the next one follows it: then the sender goes on from here
+            if number != (self.behind + 1) % (_LAST + 1) or gap == _LAST:
+                self.behind = number
+                return 0
+            gap = _LAST
+        self.last, self.behind = number, -1
+        if gap > _LAST // 2:  # the sender began anew
+            self.skipped.clear()
+            return 0
+        new = {(number - k) % (_LAST + 1) for k in range(1, gap + 1)}
+        near = {n for n in self.skipped if (number - n) % (_LAST + 1) <= _LATE}
+        self.skipped = near | new
+        return gap
+
+
 class Parser:
     """Messages from bytes, bytes from messages, and counts of what was lost.
 
@@ -30,7 +58,7 @@ class Parser:
         """Pack as the sender `system`, `component`."""
         self._mav = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
         self._mav.robust_parsing = True
-        self._sequence: dict[tuple[int, int], int] = {}
+        self._senders: dict[tuple[int, int], _Sender] = {}
         self.received = self.damaged = self.lost = 0
 
     def messages(self, data: bytes) -> Iterable[Message]:
@@ -44,22 +72,15 @@ class Parser:
             yield message
 
     def _count(self, system: int, component: int, number: int) -> None:
-        sender = (system, component)
-        gap = (number - self._sequence.get(sender, number - 1) - 1) % (_LAST + 1)
-        late = gap >= _LAST - _LATE
-        if late:
-            self.lost -= gap < _LAST  # it was counted as lost; a gap of 255 is a repetition
-        elif gap <= _LAST // 2:  # beyond, the sender began anew
-            self.lost += gap
-        if not late:
-            self._sequence[sender] = number
+        sender = self._senders.setdefault((system, component), _Sender(number - 1))
+        self.lost += sender.take(number)
 
     def restart(self, counts: bool = False) -> None:
         """Begin a new stream: what was sent in between is not counted as lost.
 
         `counts` is whether the counts begin anew as well.
         """
-        self._sequence.clear()
+        self._senders.clear()
         if counts:
             self.received = self.damaged = self.lost = 0
 

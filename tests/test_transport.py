@@ -172,6 +172,7 @@ def test_losses_are_counted_by_sequence_numbers():
     assert counted(lambda p: [*p[:99], p[100], p[99], *p[101:]]).lost == 0  # late, not lost
     assert counted(lambda p: [*p[:100], p[99], *p[100:]]).lost == 0  # twice
     assert counted(lambda p: [*p[:100], p[90], *p[100:]]).lost == 0  # twice, and late
+    assert counted(lambda p: [*p[:10], p[0], *p[10:]]).lost == 0
     assert counted(lambda p: p[:110] + p[:50]).lost == 0  # the sender began anew
     assert counted(lambda p: p[:60] + p[10:50]).lost == 0  # also a little before
 

@@ -37,8 +37,8 @@ def stepped(
     before: Float[Array, "*#b"], command: Float[Array, "*#b"], held: Any, step: Any
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
     """Multiples of `step` (N) alone: the one nearest to the command."""
-    del held
-    after = step * jnp.round(command / step) + 0 * before
+    del before, held
+    after = step * jnp.round(command / step)
     return after, after
 
 

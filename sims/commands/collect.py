@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from ...models.config.checks import SEED, Within
-from ...models.config.errors import UserError
 from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar, tell_code
 
@@ -76,11 +75,8 @@ class Collect:
             from ..scenarios.scenario import load_scenario
 
         scenario = load_scenario(self.scenario, self.scenario_text)
-        if self.arm and scenario.vehicle_link is None:
-            raise UserError(
-                f"--arm: scenario {scenario.name} has no vehicle_link; add vehicle_link: !Mavlink "
-                '{connection: "udpin:0.0.0.0:14550"}'
-            )
+        if self.arm:
+            scenario.link("--arm")
         out = self.out or Path("runs") / f"{scenario.name}-maneuvers"
         with run_folder(out, COLLECTION) as folder:
             scenario = maneuver_scenario(scenario.with_changes(self.seed), self._settings())

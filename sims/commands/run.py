@@ -7,7 +7,6 @@ from typing import Annotated, Any, ClassVar, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ...models.config.checks import SECONDS, SEED
-from ...models.config.errors import UserError
 from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar, tell_code
 
@@ -77,11 +76,8 @@ class Run:
         scenario = load_scenario(self.scenario, self.scenario_text)
         tell_code(self.scenario, scenario.code)
         scenario = scenario.with_changes(self.seed, self.duration, self.model)
-        if (self.arm or self.dry_run) and scenario.vehicle_link is None:
-            raise UserError(
-                f"{'--arm' if self.arm else '--dry-run'}: scenario {scenario.name} has no "
-                'vehicle_link; add vehicle_link: !Mavlink {connection: "udpin:0.0.0.0:14550"}'
-            )
+        if self.arm or self.dry_run:
+            scenario.link("--arm" if self.arm else "--dry-run")
         if told := scenario.station.load_vehicle().limitation():
             console().print(f"{told} What the controller asks for there has no effect.")
         with (

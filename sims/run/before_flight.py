@@ -35,12 +35,7 @@ def checked_link(scenario: Scenario) -> Mavlink:
         UserError: it has none, or a sensor that no vehicle has, an obstacle at the start, or no
             safe plan.
     """
-    link = scenario.vehicle_link
-    if link is None:
-        raise UserError(
-            f"scenario {scenario.name} has no vehicle_link: add vehicle_link: !Mavlink "
-            '{connection: "udpin:0.0.0.0:14550"} to fly on a vehicle'
-        )
+    link = scenario.link()
     for name in unread(scenario.station.sensing.sensors):
         raise UserError(
             f"station.sensing.more.{name}: no message of a vehicle measures it; leave it out"

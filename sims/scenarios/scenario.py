@@ -128,6 +128,20 @@ class Scenario:
         parts = (self.controller, task, sensing.filter, *sensing.more.values())
         return tuple(part.code for part in parts if isinstance(part, OwnSystem))
 
+    def link(self, option: str = "") -> Mavlink:
+        """The link to the vehicle that `option` of a command asks for.
+
+        Raises:
+            UserError: the scenario has none.
+        """
+        if self.vehicle_link is None:
+            asked = f"{option}: " if option else ""
+            raise UserError(
+                f"{asked}scenario {self.name} has no vehicle_link: add vehicle_link: !Mavlink "
+                '{connection: "udpin:0.0.0.0:14550"} to fly on a vehicle'
+            )
+        return self.vehicle_link
+
     def with_changes(
         self, seed: int | None = None, duration: float | None = None, model: Path | None = None
     ) -> "Scenario":

@@ -20,10 +20,17 @@ _LATE = 64  # places by which a packet can be late: 50 ms at a full rate and in 
 
 
 class _Sender:
-    """Sequence numbers of a sender: the last one, and those that were skipped shortly before."""
+    """Sequence numbers of a sender.
+
+    Attributes:
+        last: the last one.
+        skipped: those that were skipped shortly before.
+        behind: the last one that lay behind and had not been skipped, if it came just now.
+    """
 
     def __init__(self, last: int):
-        self.last, self.skipped, self.behind = last, set[int](), -1
+        self.last, self.skipped = last, set[int]()
+        self.behind: int | None = None
 
     def take(self, number: int) -> int:
         """Packets that are lost more than before: those skipped, or -1 for one that was late."""
@@ -32,19 +39,22 @@ class _Sender:
             if number in self.skipped:
                 self.skipped.remove(number)
                 return -1
-            # a repetition, unless the next one follows it: then the sender goes on from here
-            if number != (self.behind + 1) % (_LAST + 1) or gap == _LAST:
-                self.behind = number
-                return 0
-            gap = _LAST
-        self.last, self.behind = number, -1
-        if gap > _LAST // 2:  # the sender began anew
-            self.skipped.clear()
+            before, self.behind = self.behind, number
+            if before is not None and gap < _LAST and number == (before + 1) % (_LAST + 1):
+                self._begin(number)  # two in a row are no repetitions
             return 0
-        new = {(number - k) % (_LAST + 1) for k in range(1, gap + 1)}
+        if gap > _LAST // 2:
+            self._begin(number)
+            return 0
         near = {n for n in self.skipped if (number - n) % (_LAST + 1) <= _LATE}
-        self.skipped = near | new
+        self.skipped = near | {(number - k) % (_LAST + 1) for k in range(1, gap + 1)}
+        self.last, self.behind = number, None
         return gap
+
+    def _begin(self, number: int) -> None:
+        """The sender began anew, or so much was lost that it looks like that."""
+        self.last, self.behind = number, None
+        self.skipped.clear()
 
 
 class Parser:

@@ -3,9 +3,10 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import jax.numpy as jnp
+import numpy as np
 import xarray as xr
 
 from ..models.config.errors import UserError
@@ -16,10 +17,12 @@ from ..models.files.owned import claim
 from ..models.integrate import cast
 from ..models.recordings.store import Recording
 from ..models.rigid_body import FossenDynamics
+from ..models.spinn import Spinn
 from ..models.vehicles.vehicle import Vehicle
 from ..training.config import TrainingConfig, WindowConfig
 from ..training.data.windows import Normalisation, Windows, make_windows
 from ..training.evaluation.evaluate import Evaluation, evaluate
+from ..training.fitting.calibrate import calibrated
 from ..training.fitting.fit import TrainingResult, fit
 from ..training.fitting.hidden_start import HiddenStart
 from ..training.fitting.run_folder import TRAINING
@@ -66,10 +69,12 @@ class Start:
     Attributes:
         model: a Fossen model, a SPINN, or either with effects.
         substeps: integration steps per sample for it.
+        name: of it in the evaluation.
     """
 
     model: Dynamics
     substeps: int = FINE_SUBSTEPS
+    name: str = "start"
 
     @classmethod
     def read(cls, path: Path) -> tuple["Start", dict[str, Any]]:
@@ -125,14 +130,27 @@ def split_parts(
         except UserError as error:
             raise UserError(f"{name} part of the data: {error}") from error
 
-    rest, last = recording.split(config.held_out, config.by, config.gap_s)
+    first, middle, last = split_recording(recording, config)
     held_out = cut(last, config.length_s, "held-out")
+    validation = None if middle is None else cut(middle, config.stride_s, "validation")
+    return Parts(cut(first, config.stride_s, "training"), validation, held_out)
+
+
+def split_recording(
+    recording: Recording, config: WindowConfig
+) -> tuple[Recording, Recording | None, Recording]:
+    """The parts for training, for selecting the best step and calibrating bands, and held out.
+
+    With too little data for validation windows there is no second part: the first one has all.
+    """
+    rest, last = recording.split(config.held_out, config.by, config.gap_s)
     try:
         first, middle = rest.split(_VALIDATION, config.by, config.gap_s)
-        validation = cut(middle, config.length_s, "validation")
-    except UserError:  # too little data for validation: the last step is taken, not the best
-        first, validation = rest, None
-    return Parts(cut(first, config.stride_s, "training"), validation, held_out)
+    except UserError:
+        return rest, None, last
+    if (middle.lengths.max() - 1) * middle.dt < config.length_s - middle.dt / 2:
+        return rest, None, last
+    return first, middle, last
 
 
 def compare(
@@ -219,6 +237,9 @@ def learn(
 ) -> Learned:
     """Train a SPINN from a preset, or another `start`, and evaluate them on the held-out part.
 
+    Bands are calibrated on the validation windows, those of the models compared with too. If a
+    `start` scores better there than every step of training, it is the learned model itself.
+
     Writes into `out` the files of `training.fitting.fit`, `evaluation.csv`, `evaluation.json`, the
     model that training starts from as `start.spinn`, and the preset with its estimated diffusion as
     `preset.spinn`. With `resume` a run with a checkpoint resumes from `start.spinn` and checkpoint.
@@ -257,16 +278,75 @@ def learn(
         resume=resume,
         metadata=metadata,
     )
-    substeps = config.objective.substeps
-    models = {"preset": (preset, FINE_SUBSTEPS), "learned": (result.model, substeps)}
+    models = {
+        "preset": (preset, FINE_SUBSTEPS),
+        "learned": (result.model, config.objective.substeps),
+    }
+    learned = _learned(models, start, parts, result, hidden)
+    _save(learned, out, metadata)
+    return learned
+
+
+def _learned(
+    models: dict[str, tuple[Dynamics, int]],
+    start: Start | None,
+    parts: Parts,
+    result: TrainingResult,
+    hidden: HiddenStart | None,
+) -> Learned:
+    """The models, calibrated, and evaluated on the held-out windows."""
     if start is not None:
-        models["start"] = judged(start.model, parts.learn), start.substeps
+        models = models | {start.name: (judged(start.model, parts.learn), start.substeps)}
+    models = _calibrated(models, parts.validation, hidden)
+    if _is_better(start, models, parts.validation):
+        models["learned"] = models[start.name]
+        result = replace(result, best_step=0)
+    model, substeps = models["learned"]
     evaluation, parts = _held_out(models, parts, hidden)
-    for kind in ("csv", "json"):
-        evaluation.save(out / f"evaluation.{kind}")
-    save_model(out / "preset.spinn", preset, metadata | {"substeps": FINE_SUBSTEPS})
     told = () if hidden is None else hidden.fitted.told
-    return Learned(result.model, preset, parts, result, evaluation, substeps, told)
+    result = replace(result, model=model)
+    return Learned(model, models["preset"][0], parts, result, evaluation, substeps, told)
+
+
+def _save(learned: Learned, out: Path, metadata: dict[str, Any]) -> None:
+    """Write the evaluation, and the models as they were evaluated."""
+    for kind in ("csv", "json"):
+        learned.evaluation.save(out / f"evaluation.{kind}")
+    save_model(out / "model.spinn", learned.model, metadata | {"substeps": learned.substeps})
+    save_model(out / "preset.spinn", learned.preset, metadata | {"substeps": FINE_SUBSTEPS})
+
+
+def _calibrated(
+    models: dict[str, tuple[Dynamics, int]], validation: Windows | None, hidden: HiddenStart | None
+) -> dict[str, tuple[Dynamics, int]]:
+    """The models with bands that hold on the validation windows.
+
+    Without some channels, windows start from what the learned model knew, so that only its own
+    bands are calibrated.
+    """
+    if validation is None:
+        return models
+    own = models if hidden is None else ("learned",)
+    return {
+        name: (calibrated(model, validation, substeps) if name in own else model, substeps)
+        for name, (model, substeps) in models.items()
+    }
+
+
+def _is_better(
+    start: Start | None, models: Mapping[str, tuple[Dynamics, int]], validation: Windows | None
+) -> TypeGuard[Start]:
+    """Whether the model that training began with scores better on the validation windows.
+
+    A SPINN is the first candidate of its own training. Other models are not: a SPINN approximates
+    them, and is integrated in fewer steps.
+    """
+    if start is None or validation is None or isinstance(core(start.model), Spinn):
+        return False
+    names = "learned", start.name
+    found = compare({name: models[name] for name in names}, validation).overall()
+    learned, own = (found[n]["energy_pose"] + found[n]["energy_velocity"] for n in names)
+    return bool(np.isfinite(own)) and not learned <= own
 
 
 def _drift_first(progress: Progress) -> Callable[[int, int, float], None]:

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from spinndrift.sims.reports.diagnosis_report import _noise, _probability
+from spinndrift.sims.reports.diagnosis_answer import probability
+from spinndrift.sims.reports.diagnosis_report import _noise
 from spinndrift.sims.reports.figures import scaled
 from spinndrift.sims.reports.figures_diagnosis import horizon_figure, panel_top
 from spinndrift.training.diagnosis.findings.result import (
@@ -66,5 +67,5 @@ def test_axes_have_numbers_to_read(values):
 def test_noise_has_units_and_a_p_value_that_underflows_a_bound():
     assert _noise("velocity_m_s") == "of velocities / (m/s)"
     assert _noise("diffusion_yaw") == "of the disturbance, yaw / N·m√s"
-    assert _probability(0.0) == "< 1e−300"
-    assert _probability(0.0123) == "0.012"
+    assert probability(0.0) == "< 1e−300"
+    assert probability(0.0123) == "0.012"

@@ -8,9 +8,9 @@ from test_owned import held_elsewhere, tree
 
 from helpers import full_disk
 from spinndrift.models.files.owned import MARKER, run_folder
-from spinndrift.sims.commands.diagnose import DIAGNOSIS
 from spinndrift.sims.demo import DEMO
 from spinndrift.sims.diagnosis_benchmark.run import CHECK
+from spinndrift.sims.diagnosis_folder import DIAGNOSIS
 from spinndrift.sims.estimator_check.run import ESTIMATOR
 from spinndrift.sims.reports.marked_page import BEGIN, END
 from spinndrift.sims.run.collection import COLLECTION

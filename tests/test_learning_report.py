@@ -5,7 +5,7 @@ import pytest
 
 from spinndrift.models.se3 import AXES
 from spinndrift.models.vehicles.vehicle import load_vehicle
-from spinndrift.sims.demo import _compared, _task
+from spinndrift.sims.reports.demo_report import compared, task_words
 from spinndrift.sims.reports.figures_learning import learning_figure, stretches
 from spinndrift.sims.reports.learning_report import scale_words, taken_words
 from spinndrift.sims.scenarios.scenario import load_scenario
@@ -98,12 +98,12 @@ def test_what_is_said_of_thrust_is_what_the_table_shows(mass, drag, words):
 
 def test_errors_are_told_with_their_sizes():
     overall = {"learned": {"rmse_position": 0.238}, "preset": {"rmse_position": 0.61}}
-    assert _compared(overall, "position", "m") == (
+    assert compared(overall, "position", "m") == (
         "position error 0.24 m, 39 % of the preset's 0.61 m"
     )
 
 
 def test_the_dive_is_told_as_its_scenario_has_it():
-    assert _task(load_scenario("pylon_crossing_calm", "controller: {planner: {period: 0.5}}")) == (
-        "from (0, 0, -1.5) m to (4.5, -2, -1.5) m, with 2 plans a second"
-    )
+    assert task_words(
+        load_scenario("pylon_crossing_calm", "controller: {planner: {period: 0.5}}")
+    ) == ("from (0, 0, -1.5) m to (4.5, -2, -1.5) m, with 2 plans a second")

@@ -10,15 +10,11 @@ from tyro.conf import Positional
 from ...models.config.checks import RATE_OF_ALARMS, WATER_DENSITY, Vector6, Within
 from ...models.config.errors import UserError
 from ...models.files.interrupts import interrupts_held
-from ...models.files.owned import FolderKind, run_folder
 from ..progress import console, progress_bar
 
 if TYPE_CHECKING:
     from ...training.diagnosis.findings.result import Diagnosis
 
-DIAGNOSIS = FolderKind(
-    "diagnosis", ("diagnosis.json", "diagnosis.schema.json", "extended/model.spinn", "report.html")
-)
 _USUAL = "bluerov2_heavy"
 _STATE_VEHICLES = (".nc", ".nc4", ".h5", ".yaml", ".yml")
 """Suffixes of files that can state their vehicle; logs can't."""
@@ -65,25 +61,25 @@ class Diagnose:
 
     def place(self) -> AbstractContextManager[Path]:
         """Check and lock the outputs."""
+        with interrupts_held():
+            from ...models.files.owned import run_folder
+            from ..diagnosis_folder import DIAGNOSIS
+
         return run_folder(self.out, DIAGNOSIS)
 
     def run(self) -> None:
         """Load, diagnose, write."""
         with interrupts_held():
-            import json
-
             import numpy as np
 
-            from ...models.files.atomic import atomic_files
-            from ...models.files.checkpoint import load_model, save_model
+            from ...models.files.checkpoint import load_model
             from ...models.recordings.checks.examine import examine
             from ...models.recordings.checks.finding import check_accepted
             from ...models.vehicles.vehicle import load_vehicle
             from ...systems.logs.load import LogOptions, load_data
-            from ...training.diagnosis.findings.result import schema
             from ...training.diagnosis.pipeline import DiagnoseConfig, diagnose
-            from ..reports.diagnosis_report import diagnosis_page
-            from ..reports.findings import add_findings, print_findings
+            from ..diagnosis_folder import write_diagnosis
+            from ..reports.findings import print_findings
 
         self._check()
         check_accepted(self.accept)
@@ -109,18 +105,8 @@ class Diagnose:
             base = vehicle.dynamics(np.array(self.diffusion))
         with progress_bar("diagnosing") as update:
             finding = diagnose(recording, vehicle, base, config, update)
-        page = diagnosis_page(finding, f"Diagnosis of {self.data.name}")
-        add_findings(page, recording)
-        with atomic_files(self.out) as partial:
-            finding.diagnosis.save(partial / "diagnosis.json")
-            text = json.dumps(schema(), indent=2) + "\n"
-            (partial / "diagnosis.schema.json").write_text(text, encoding="utf-8")
-            save_model(
-                partial / "extended" / "model.spinn",
-                finding.extended,
-                {"vehicle": stated, "source": str(self.data), "dt": recording.dt},
-            )
-            page.write(partial / "report.html")
+        about = {"vehicle": stated, "source": str(self.data), "dt": recording.dt}
+        write_diagnosis(self.out, finding, recording, self.data.name, about)
         _print(finding.diagnosis)
         console().print(f"wrote {self.out}")
 
@@ -147,7 +133,7 @@ def _print(diagnosis: "Diagnosis") -> None:
     shown = console()
     shown.print(diagnosis.sentence)
     for cause in diagnosis.causes:
-        told = ", ".join(f"{k} {v.value:.4g} {v.unit}" for k, v in cause.parameters.items())
+        told = ", ".join(f"{k} {v.with_unit}" for k, v in cause.parameters.items())
         if cause.structure is not None:  # its coefficients are in diagnosis.json
             told = cause.structure.description
         shown.print(f"  {cause.name} ({cause.where}): {told}")

@@ -1,13 +1,11 @@
 """A diagnosis as a page."""
 
-import math
-
 from ...models.se3 import AXES
 from ...training.diagnosis.findings.maneuver_library import MANEUVERS
-from ...training.diagnosis.findings.result import Cause, Diagnosis, Interval, Value
+from ...training.diagnosis.findings.result import Diagnosis
 from ...training.diagnosis.pipeline import Finding
+from .diagnosis_answer import MODELS, add_answer, interval, verdict_words
 from .figures_diagnosis import (
-    CONTENDERS,
     experiments_figure,
     horizon_figure,
     innovations_figure,
@@ -29,12 +27,6 @@ _UNITS = (
     "Both models are measured in one noise, that estimated with the causes: by noise levels of its "
     "own, which hold some of its errors, a wrong belief would look like noise."
 )
-_VERDICTS = {
-    "adequate": "left-out data show no difference of a practical size",
-    "explained": "named causes or coefficients explain every difference that the data show",
-    "partly_explained": "named causes or coefficients, and errors that they do not explain",
-    "unexplained": "structure or errors that no cause explains",
-}
 _NOISE = {
     "position_m": "of positions / m",
     "attitude_rad": "of attitudes / rad",
@@ -44,8 +36,12 @@ _NOISE = {
     "slip_attitude": "of an estimator: drift of attitudes / (rad/√s)",
 }
 _WORDS = {
-    "nat": "Unit of log likelihood: what wins n nats makes the data eⁿ times as likely. Won on "
-    "data that were left out of the fit, so that more parameters win nothing by themselves.",
+    "over inertia": "Divided by the inertia of the axis. All forces and masses scaled alike leave "
+    "the motion as it is, so it determines nothing else.",
+    "nat": "Unit of log likelihood: what wins n nats makes the data eⁿ times as likely. One nat a "
+    "sample is won by forecasts over one step whose errors on each of 12 channels are 8 % smaller "
+    "(e to the −1/12). Won on data that were left out of the fit, so that more parameters win "
+    "nothing by themselves.",
     "p": "The probability that noise alone makes one of all names look so good. Runs are counted "
     "as independent, samples are not.",
     "innovation": "The error of a prediction over one step that is not the noise of the record it "
@@ -75,16 +71,8 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
         title, f"{len(d.data.scenarios)} scenarios, {d.data.runs} runs, {d.data.seconds:.0f} s"
     )
     page.verdict(d.sentence, good=d.verdict == "adequate")
-    page.text(
-        f"Verdict: **{d.verdict.replace('_', ' ')}** ({_VERDICTS[d.verdict]}). Words are explained "
-        "[at the end](#words)."
-    )
-    for problem in d.data.problems:
-        page.text(f"**Data:** {problem}")
-    for one in d.left:
-        page.text(f"**Left:** {one}.")
-    _add_causes(page, d)
-    _add_coefficients(page, d)
+    page.text(f"{verdict_words(d)} Words are explained [at the end](#words).")
+    add_answer(page, d)
     _add_experiments(page, finding)
     _add_simulations(page, finding, shared)
     _add_error_maps(page, shared)
@@ -95,70 +83,20 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
     return page.footer(f"{d.tested} names, {d.seconds:.0f} s")
 
 
-def _add_causes(page: Page, d: Diagnosis) -> None:
-    page.section("Causes")
-    if d.causes:
-        page.table(
-            [
-                (
-                    c.name,
-                    c.where,
-                    "; ".join(_with_value(k, v) for k, v in c.parameters.items()),
-                    f"{c.evidence.heldout_gain:.0f}",
-                    _probability(c.evidence.p_value),
-                    ", ".join(c.indistinguishable_from) or "–",
-                    c.next_experiment,
-                )
-                for c in d.causes
-            ],
-            (
-                "cause", "where", "parameters (95 %)", "nats won", "p", "not distinguishable from",
-                "next experiment",
-            ),
-        )  # fmt: skip
-        page.text("What other causes would have won in its place:")
-        page.table([(f"{c.name} ({c.where})", _rivals(c)) for c in d.causes],
-                   ("cause", "rivals, with nats"))  # fmt: skip
-    else:
-        page.text(
-            f"None of {d.tested} causes wins more than noise alone can win ({d.threshold:.1f} nats "
-            f"at a false-alarm rate of {d.alpha:g})."
-        )
-    for c in d.causes:
-        if c.structure is not None:
-            s = c.structure
-            page.text(
-                f"**Unmodelled structure:** {s.description} wins {s.heldout_gain:.0f} nats; the "
-                f"best cause would win {s.best_name_gain:.0f} of them."
-            )
-
-
-def _add_coefficients(page: Page, d: Diagnosis) -> None:
-    if d.ratios:
-        page.text("Coefficients over inertia, which motion determines without the mass:")
-        page.table(
-            [(r.name, r.where, f"{r.believed:.4g}", _valued(r.found))
-             for r in d.ratios],
-            ("ratio", "where", "believed", "found (95 %)"),
-        )  # fmt: skip
-    if d.refitted:
-        page.text("Coefficients that were fitted before causes were sought:")
-        page.table(
-            [(r.name, r.where, f"{r.believed:.4g}", _with_value(r.parameter, r.fitted))
-             for r in d.refitted],
-            ("coefficient", "where", "believed", "fitted (95 %)"),
-        )  # fmt: skip
-
-
 def _add_experiments(page: Page, finding: Finding) -> None:
     d = finding.diagnosis
-    page.figure(names_figure(finding), "Gain of each cause alone, fitted to the other scenarios.")
+    page.section("The causes that were tried")
+    page.figure(
+        names_figure(finding),
+        "Log likelihood that each cause alone wins on data left out of its fit.",
+    )
     following = experiments_figure(d)
     if following is not None:
         page.figure(
             following,
             "Expected information of each maneuver about a cause against its closest rivals, from "
-            "simulations of the model with the causes, evaluated as these data were.",
+            "simulations of the model with the causes, evaluated as these data were. With n nats a "
+            "minute the cause's standard error is eⁿ times smaller after a minute.",
         )
         maneuvers = dict.fromkeys(t for c in d.causes for t in c.experiments)
         page.table(
@@ -227,19 +165,18 @@ def _add_memory(page: Page, shared: Finding) -> None:
 
 
 def _add_gain(page: Page, d: Diagnosis) -> None:
-    page.section("Gain", _LEFT_OUT[d.left_out])
-    page.table(
-        _gains(d),
-        (
-            "model", "nats a sample", "won over the belief", "energy score", "inside 50 % bands",
-            "inside 90 % bands",
-        ),
-    )  # fmt: skip
+    page.section("Forecasts on left-out data", _LEFT_OUT[d.left_out])
     page.figure(
         horizon_figure(d),
         "Root mean square error of noise-free simulations from recorded states, and energy score "
         "of simulations with noise (m, rad, m/s and rad/s alike); bands: 95 %. ↑: the largest "
         "error of a model that is far beyond the panel.",
+    )
+    page.table(
+        _scores(d),
+        ("model", "nats a sample", "won over the belief", "energy score"),
+        "Log score of forecasts over one step, and energy score of simulations.",
+        fold="Scores of forecasts",
     )
 
 
@@ -254,8 +191,6 @@ def _add_data(page: Page, d: Diagnosis) -> None:
         caption="Standard deviations of the records, mean over axes, and diffusion of the random "
         "disturbance, as estimated from these data with the causes.",
     )
-    for limit in d.data.limits:
-        page.text(f"Not identifiable: {limit}.")
 
 
 def _noise(key: str) -> str:
@@ -266,37 +201,12 @@ def _noise(key: str) -> str:
     return f"of the disturbance, {axis} / {'N√s' if axis in AXES[:3] else 'N·m√s'}"
 
 
-def _probability(p: float) -> str:
-    text = "< 1e-300" if p == 0 else f"{p:.2g}" if math.isfinite(p) else "–"
-    return text.replace("-", "−")
-
-
-def _rivals(c: Cause) -> str:
-    return ", ".join(f"{r.name} ({r.where}) {r.heldout_gain:.0f}" for r in c.rivals) or "–"
-
-
-def _with_value(name: str, v: Value) -> str:
-    return f"{name} = {_valued(v)}"
-
-
-def _valued(v: Value) -> str:
-    low, high = v.interval95
-    between = f"({low:.4g} … {high:.4g})" if math.isfinite(low) else "(not estimated)"
-    return f"{v.value:.4g} {between} {v.unit}"
-
-
-def _gains(d: Diagnosis) -> list[tuple[str, ...]]:
-    """One row per model: scores, and bands at the longest horizon."""
+def _scores(d: Diagnosis) -> list[tuple[str, ...]]:
+    """One row per model: log score, and energy score over the longest horizon."""
     rows = []
     for name, g in d.gain.items():
         last = list(g.energy_score)[-1]
-        shares = [_interval(bands[last], 2) for bands in g.coverage.values()]
-        energy = f"{_interval(g.energy_score[last])} at {last} s"
-        row = (CONTENDERS[name], _interval(g.log_score, 2), _interval(g.log_score_gain, 2))
-        rows.append((*row, energy, *shares))
+        energy = f"{interval(g.energy_score[last])} at {last} s"
+        row = (interval(g.log_score, 2), interval(g.log_score_gain, 2), energy)
+        rows.append((MODELS[name], *row))
     return rows
-
-
-def _interval(v: Interval, digits: int = 3) -> str:
-    low, high = v.interval95
-    return f"{v.value:.{digits}f} ({low:.{digits}f} … {high:.{digits}f})"

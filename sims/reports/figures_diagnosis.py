@@ -7,14 +7,10 @@ from matplotlib.figure import Figure
 from ...models.se3 import AXES, CHANNELS
 from ...training.diagnosis.findings.result import Diagnosis
 from ...training.diagnosis.pipeline import Finding
+from .diagnosis_answer import MODELS
 from .figures import FLOWN, INK, PLANNED, QUIET, common_legend, legend, panels, scaled, styled
 from .figures_maps import run_times
 
-CONTENDERS = {
-    "base": "belief", "refitted": "refitted", "extended": "with the causes",
-    "black_box": "black box",
-}  # fmt: skip
-"""The models' names on the page."""
 _FAR, _APART, _ROOM = 2.5, 10.0, 1.15
 """Limits of a panel: for other models relative to the larger error of belief and causes, for the
 larger relative to the smaller of these two, and margin above."""
@@ -108,9 +104,7 @@ def horizon_figure(diagnosis: Diagnosis) -> Figure:
             errors[name] = np.array([v.value for v in table.values()])
             low, high = np.array([v.interval95 for v in table.values()]).T
             ax.fill_between(h, low, high, color=colors[name], alpha=0.13, lw=0)
-            ax.plot(
-                h, errors[name], lines[name], ms=3.5, color=colors[name], label=CONTENDERS[name]
-            )
+            ax.plot(h, errors[name], lines[name], ms=3.5, color=colors[name], label=MODELS[name])
         ax.set_title(title if errors else f"{title.split(' / ')[0]}: not measured")
         if not errors:
             continue
@@ -119,7 +113,7 @@ def horizon_figure(diagnosis: Diagnosis) -> Figure:
         ax.set_xlabel("horizon / s")
         beyond = [n for n, e in errors.items() if not np.all(e <= top)]
         for row, name in enumerate(beyond):
-            _note_beyond(ax, errors[name], row, CONTENDERS[name], colors[name])
+            _note_beyond(ax, errors[name], row, MODELS[name], colors[name])
     common_legend(figure, axes[0, 3])
     return figure
 

@@ -24,7 +24,7 @@ _NORMS = (
     ("linear_velocity", "velocity / (m/s)"),
     ("angular_velocity", "rate / (rad/s)"),
 )
-_COLORS = {"preset": PLANNED, "learned": FLOWN, "start": ESTIMATE}
+_COLORS = {"preset": PLANNED, "learned": FLOWN, "start": ESTIMATE, "extended": ESTIMATE}
 
 
 @styled
@@ -137,13 +137,13 @@ def coverage_figure(evaluation: Evaluation) -> Figure:
     models = [str(m) for m in d["model"].to_numpy()]
     figure, axes = panels(1, 2, 2.8, sharey=True)
     labels = [str(a) for a in d["axis"].to_numpy()]
-    x = np.arange(len(labels))
+    x, step = np.arange(len(labels)), 0.8 / len(models)
     for ax, band in zip(axes[0], d["band"].to_numpy(), strict=True):
         for number, model in enumerate(models):
             share = d["coverage"].sel(model=model, band=band).mean("horizon").to_numpy()
-            offset = (number - (len(models) - 1) / 2) * 0.38
+            offset = (number - (len(models) - 1) / 2) * step
             color = _COLORS.get(model, QUIET)
-            ax.bar(x + offset, 100 * share, width=0.36, color=color, label=model)
+            ax.bar(x + offset, 100 * share, width=0.95 * step, color=color, label=model)
         ax.axhline(100 * band, color=INK, lw=1, ls="--")
         ax.set_xticks(x, labels, rotation=45)
         ax.set_title(f"Inside the {100 * band:.0f} % band")

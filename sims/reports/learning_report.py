@@ -6,9 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...models.dynamics import Dynamics
+from ...models.effects.extended import Extended, core
 from ...models.recordings.store import Recording
 from ...models.recordings.summary import summarize
 from ...models.se3 import AXES
+from ...training.evaluation.evaluate import Evaluation
 from ...training.fitting.fit import TrainingResult
 from ...training.smoothing.complete import CHANNELS
 from ..learning import FINE_SUBSTEPS, Learned
@@ -22,7 +24,12 @@ from .figures_learning import (
 from .findings import add_findings
 from .pages import Page
 
-_LEFT_OUT = ("rmse_geodesic", "rmse_velocity", "finite")
+_NORMS = {
+    "position": "m",
+    "rotation": "rad",
+    "linear_velocity": "(m/s)",
+    "angular_velocity": "(rad/s)",
+}
 _SPEED = 0.5
 
 
@@ -57,14 +64,17 @@ def add_training(page: Page, learned: Learned) -> Page:
             " Dotted lines: bandwidths were refitted; losses before and after are not comparable."
         )
     page.figure(learning_figure(result.metrics, result.refits, result.best_step), caption)
-    rows = coefficient_rows(learned.preset, learned.model)
+    rows = coefficient_rows(core(learned.preset), core(learned.model))
+    told = scale_words(rows)
+    if isinstance(learned.model, Extended):
+        told = "Of the SPINN alone, whose reference is the preset: the diagnosed effects act on it."
     page.table(
         rows,
         ("axis", "M preset", "M learned", "D preset", "D learned", "D^f preset", "D^f learned",
          "b preset", "b learned"),
         "Diagonals at rest: mass with added mass (kg, kg·m²), viscous and fluid drag, diffusion "
-        "(N√s, N·m√s). The preset's diffusion is estimated from its prediction errors. "
-        + scale_words(rows),
+        "(N√s, N·m√s). The preset's diffusion is estimated from its prediction errors. " + told,
+        fold="Learned coefficients",
     )  # fmt: skip
     if learned.told:
         _add_told(page, learned)
@@ -92,8 +102,9 @@ def _add_told(page: Page, learned: Learned) -> None:
 def add_evaluation(page: Page, learned: Learned, window: int | None = None) -> Page:
     """Held-out errors and bands, and one window in full."""
     held_out, evaluation = learned.parts.held_out, learned.evaluation
+    models = [str(m) for m in evaluation.dataset["model"].to_numpy()]
     page.section(
-        "Held-out error: preset against learned",
+        f"Held-out error: {', '.join(models[:-1])} and {models[-1]}",
         f"{len(held_out)} windows of {held_out.length:g} s that do not overlap with training data.",
     )
     hidden = held_out.hidden
@@ -105,12 +116,11 @@ def add_evaluation(page: Page, learned: Learned, window: int | None = None) -> P
             "model infers of them from the commands and sensors until then."
         )
     page.figure(error_figure(evaluation), "Error of the noise-free prediction against its horizon.")
-    shown = [key for key in next(iter(evaluation.overall().values())) if key not in _LEFT_OUT]
     page.table(
-        [(name, *(row[key] for key in shown)) for name, row in evaluation.overall().items()],
-        ("model", *(key.replace("_", " ") for key in shown)),
-        "Averages over all horizons. Coverage should be 0.5 and 0.9; a smaller energy score is "
-        "better.",
+        side_by_side(evaluation),
+        ("", *models),
+        "Root mean square errors of the noise-free prediction, after each time and over all; share "
+        "of records inside the bands, ideally 50 and 90 %; energy score: smaller is better.",
     )
     page.figure(coverage_figure(evaluation), "Calibration of the predicted bands.")
     index = len(held_out) // 2 if window is None else window
@@ -127,6 +137,29 @@ def add_evaluation(page: Page, learned: Learned, window: int | None = None) -> P
         "where it leaves the panel.",
     )
     return page
+
+
+def side_by_side(evaluation: Evaluation) -> list[tuple[object, ...]]:
+    """Rows of errors at some horizons and over all, coverage and scores; a column for a model."""
+    d, overall = evaluation.dataset, evaluation.overall()
+    horizon = d["horizon"].to_numpy()
+    last = float(horizon[-1])
+    rows: list[tuple[object, ...]] = []
+    for norm, unit in _NORMS.items():
+        name = norm.replace("_", " ")
+        for after in (last / 4, last / 2, last):
+            at = int(np.argmin(np.abs(horizon - after)))
+            values = (float(v) for v in d["rmse"].sel(norm=norm).isel(horizon=at))
+            rows.append((f"{name} after {horizon[at]:.3g} s / {unit}", *values))
+        values = (row[f"rmse_{norm}"] for row in overall.values())
+        rows.append((f"{name} over {last:.3g} s / {unit}", *values))
+    for band in d["band"].to_numpy():
+        shares = (f"{row[f'coverage_{band:g}']:.0%}" for row in overall.values())
+        rows.append((f"inside the {100 * band:.0f} % band", *shares))
+    for law in ("pose", "velocity"):
+        values = (row[f"energy_{law}"] for row in overall.values())
+        rows.append((f"energy score of {law}", *values))
+    return rows
 
 
 def taken_words(result: TrainingResult, validation: int) -> str:

@@ -67,12 +67,13 @@ class Figure:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of cells; numbers are right-aligned."""
+    """Rows of cells; numbers are right-aligned. With `fold`, its title, it opens on a click."""
 
     rows: Sequence[Sequence[object]]
     header: Sequence[str] = ()
     caption: str = ""
     width: Literal["full", "half"] = "full"
+    fold: str = ""
     kind: str = "table"
 
     @property
@@ -171,10 +172,11 @@ class Page:
         header: Sequence[str] = (),
         caption: str = "",
         width: Literal["full", "half"] = "full",
+        fold: str = "",
     ) -> "Page":
-        """Add a table of rows, or of a mapping's keys and values."""
+        """Add a table of rows, or of a mapping's keys and values, closed under a title `fold`."""
         pairs = rows.items() if isinstance(rows, Mapping) else rows
-        return self._add(Table([tuple(row) for row in pairs], tuple(header), caption, width))
+        return self._add(Table([tuple(row) for row in pairs], tuple(header), caption, width, fold))
 
     def tiles(self, tiles: Iterable[Sequence[object]]) -> "Page":
         """Add key figures: (label, value) or (label, value, remark)."""

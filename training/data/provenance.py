@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ...models.recordings.store import Recording
 from .windows import Windows
 
 PACKAGES = ("spinndrift", "jax", "jaxlib", "equinox", "optax", "diffrax", "numpy", "xarray")
@@ -29,6 +30,19 @@ def fingerprint(windows: Windows) -> str:
         digest.update(repr((array.shape, str(array.dtype))).encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(repr((windows.dt, windows.names, windows.normalise)).encode())
+    return digest.hexdigest()[:16]
+
+
+def recording_fingerprint(recording: Recording, *more: str) -> str:
+    """A digest of a recording's numbers, and of `more` text."""
+    digest = hashlib.sha256()
+    for name, variable in sorted(recording.dataset.variables.items(), key=lambda v: str(v[0])):
+        values = np.ascontiguousarray(variable.to_numpy())
+        digest.update(repr((name, values.shape, str(values.dtype))).encode())
+        digest.update(
+            repr(values.tolist()).encode() if values.dtype == object else values.tobytes()
+        )
+    digest.update(repr((recording.dt, more)).encode())
     return digest.hexdigest()[:16]
 
 

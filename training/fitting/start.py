@@ -26,7 +26,7 @@ from .drift import fit_drift
 from .fit import Progress
 from .likelihood import fit_innovations
 from .one_step_errors import mass_at_rest
-from .pretrain import pretrain
+from .pretrain import fit_potential, pretrain
 
 Model = TypeVar("Model", bound=Dynamics)
 
@@ -74,12 +74,18 @@ def estimate_diffusion(
 
 def with_diffusion(model: Model, b: Float[np.ndarray, "6"]) -> Model:
     """The model with another b (a SPINN: as the scale of its diffusion network)."""
+    scale = _scale_of(model)
+    return eqx.tree_at(_scale_of, model, jnp.asarray(b, scale.dtype))
 
-    def own(model: Dynamics) -> Any:
-        found = core(model)
-        return found.scales.diffusion if isinstance(found, Spinn) else found.diffusion  # pyright: ignore[reportAttributeAccessIssue]
 
-    return eqx.tree_at(own, model, jnp.asarray(b, own(model).dtype))
+def diffusion_scale(model: Dynamics) -> Float[np.ndarray, "6"]:
+    """What `with_diffusion` sets."""
+    return np.asarray(_scale_of(model), float)
+
+
+def _scale_of(model: Dynamics) -> Any:
+    found = core(model)
+    return found.scales.diffusion if isinstance(found, Spinn) else found.diffusion  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def begun_with(config: TrainingConfig, model: Dynamics | None) -> TrainingConfig:
@@ -138,6 +144,8 @@ def starting_model(
     model_key, pretrain_key = jax.random.split(jax.random.key(config.seed))
     spinn = create_spinn(config.model, reference, model_key, dtype)
     spinn = pretrain(spinn, reference, config.pretrain, pretrain_key)[0]
+    if given is not None and config.model.coordinates == "group" and config.pretrain.steps:
+        spinn = fit_potential(spinn, reference, config.pretrain, pretrain_key)
     if fitted_to_hidden is not None:
         b = np.asarray(fitted_to_hidden.diffusion, float)
         return with_diffusion(spinn, b) if config.model.stochastic else spinn

@@ -187,7 +187,13 @@ def _advice(a: Hypothesis, opponents: Sequence[Hypothesis], value: Mapping[str, 
     apart = f"to distinguish it from {', '.join(names)}" if names else "to measure it better"
     if value[best] < NOTHING:
         return f"{apart}: {_BY_ITSELF[family]}; no maneuver of the set does"
-    return f"{apart}: {MANEUVERS[best].text} (expected: {value[best]:.2g} nats a minute)"
+    return f"{apart}: {MANEUVERS[best].text} ({_shrinks(value[best])})"
+
+
+def _shrinks(nats: float) -> str:
+    """What so many nats a minute mean for the standard error of a cause."""
+    times = "over 100" if nats > np.log(100) else f"{np.exp(nats):.2g}"
+    return f"expected: a standard error {times} times smaller after a minute"
 
 
 def of_law(
@@ -208,7 +214,7 @@ def of_law(
             t: _of_growth(k, v) / problem.data.dt * 60 for t, v in _speeds(problem, final).items()
         }
         best = max(value, key=lambda maneuver: value[maneuver])
-        text = f"{MANEUVERS[best].text} (expected: {value[best]:.0f} nats a minute)"
+        text = f"{MANEUVERS[best].text} (expected: odds of e^{value[best]:.0f} to 1 after a minute)"
         return Experiment(f"to measure it better: {text}", value)
     return Experiment(_BY_ITSELF[kind(law.name).family], {})
 

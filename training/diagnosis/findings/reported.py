@@ -40,13 +40,14 @@ def quantile(fit: Fit) -> float:
 def unit(of: str, where: str) -> str:
     """The unit at one place, of a parameter whose unit differs between translation and rotation.
 
-    A coefficient of one axis by the motion on another (`sway_from_yaw`) has the units of both.
+    A coefficient of one axis by the motion on another (`sway_from_yaw`), a force by a speed, has
+    the units of both; a lever (`pitch_from_surge`) is a length everywhere.
     """
     both = of.split(" or ")
     axis, _, source = where.partition("_from_")
     if len(both) == 2:
         return both[axis in AXES[3:] or where == "munk"]
-    if source:
+    if source and "/" in of:
         force, _, speed = of.partition("/")
         force = force.replace("N", "N·m") if axis in AXES[3:] else force
         speed = speed.replace("m", "rad") if source in AXES[3:] else speed

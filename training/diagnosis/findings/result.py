@@ -30,6 +30,11 @@ class Value:
     unit: str
     interval95: tuple[float, float]
 
+    @property
+    def with_unit(self) -> str:
+        """The estimate to four digits with its unit; a bare number if it is dimensionless."""
+        return f"{self.value:.4g}" if self.unit == "1" else f"{self.value:.4g} {self.unit}"
+
 
 @dataclass(frozen=True)
 class Support:

@@ -119,25 +119,41 @@ def commands_lost(ratios: Sequence[result.Ratio]) -> str:
     )
 
 
+def differing(ratios: Sequence[result.Ratio]) -> list[result.Ratio]:
+    """Ratios that are off by a practical size: largest first, then those that are absent."""
+    thrust = {r.where: r.believed for r in ratios if r.name in _THRUST}
+    off = []
+    for r in ratios:
+        low, high = r.found.interval95
+        if low <= r.believed <= high:
+            continue
+        if r.name == NetBuoyancy.name:
+            far = abs(r.found.value - r.believed) > OF_THRUST * thrust.get(r.where, 0.0)
+        else:
+            far = r.name in _WORDS and bool(r.believed) and _size(r) > np.log1p(_OFF)
+        off += [r] if far else []
+    sizes = {id(r): _size(r) for r in off}
+    return sorted(off, key=lambda r: (sizes[id(r)] == np.inf, -sizes[id(r)]))
+
+
+def in_words(r: result.Ratio) -> tuple[str, str]:
+    """A ratio in the user's words: its name, and what it is of the believed value."""
+    name = _WORDS.get(r.name, r.name.replace("_", " ") + " in {}").format(r.where)
+    if _size(r) < np.inf:
+        return name, f"{_ratio(r):.2g} of yours"
+    turned = r.believed and r.found.interval95[1] * np.sign(r.believed) < 0
+    return name, "reversed" if turned else "none"
+
+
 def coefficients_off(diagnosis_ratios: Sequence[result.Ratio], added: Sequence[str] = ()) -> str:
     """Which coefficients are off by a practical size, largest ratio first; empty if none is.
 
     `added` are axes without added mass.
     """
-    thrust = {r.where: r.believed for r in diagnosis_ratios if r.name in _THRUST}
     off: dict[str, list[result.Ratio]] = {}
-    for r in diagnosis_ratios:
-        low, high = r.found.interval95
-        if low <= r.believed <= high:
-            continue
-        if r.name == NetBuoyancy.name:
-            least = OF_THRUST * thrust.get(r.where, 0.0)
-            if abs(r.found.value - r.believed) > least:
-                off.setdefault(r.name, []).append(r)
-        elif _size(r) > np.log1p(_OFF) and r.believed:
-            off.setdefault(r.name, []).append(r)
-    kinds = [sorted(rows, key=_size, reverse=True) for rows in off.values()]
-    there = [rows for rows in kinds if rows[0].name in _WORDS]
+    for r in differing(diagnosis_ratios):
+        off.setdefault(r.name, []).append(r)
+    there = [rows for name, rows in off.items() if name in _WORDS]
     here = [[r for r in rows if _size(r) < np.inf] for rows in there]
     parts = [_kind(rows) for rows in sorted(filter(None, here), key=lambda g: -_size(g[0]))]
     for rows in there:

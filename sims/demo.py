@@ -39,10 +39,11 @@ DEMO = FolderKind("demo", ("recording.nc", "report.html", "summary.json"))
 DEFAULT = Path("runs/demo")
 _USUAL = "bluerov2_heavy"
 _ON_TOP = TrainingConfig(
-    steps=150,
+    steps=100,
+    batch=8,
     learning_rate=1e-3,
     warm_up=20,
-    validate_every=25,
+    validate_every=20,
     drift=DriftConfig(iterations=0),
 )
 """Training on top of an extended model, which leaves little to learn: the diagnosis has fitted its

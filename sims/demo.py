@@ -24,7 +24,7 @@ from .demo_diagnosis import Diagnosed, diagnosed
 from .diagnosis_folder import DIAGNOSIS
 from .learning import Learned, learn
 from .progress import Update, console, progress_bar
-from .reports.demo_report import NORMS, UNITS, demo_page
+from .reports.demo_report import NORMS, UNITS, demo_page, start_words
 from .reports.findings import print_findings
 from .run.estimate import nees_words
 from .run.folder import RUN, write_files
@@ -194,12 +194,12 @@ def _summary(
     return {
         "diagnosis": told,
         "learned_from": "preset" if found.start is None else "extended",
-        "why_from_preset": found.why or None,
         "held_out": learned.evaluation.overall(),
         "training": {
             "steps": learned.result.steps,
             "best_step": learned.result.best_step,
             "seconds": learned.result.seconds,
+            "words": start_words(found, learned),
         },
         "dive": values["outcome"] | {"min_clearance_m": values["path"].get("min_clearance_m")},
         "estimate": values["estimate"],
@@ -210,7 +210,7 @@ def _summary(
 def _words(summary: dict[str, Any], out: Path) -> str:
     d, models = summary["diagnosis"], list(summary["held_out"])
     lines = [] if d is None else [f"the preset: {d['sentence']}"]
-    lines += [summary["why_from_preset"]] if summary["why_from_preset"] else []
+    lines += [summary["training"]["words"].replace("`", "")]
     lines.append(f"{'held-out error (RMS over 4 s)':<34}" + "".join(f"{m:>11}" for m in models))
     for norm, unit in zip(NORMS, UNITS, strict=True):
         errors = (summary["held_out"][m][f"rmse_{norm}"] for m in models)

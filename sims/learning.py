@@ -237,8 +237,8 @@ def learn(
 ) -> Learned:
     """Train a SPINN from a preset, or another `start`, and evaluate them on the held-out part.
 
-    Bands are calibrated on the validation windows, those of the models compared with too. If a
-    `start` scores better there than every step of training, it is the learned model itself.
+    Bands are calibrated (`training.fitting.calibrate`), those of the models compared with too. If a
+    `start` scores better on the validation windows than every step, it is the learned model itself.
 
     Writes into `out` the files of `training.fitting.fit`, `evaluation.csv`, `evaluation.json`, the
     model that training starts from as `start.spinn`, and the preset with its estimated diffusion as
@@ -295,9 +295,10 @@ def _learned(
     hidden: HiddenStart | None,
 ) -> Learned:
     """The models, calibrated, and evaluated on the held-out windows."""
-    if start is not None:
-        models = models | {start.name: (judged(start.model, parts.learn), start.substeps)}
-    models = _calibrated(models, parts.validation, hidden)
+    if start is not None:  # between the preset and what was learned
+        own = {start.name: (judged(start.model, parts.learn), start.substeps)}
+        models = {"preset": models["preset"], **own, "learned": models["learned"]}
+    models = _calibrated(models, parts, hidden)
     if _is_better(start, models, parts.validation):
         models["learned"] = models[start.name]
         result = replace(result, best_step=0)
@@ -317,18 +318,19 @@ def _save(learned: Learned, out: Path, metadata: dict[str, Any]) -> None:
 
 
 def _calibrated(
-    models: dict[str, tuple[Dynamics, int]], validation: Windows | None, hidden: HiddenStart | None
+    models: dict[str, tuple[Dynamics, int]], parts: Parts, hidden: HiddenStart | None
 ) -> dict[str, tuple[Dynamics, int]]:
-    """The models with bands that hold on the validation windows.
+    """The models with bands that hold on the training and validation windows.
 
     Without some channels, windows start from what the learned model knew, so that only its own
     bands are calibrated.
     """
-    if validation is None:
+    if parts.validation is None:
         return models
+    sets = parts.learn, parts.validation
     own = models if hidden is None else ("learned",)
     return {
-        name: (calibrated(model, validation, substeps) if name in own else model, substeps)
+        name: (calibrated(model, sets, substeps) if name in own else model, substeps)
         for name, (model, substeps) in models.items()
     }
 

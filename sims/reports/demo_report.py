@@ -60,29 +60,37 @@ def demo_page(
             for norm, unit in zip(NORMS, UNITS, strict=True)
         ]
     )
-    _add_diagnosis(page, vehicle, found)
+    _add_diagnosis(page, vehicle, found, learned)
     add_evaluation(page, learned)
     _add_dive(page, vehicle, run, values)
     return add_data(add_training(page, learned), recording)
 
 
-def _add_diagnosis(page: Page, vehicle: Vehicle, found: Diagnosed) -> None:
+def _add_diagnosis(page: Page, vehicle: Vehicle, found: Diagnosed, learned: Learned) -> None:
     """The answer of the diagnosis, and what training starts from."""
     d = found.diagnosis
     if d is None:
-        page.section("Diagnosis", f"{found.why} The SPINN was learned from the preset.")
+        page.section("Diagnosis", start_words(found, learned))
         return
     page.text(
         f'{verdict_words(d)} "Yours" is the preset `{vehicle.name}`. Only the training part of the '
         "data was diagnosed. Figures and all evidence are in [its report](diagnosis/report.html)."
     )
-    page.text(
-        f"{found.why} The SPINN was learned from the preset."
-        if found.start is None
-        else "The SPINN was learned on top of the extended model: the preset with the fitted "
-        "coefficients and causes below (`diagnosis/extended/model.spinn`)."
-    )
+    page.text(start_words(found, learned))
     add_answer(page, d)
+
+
+def start_words(found: Diagnosed, learned: Learned) -> str:
+    """What training started from, and whether it got further."""
+    if found.start is None:
+        return f"{found.why} The SPINN was learned from the preset."
+    told = (
+        "The SPINN was learned on top of the extended model (`diagnosis/extended/model.spinn`): the "
+        "preset with the fitted coefficients and the causes."
+    )
+    if learned.result.best_step == 0:
+        told += " No step of training forecast validation windows better than that model itself."
+    return told
 
 
 def _add_dive(page: Page, vehicle: Vehicle, run: Run, values: dict[str, Any]) -> None:

@@ -104,9 +104,6 @@ def _add_causes(page: Page, d: Diagnosis) -> None:
         ],
         ("cause", "where", "size (95 %)", "not distinguishable from"),
     )
-    for c in d.causes:
-        if c.structure is not None:
-            page.text(f"**No name:** {c.structure.description}.")
     page.table(
         [
             (f"{c.name} ({c.where})", f"{c.evidence.heldout_gain:.0f}",
@@ -222,6 +219,7 @@ def checks(d: Diagnosis) -> list[str]:
     """Faults of the data, what speaks against the verdict, and what has several explanations."""
     found = [f"**Data:** {problem}" for problem in d.data.problems]
     found += [f"**Left:** {one}" for one in d.left]
+    found += [f"**No name:** {c.structure.description}" for c in d.causes if c.structure]
     found += [
         f"**Open:** {c.name.replace('_', ' ')} ({c.where}) or {', '.join(c.indistinguishable_from)}"
         for c in d.causes

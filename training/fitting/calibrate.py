@@ -1,11 +1,13 @@
-"""Bands that hold what they say: b scaled to the errors on windows that nothing was fitted to.
+"""Bands that hold what they say: b scaled to the errors on training and validation windows.
 
-On the windows that the drift was fitted to errors are smaller than on others, and a median of them
-does not know their tails, so that bands of a b from there are too narrow elsewhere. Here each axis'
-b is scaled until the central bands of 50 and 90 % of predicted pose and velocity on that axis hold
-their shares of other windows, on average over both bands and all horizons.
+A median of errors does not know their tails, and errors on the windows that the drift was fitted to
+are smaller than on others, so that bands of a b from there alone are too narrow. Validation windows
+are honest but few. Both sets count alike: each axis' b is scaled until the central bands of 50 and
+90 % of predicted pose and velocity on that axis hold their shares, on average over both sets, both
+bands and all horizons.
 """
 
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -26,28 +28,28 @@ from .start import diffusion_scale, with_diffusion
 
 Model = TypeVar("Model", bound=Dynamics)
 
-_SAMPLES, _CHUNK, _WINDOWS = 39, 16, 96
+_SAMPLES, _CHUNK, _WINDOWS = 39, 16, 48
 _ROUNDS = 2
 """Spreads are nearly proportional to b, so that a second round is a small correction."""
 _MOST = 4.0
 """Largest factor of a round."""
 
 
-def calibrated(model: Model, windows: Windows, substeps: int, seed: int = 0) -> Model:
+def calibrated(model: Model, sets: Sequence[Windows], substeps: int, seed: int = 0) -> Model:
     """The model with b scaled, axis by axis, so that its bands hold their shares of the windows.
 
-    A model without diffusion is returned as it is, and so is the b of an axis whose pose and
-    velocity nobody has measured or whose motion diverges.
+    Each of the `sets` counts alike, whatever its size. A model without diffusion is returned as it
+    is, and so is the b of an axis whose pose and velocity nobody has measured or whose motion
+    diverges.
     """
     own = core(model)
     if not isinstance(own, FossenDynamics | Spinn) or not own.stochastic:
         return model
     if not np.all(diffusion_scale(model) > 0):
         return model
-    windows = windows.thin(_WINDOWS)
     for _ in range(_ROUNDS):
-        factors = _factors(*_spreads(model, windows, substeps, seed))
-        model = with_diffusion(model, diffusion_scale(model) * factors)
+        spreads = [_spreads(model, one.thin(_WINDOWS), substeps, seed) for one in sets]
+        model = with_diffusion(model, diffusion_scale(model) * _factors(spreads))
     return model
 
 
@@ -84,29 +86,33 @@ def _displacements(
     return e, displacement(batch.X[1:, :, None], batch.V[1:, :, None], *drift)[:, :, 0]
 
 
-def _factors(
-    e: Float[np.ndarray, "12 T P W"], y: Float[np.ndarray, "12 T W"]
-) -> Float[np.ndarray, "6"]:
-    """By which factor each axis' spread has to grow."""
-    ends = [order_statistics(e.shape[2], band) for band in BANDS]
-    factors = np.ones(6)
+def _factors(sets: Sequence[tuple[np.ndarray, np.ndarray]]) -> Float[np.ndarray, "6"]:
+    """By which factor each axis' spread has to grow; of each set what `_spreads` returns."""
+    factors, most = np.ones(6), np.log(_MOST)
     for axis in range(6):
-        channels = [axis, axis + 6]
-        at, low = y[channels], e[channels][:, :, [a for a, _ in ends]]
-        high = e[channels][:, :, [b for _, b in ends]]
-        known = np.isfinite(at) & np.isfinite(low).all(axis=2) & np.isfinite(high).all(axis=2)
-        if not known.any():
-            continue
+        parts = [part for e, y in sets if (part := _known(e, y, axis))]
 
-        def short(log_factor: float, at=at, low=low, high=high, known=known) -> float:
+        def short(log_factor: float, parts: Any = parts) -> float:
             s = np.exp(log_factor)
-            inside = (s * low <= at[:, :, None]) & (at[:, :, None] <= s * high)
-            return float(np.moveaxis(inside, 2, 0)[:, known].mean() - np.mean(BANDS))
+            inside = [np.mean((s * low <= y) & (y <= s * high)) for low, high, y in parts]
+            return float(np.mean(inside) - np.mean(BANDS))
 
-        most = np.log(_MOST)
+        if not parts:
+            continue
         if short(-most) >= 0 or short(most) <= 0:
             factors[axis] = 1 / _MOST if short(-most) >= 0 else _MOST
         else:
             root: Any = scipy.optimize.bisect(short, -most, most, xtol=1e-3)
             factors[axis] = np.exp(root)
     return factors
+
+
+def _known(
+    e: Float[np.ndarray, "12 T P W"], y: Float[np.ndarray, "12 T W"], axis: int
+) -> tuple[np.ndarray, ...] | None:
+    """Ends of both bands (2, n) on an axis, and what was observed (n), where all are finite."""
+    own = [axis, axis + 6]
+    ends = np.array([order_statistics(e.shape[2], band) for band in BANDS])
+    low, high = (np.moveaxis(e[own][:, :, at], 2, 0) for at in ends.T)
+    known = np.isfinite(y[own]) & np.isfinite(low).all(axis=0) & np.isfinite(high).all(axis=0)
+    return (low[:, known], high[:, known], y[own][known]) if known.any() else None

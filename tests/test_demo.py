@@ -47,6 +47,8 @@ def test_demo_tells_the_whole_story(tmp_path, monkeypatch):
         return given[0].with_base(start)
 
     monkeypatch.setattr("spinndrift.sims.learning.starting_model", begin)
+    # test_calibrate has this
+    monkeypatch.setattr("spinndrift.sims.learning.calibrated", lambda model, *_: model)
     # test_demo_diagnosis has what other diagnoses lead to
     explained = finding(told(gain={"base": GAIN, "refitted": GAIN}, causes=[CAUSE]))
     monkeypatch.setattr(demo_diagnosis.pipeline, "diagnose", lambda *_, **__: explained)

@@ -85,8 +85,8 @@ def start_words(found: Diagnosed, learned: Learned) -> str:
     if found.start is None:
         return f"{found.why} The SPINN was learned from the preset."
     told = (
-        "The SPINN was learned on top of the extended model (`diagnosis/extended/model.spinn`): the "
-        "preset with the fitted coefficients and the causes."
+        "The SPINN was learned on top of the extended model (`diagnosis/extended/model.spinn`): "
+        "the preset with the fitted coefficients and the causes."
     )
     if learned.result.best_step == 0:
         told += " No step of training forecast validation windows better than that model itself."

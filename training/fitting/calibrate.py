@@ -2,12 +2,12 @@
 
 A median of errors does not know their tails, and errors on the windows that the drift was fitted to
 are smaller than on others, so that bands of a b from there alone are too narrow. Validation windows
-are honest but few. Both sets count alike: each axis' b is scaled until the central bands of 50 and
-90 % of predicted pose and velocity on that axis hold their shares, on average over both sets, both
-bands and all horizons.
+are honest but few. Both sets count alike: on each axis two factors of b are found, at which the
+central bands of 50 and of 90 % of predicted pose and velocity hold their shares, on average over
+both sets and all horizons; b is scaled by their geometric mean.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -88,23 +88,29 @@ def _displacements(
 
 def _factors(sets: Sequence[tuple[np.ndarray, np.ndarray]]) -> Float[np.ndarray, "6"]:
     """By which factor each axis' spread has to grow; of each set what `_spreads` returns."""
-    factors, most = np.ones(6), np.log(_MOST)
+    factors = np.ones(6)
     for axis in range(6):
         parts = [part for e, y in sets if (part := _known(e, y, axis))]
 
-        def short(log_factor: float, parts: Any = parts) -> float:
+        def short(log_factor: float, k: int, parts: Any = parts) -> float:
             s = np.exp(log_factor)
-            inside = [np.mean((s * low <= y) & (y <= s * high)) for low, high, y in parts]
-            return float(np.mean(inside) - np.mean(BANDS))
+            inside = [np.mean((s * low[k] <= y) & (y <= s * high[k])) for low, high, y in parts]
+            return float(np.mean(inside)) - BANDS[k]
 
-        if not parts:
-            continue
-        if short(-most) >= 0 or short(most) <= 0:
-            factors[axis] = 1 / _MOST if short(-most) >= 0 else _MOST
-        else:
-            root: Any = scipy.optimize.bisect(short, -most, most, xtol=1e-3)
-            factors[axis] = np.exp(root)
+        if parts:
+            factors[axis] = np.exp(np.mean([_root(short, k) for k in range(len(BANDS))]))
     return factors
+
+
+def _root(short: Callable[[float, int], float], band: int) -> float:
+    """The logarithm of the factor at which a band holds its share, within bounds."""
+    most = float(np.log(_MOST))
+    if short(-most, band) >= 0:
+        return -most
+    if short(most, band) <= 0:
+        return most
+    found: Any = scipy.optimize.bisect(short, -most, most, args=(band,), xtol=1e-3)
+    return found
 
 
 def _known(

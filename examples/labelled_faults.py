@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 
 from spinndrift.models.config.errors import UserError
 from spinndrift.sims.diagnosis_benchmark.tables import interval
+from spinndrift.training.diagnosis.against.calibration import Calibration, calibrate
 
 STEP = 0.05  # s between rows; the file's own time counts whole seconds
 COLUMNS = ("pwm1", "depth", "press", "voltage", "roll", "pitch", "w_yaw")
@@ -24,6 +25,8 @@ CLASSES = ("Normal", "AddWeight", "PressureGain_constant", "PropellerDamage_slig
 TOLD = ("nothing", "weight", "depth sensor", "propeller")
 DIVE, HELD = (1.0, 4.0), (1.0, 5.0)  # s after the thrusters start
 FOLDS = 5
+TESTS = 3
+RATE = 0.125  # of false alarms, over all tests together
 
 
 @dataclass(frozen=True)
@@ -114,23 +117,29 @@ class Healthy:
 
     Attributes:
         x, y: what it was fitted to (n, k), (n, m).
-        limit: second largest score of these runs, each scored by a model that was fitted without
-            it. A further healthy run exceeds it with probability 2/(n + 1) (Vovk et al. 2005), and
-            one odd run among them doesn't set it.
+        calibration: limit that a further healthy run exceeds at a rate, from the scores of these
+            runs, each by a model that was fitted without it.
     """
 
     x: Float[np.ndarray, "n k"]
     y: Float[np.ndarray, "n m"]
-    limit: float = np.inf
+    calibration: Calibration | None = None
 
     @classmethod
-    def fit(cls, x: Float[np.ndarray, "n k"], y: Float[np.ndarray, "n m"]) -> "Healthy":
+    def fit(
+        cls, x: Float[np.ndarray, "n k"], y: Float[np.ndarray, "n m"], rate: float
+    ) -> "Healthy":
         """Fit, and set the limit by leaving out one run at a time."""
         scores = []
         for i in range(len(x)):
             kept = np.arange(len(x)) != i
             scores.append(cls(x[kept], y[kept]).score(x[i : i + 1], y[i : i + 1])[0])
-        return cls(x, y, float(sorted(scores)[-2]))
+        return cls(x, y, calibrate(np.array(scores), rate))
+
+    @property
+    def limit(self) -> float:
+        """The limit of the score; infinite without a calibration."""
+        return np.inf if self.calibration is None else self.calibration.threshold
 
     def off(self, x: Float[np.ndarray, "r k"], y: Float[np.ndarray, "r m"]) -> np.ndarray:
         """Measured less predicted, (r, m)."""
@@ -154,13 +163,18 @@ class Judge:
     turn: Healthy
 
     @classmethod
-    def fit(cls, runs: Runs, kept: Bool[np.ndarray, " n"], pwm_known: bool = True) -> "Judge":
-        """Fit to the runs kept, which are healthy; without the PWM if it shall tell nothing."""
-        one = runs.drive[kept, :1]
+    def fit(
+        cls, runs: Runs, kept: Bool[np.ndarray, " n"], rate: float = RATE, pwm_known: bool = True
+    ) -> "Judge":
+        """Fit to the runs kept, which are healthy; without the PWM if it shall tell nothing.
+
+        `rate` is that of false alarms of all tests together: each test gets an equal share.
+        """
+        one, each = runs.drive[kept, :1], rate / TESTS
         return cls(
-            Healthy.fit(one, runs.sensor[kept, :1]),
-            Healthy.fit(runs.drive[kept] if pwm_known else one, runs.dive[kept]),
-            Healthy.fit(one, runs.turn[kept]),
+            Healthy.fit(one, runs.sensor[kept, :1], each),
+            Healthy.fit(runs.drive[kept] if pwm_known else one, runs.dive[kept], each),
+            Healthy.fit(one, runs.turn[kept], each),
         )
 
     def ratios(self, runs: Runs) -> Float[np.ndarray, "n 3"]:
@@ -183,12 +197,14 @@ def folds(runs: Runs) -> np.ndarray:
     return fold
 
 
-def cross_fitted(runs: Runs, pwm_known: bool = True) -> Float[np.ndarray, "n 3"]:
+def cross_fitted(
+    runs: Runs, rate: float = RATE, pwm_known: bool = True
+) -> Float[np.ndarray, "n 3"]:
     """Ratios of every run from a model of healthy runs of other folds."""
     healthy, fold = runs.label == CLASSES[0], folds(runs)
     found = np.zeros((len(healthy), 3))
     for k in range(FOLDS):
-        judge = Judge.fit(runs, healthy & (fold != k), pwm_known)
+        judge = Judge.fit(runs, healthy & (fold != k), rate, pwm_known)
         found[fold == k] = judge.ratios(runs)[fold == k]
     return found
 
@@ -198,13 +214,15 @@ def told(ratios: Float[np.ndarray, "n 3"]) -> np.ndarray:
     return np.where(ratios.max(axis=1) > 1, 1 + ratios.argmax(axis=1), 0)
 
 
-def beyond(runs: Runs, y: Float[np.ndarray, "n m"], reference: str) -> dict[str, int]:
+def beyond(
+    runs: Runs, y: Float[np.ndarray, "n m"], reference: str, rate: float = RATE
+) -> dict[str, int]:
     """How many runs of each class lie beyond the limit of a class taken as the reference."""
     own, fold = runs.label == reference, folds(runs)
     hits: dict[str, int] = {label: 0 for label in CLASSES}  # noqa: C420
     one = runs.drive[:, :1]
     for k in range(FOLDS):
-        model = Healthy.fit(one[own & (fold != k)], y[own & (fold != k)])
+        model = Healthy.fit(one[own & (fold != k)], y[own & (fold != k)], rate / TESTS)
         far = (model.score(one, y) > model.limit) & (fold == k)
         for label in CLASSES:
             hits[label] += int(far[runs.label == label].sum())
@@ -222,6 +240,28 @@ def table(runs: Runs, said: np.ndarray, kept: Bool[np.ndarray, " n"]) -> str:
         cells = " | ".join(str(c) for c in counts)
         lines.append(f"| {label} | {cells} | {hits / of:.2f} ({low:.2f} to {high:.2f}) |")
     return "\n".join(lines)
+
+
+def judge_new(runs: Runs, path: Path | None, rate: float) -> None:
+    """Judge runs that neither a model nor a limit nor a choice of tests has seen.
+
+    Those of another file by all healthy runs; without one the odd-numbered by the even-numbered.
+    """
+    healthy, odd = runs.label == CLASSES[0], np.arange(len(runs.label)) % 2 == 1
+    if path is None:
+        print("\nOdd-numbered runs, judged by a model of even-numbered healthy ones:\n")
+        judge, new = Judge.fit(runs, healthy & ~odd, rate), runs.select(odd)
+    else:
+        print(f"\nRuns of {path.name}, judged by a model of all healthy ones:\n")
+        judge, new = Judge.fit(runs, healthy, rate), read_runs(path)
+    print(table(new, told(judge.ratios(new)), np.ones(len(new.label), bool)))
+    found = judge.turn.calibration
+    assert found is not None
+    print(
+        f"\nRate of false alarms: {rate:g} asked for, {found.rate:.3g} a test; {found.units} "
+        "healthy runs, each left out in turn, can show "
+        f"{TESTS / (found.units + 1):.3g} by count at least"
+    )
 
 
 def draw(runs: Runs, path: Path) -> None:
@@ -254,30 +294,36 @@ def main(arguments: list[str] | None = None) -> None:
     """Read, judge, print the tables, write the figure."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("file", type=Path, help="haizhe_train.npz")
+    parser.add_argument("--new", type=Path, help="further runs, judged by all healthy ones of FILE")
+    parser.add_argument(
+        "--rate", type=float, default=RATE, help=f"of false alarms (default {RATE:g})"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/faults"), help="folder to write")
     given = parser.parse_args(arguments)
+    rate = given.rate
+    if not 0.0 < rate < 0.5:
+        raise UserError(f"--rate {rate:g}: give a number between 0 and 0.5")
     runs = read_runs(given.file)
     absent = [label for label in CLASSES if label not in runs.label]
     if absent:
         raise UserError(f"{given.file}: no run is labelled {absent[0]}; take the file as published")
-    ratios = cross_fitted(runs)
+    ratios = cross_fitted(runs, rate)
     number = np.arange(len(runs.label))
     print("All runs, each judged by a model that has not seen it:\n")
     print(table(runs, told(ratios), number >= 0))
-    print("\nOdd-numbered runs, on which nothing was tuned:\n")
-    print(table(runs, told(ratios), number % 2 == 1))
-    blind = told(cross_fitted(runs, pwm_known=False))
+    judge_new(runs, given.new, rate)
+    blind = told(cross_fitted(runs, rate, pwm_known=False))
     print("\nThe same, all runs, if the law of the dive may not use PWM and voltage:\n")
     print(table(runs, blind, number >= 0))
     usual = (runs.label != CLASSES[0]) | (np.abs(runs.drive[:, 1]) < 20)
     rest = runs.select(usual)
     print(f"\nThe same without {int((~usual).sum())} healthy run far from the others' PWM:\n")
-    print(table(rest, told(cross_fitted(rest)), np.ones(int(usual.sum()), bool)))
-    told_apart = beyond(runs, runs.turn, "PressureGain_constant")
+    print(table(rest, told(cross_fitted(rest, rate)), np.ones(int(usual.sum()), bool)))
+    told_apart = beyond(runs, runs.turn, "PressureGain_constant", rate)
     print("\nTurning beyond the runs with a faulty depth sensor, whose trim is that of the damaged"
           f" propellers: {told_apart}")  # fmt: skip
     print("Attitude at rest alone, before a thruster turns, beyond the healthy runs: "
-          f"{beyond(runs, runs.rest, CLASSES[0])}")  # fmt: skip
+          f"{beyond(runs, runs.rest, CLASSES[0], rate)}")  # fmt: skip
     print("\nMedian, and in brackets standard deviation, by class:\n")
     print(
         "| labelled | depth at the surface (m) | m per unit of pressure | w\\|w\\| (10⁻³ m²/s²) "

@@ -29,6 +29,7 @@ class Told:
 
     sentence = "Nothing differs."
     causes = ()
+    against = None
 
     def __init__(self, words="new"):
         self.words = words

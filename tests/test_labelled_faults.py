@@ -81,7 +81,7 @@ def test_a_limit_is_exceeded_by_healthy_runs_as_often_as_it_says():
     n, hits, of = 19, 0, 0
     for _ in range(60):
         x, y = np.ones((n + 50, 1)), rng.standard_t(4, size=(n + 50, 2))
-        model = example.Healthy.fit(x[:n], y[:n])
+        model = example.Healthy.fit(x[:n], y[:n], 2 / (n + 1))
         hits += int((model.score(x[n:], y[n:]) > model.limit).sum())
         of += 50
     # 2/(n + 1) for one further run; draws of one model hang together, hence the wide margin

@@ -20,6 +20,13 @@ class Region(NamedTuple):
     high: tuple[float, float, float]
     step: float
 
+    def with_other(self, other: "Region") -> "Region":
+        """The least region that holds both."""
+        (a, b, c), (d, e, f) = self.low, other.low
+        (g, h, i), (j, k, m) = self.high, other.high
+        low, high = (min(a, d), min(b, e), min(c, f)), (max(g, j), max(h, k), max(i, m))
+        return Region(low, high, self.step)
+
 
 class Traits:
     """Base of `Effect`: how a diagnosis treats it, and what it is to the believed model.

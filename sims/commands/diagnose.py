@@ -3,7 +3,7 @@
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import Positional
 
@@ -13,7 +13,12 @@ from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar
 
 if TYPE_CHECKING:
+    from ...models.dynamics import Dynamics
+    from ...models.recordings.store import Recording
+    from ...models.vehicles.vehicle import Vehicle
+    from ...training.diagnosis.config import DiagnoseConfig
     from ...training.diagnosis.findings.result import Diagnosis
+    from ...training.diagnosis.pipeline import Finding
 
 _USUAL = "bluerov2_heavy"
 _STATE_VEHICLES = (".nc", ".nc4", ".h5", ".yaml", ".yml")
@@ -31,6 +36,7 @@ class Diagnose:
     EXAMPLES: ClassVar = (
         "spinndrift diagnose dive.nc --vehicle bluerov2_heavy",
         "spinndrift diagnose tank.nc --diffusion 2 2 2 0.2 0.2 0.2 --refit none --out runs/told",
+        "spinndrift diagnose harbour.nc --against tank.nc --out runs/changed",
     )
 
     data: Positional[Path]
@@ -43,8 +49,13 @@ class Diagnose:
     diffusion: Annotated[Vector6 | None, Within(0, 1e6)] = None
     """Disturbance that is believed with a preset: b of surge, sway, heave (N√s), roll, pitch, yaw
     (N·m√s). Without it a wrong level of the disturbance can't be found."""
+    against: Path | None = None
+    """Healthy runs: what differs from them in DATA, as changes of causes, or that nothing does. A
+    folder that `diagnose` wrote for them (their data are read again), healthy data in any form that
+    DATA may have (diagnosed first, with the options given), or a folder of several recordings."""
     alpha: Annotated[float, RATE_OF_ALARMS] = 0.01
-    """Rate of false alarms over all names together."""
+    """Rate of false alarms over all names together; with `--against` calibrated on healthy runs,
+    each left out in turn."""
     refit: Literal["auto", "none", "scales", "linear", "command", "all"] = "auto"
     """Coefficients that are fitted before any cause is named: none, one factor on all thrust
     (`scales`), added mass, drag and buoyancy (`linear`), drag, buoyancy and the scale of each axis'
@@ -73,47 +84,109 @@ class Diagnose:
             import numpy as np
 
             from ...models.files.checkpoint import load_model
-            from ...models.recordings.checks.examine import examine
             from ...models.recordings.checks.finding import check_accepted
             from ...models.vehicles.vehicle import load_vehicle
-            from ...systems.logs.load import LogOptions, load_data
-            from ...training.diagnosis.pipeline import DiagnoseConfig, diagnose
+            from ...training.diagnosis.pipeline import diagnose
             from ..diagnosis_folder import write_diagnosis
+            from ..healthy import OPTIONS, SOURCE
             from ..reports.findings import print_findings
 
         self._check()
         check_accepted(self.accept)
-        config = DiagnoseConfig(alpha=self.alpha, refit=self.refit)
         base, metadata = (None, {}) if self.model is None else load_model(self.model, dtype=float)
         named = metadata.get("vehicle")
         if self.vehicle is not None:
             load_vehicle(self.vehicle)  # fails now, not after the data are read
-        with progress_bar(f"reading {self.data.name}") as update:
-            recording = load_data(
-                self.data,
-                vehicle=self.vehicle or (named if self._is_log() else None),
-                options=LogOptions(water_density=self.water_density),
-                resample=False,
-                accept=self.accept,
-                progress=update,
-            )
+        recording = self._read(self.data, self.vehicle or (named if self._is_log() else None))
         stated = self._vehicle(recording.vehicle, named)
         vehicle = load_vehicle(stated)
-        recording = examine(recording, vehicle, str(self.data), self.accept)
+        recording = self._examined(recording, vehicle, self.data)
         print_findings(console(), recording)
         if self.diffusion is not None:
             base = vehicle.dynamics(np.array(self.diffusion))
-        with progress_bar("diagnosing") as update:
-            finding = diagnose(recording, vehicle, base, config, update)
-        about = {"vehicle": stated, "source": str(self.data), "dt": recording.dt}
+        if self.against is not None:
+            finding = self._compared(recording, vehicle, base, stated)
+        else:
+            with progress_bar("diagnosing") as update:
+                finding = diagnose(recording, vehicle, base, self._config(), update)
+        about = {
+            "vehicle": stated,
+            SOURCE: str(self.data.absolute()),
+            OPTIONS: {"water_density": self.water_density, "accept": list(self.accept)},
+            "dt": recording.dt,
+        }
         write_diagnosis(self.out, finding, recording, self.data.name, about)
         _print(finding.diagnosis)
         console().print(f"wrote {self.out}")
+
+    def _read(self, path: Path, vehicle: str | None, **options: Any) -> "Recording":
+        """Data of any kind; `options` replace those of the command."""
+        with interrupts_held():
+            from ...systems.logs.load import LogOptions, load_data
+
+        density = options.get("water_density", self.water_density)
+        with progress_bar(f"reading {path.name}") as update:
+            return load_data(
+                path,
+                vehicle=vehicle,
+                options=LogOptions(water_density=density),
+                resample=False,
+                accept=options.get("accept", self.accept),
+                progress=update,
+            )
+
+    def _examined(
+        self, recording: "Recording", vehicle: "Vehicle", path: Path, **options: Any
+    ) -> "Recording":
+        """The recording after all checks."""
+        with interrupts_held():
+            from ...models.recordings.checks.examine import examine
+
+        return examine(recording, vehicle, str(path), options.get("accept", self.accept))
+
+    def _config(self) -> "DiagnoseConfig":
+        with interrupts_held():
+            from ...training.diagnosis.config import DiagnoseConfig
+
+        return DiagnoseConfig(alpha=self.alpha, refit=self.refit)
+
+    def _compared(
+        self, recording: "Recording", vehicle: "Vehicle", base: "Dynamics | None", stated: str
+    ) -> "Finding":
+        """What differs from the healthy runs; without a diagnosis of these, one is made first."""
+        with interrupts_held():
+            from ...training.diagnosis.against.pipeline import Healthy, diagnose_against
+            from ...training.diagnosis.pipeline import diagnose
+            from ..healthy import diagnosis_at, healthy_of_diagnosis, recordings_in
+
+        def read(path: Path, options: dict[str, Any]) -> "Recording":
+            data = self._read(path, stated, **options)
+            return self._examined(data, vehicle, path, **options)
+
+        assert self.against is not None
+        folder = diagnosis_at(self.against)
+        if folder is not None:
+            healthy = healthy_of_diagnosis(folder, read)
+        else:
+            runs = recordings_in(self.against, lambda path: read(path, {}))
+            with progress_bar("diagnosing the healthy runs") as update:
+                model = diagnose(runs, vehicle, base, self._config(), update).extended
+            healthy = Healthy(runs, model, str(self.against))
+        with progress_bar("comparing with them") as update:
+            return diagnose_against(recording, vehicle, healthy, self._config(), update)
 
     def _check(self) -> None:
         """Check for contradicting options, before anything is read."""
         if self.diffusion is not None and self.model is not None:
             raise UserError("--diffusion: the model of --model has its own; leave one out")
+        if self.against is not None:
+            with interrupts_held():
+                from ..healthy import check_healthy
+
+            given = {"--model": self.model, "--diffusion": self.diffusion}
+            check_healthy(
+                self.against, [name for name, value in given.items() if value is not None]
+            )
 
     def _vehicle(self, recorded: str, named: str | None) -> str:
         """The vehicle given, or that of the data or the model; else the default, with a message."""
@@ -132,6 +205,8 @@ def _print(diagnosis: "Diagnosis") -> None:
     """The verdict and the causes."""
     shown = console()
     shown.print(diagnosis.sentence)
+    if diagnosis.against is not None:
+        return
     for cause in diagnosis.causes:
         told = ", ".join(f"{k} {v.with_unit}" for k, v in cause.parameters.items())
         if cause.structure is not None:  # its coefficients are in diagnosis.json

@@ -4,6 +4,7 @@ from ...models.se3 import AXES
 from ...training.diagnosis.findings.maneuver_library import MANEUVERS
 from ...training.diagnosis.findings.result import Diagnosis
 from ...training.diagnosis.pipeline import Finding
+from .against_section import add_against
 from .diagnosis_answer import MODELS, add_answer, interval, verdict_words
 from .figures_diagnosis import (
     experiments_figure,
@@ -70,8 +71,15 @@ def diagnosis_page(finding: Finding, title: str) -> Page:
     page = Page(
         title, f"{len(d.data.scenarios)} scenarios, {d.data.runs} runs, {d.data.seconds:.0f} s"
     )
-    page.verdict(d.sentence, good=d.verdict == "adequate")
-    page.text(f"{verdict_words(d)} Words are explained [at the end](#words).")
+    against = d.against
+    good = d.verdict == "adequate" if against is None else against.verdict == "unchanged"
+    page.verdict(d.sentence, good=good)
+    if against is None:
+        page.text(f"{verdict_words(d)} Words are explained [at the end](#words).")
+    else:
+        add_against(page, against)
+        page.section("The healthy model, with the changes, on the new data", verdict_words(d))
+        page.text("Words are explained [at the end](#words).")
     add_answer(page, d)
     _add_experiments(page, finding)
     _add_simulations(page, finding, shared)

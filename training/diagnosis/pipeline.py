@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ...models.config.checks import check_numbers, require, require_rate
 from ...models.config.errors import UserError
 from ...models.dynamics import Dynamics
 from ...models.effects.base import Effect
@@ -24,6 +23,7 @@ from .causes import (
     reported_causes,
     supported,
 )
+from .config import DiagnoseConfig
 from .data.arrays import Data
 from .data.checks import SPARSE, limits, problems, require_enough, settled, unexcited
 from .disturbance.found import OF_OTHERS, all_laws, reported_laws
@@ -34,9 +34,9 @@ from .findings import reported, result
 from .findings.conclusion import conclude
 from .findings.ratios import ratios
 from .selection.hypotheses import Fit
-from .selection.model_selection import parameters_of
+from .selection.model_selection import Hypothesis, parameters_of
 from .selection.refit_all import identify, with_coefficients
-from .selection.search import Refit, Search, refitted
+from .selection.search import Search, refitted
 from .selection.state import Fits, Selection
 from .validation.blackbox import train
 from .validation.claims import LEFT, Judgement, asserted, clearly_better
@@ -51,41 +51,6 @@ _OF_A_COMMAND = 0.1
 """Least lag or delay, as a share of the period of sparse commands: interpolation looks like one."""
 _FINEST = 0.02
 """Shortest step (s) that the extended model supports: it sets the length of delay buffers."""
-
-
-@dataclass(frozen=True)
-class DiagnoseConfig:
-    """Options of a diagnosis.
-
-    Attributes:
-        alpha: rate of false alarms over all causes together.
-        refit: what is fitted before the causes and stays free with them: `none` (every difference
-            from the believed model is a cause), `scales` (one factor on all thrust), `linear`
-            (added masses, drag, buoyancy), `command` (a factor on the wrench of each axis, drag,
-            buoyancy: for commands of unknown scale; the inertia stays as believed) or `all` (these,
-            the thrust curve and lever arms, the centre of buoyancy: `identify`). `auto` is `none`
-            if left-out data bear out its verdict (`validation.claims`). Else `all` are fitted, and
-            the diagnosis that forecasts better is taken.
-        most: causes at most.
-        horizon: length of the simulations for validation (s).
-        seed: of bootstraps and simulated noise.
-
-    Example:
-        >>> DiagnoseConfig(alpha=0.001, refit="none").most
-        6
-    """
-
-    alpha: float = 0.01
-    refit: Refit = "auto"
-    most: int = 6
-    horizon: float = 4.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_numbers(self)
-        require_rate(self.alpha, "DiagnoseConfig.alpha")
-        require(self.most >= 1, self, "most", "give at least 1")
-        require(self.horizon > 0, self, "horizon", "give a positive time")
 
 
 @dataclass(frozen=True)
@@ -165,9 +130,7 @@ class Diagnoser:
                 problem = self.problem = problem.along(first.theta)
                 base, first = self._believed(problem), self._refitted(problem, first.theta)
         start = Selection.start(problem, base, first, config.seed)
-        found, nuisance, structures = find_causes(
-            start, nuisance, config.refit, self._selector, self.progress
-        )
+        found, nuisance, structures = self._find(start, nuisance)
         problem = found.problem
         self.progress(0.72, "all causes together")
         rows = reported.joint_rows(found, nuisance, problem)
@@ -178,7 +141,7 @@ class Diagnoser:
             final = problem.evaluate(theta)
         self.progress(0.78, "laws of the disturbance")
         least = self._least_gain(found)
-        laws = [] if final.noise.estimated else all_laws(problem, final, least)
+        laws = self._laws(problem, final, least)
         groups = reported_laws(laws, problem, final, least)
         causes = reported_causes(found, nuisance, structures, final, joint, self.progress)
         of_laws, random_effects = law_causes(groups, laws, least, final, problem)
@@ -220,6 +183,14 @@ class Diagnoser:
             diagnosis, extended.for_steps_of(_FINEST), problem.library, final.theta, d, base, final,
             found.fits, laws, judged,
         )  # fmt: skip
+
+    def _find(
+        self, start: Selection, nuisance: list[int]
+    ) -> tuple[Selection, list[int], dict[Hypothesis, result.Structure]]:
+        return find_causes(start, nuisance, self.config.refit, self._selector, self.progress)
+
+    def _laws(self, problem: DiagnosisProblem, final: Evaluation, least: float) -> list[Law]:
+        return [] if final.noise.estimated else all_laws(problem, final, least)
 
     def _least_gain(self, found: Selection) -> float:
         """Nats that a law must win."""
@@ -286,10 +257,15 @@ class Diagnoser:
         return theta, fitted, fitted.evidence.fit(rows)
 
     def _selector(self, problem: DiagnosisProblem, nuisance: list[int]) -> Search:
+        shortest = self._shortest(problem)
+        return Search(nuisance, self.config.alpha, self.config.most, self.quiet, shortest)
+
+    def _shortest(self, problem: DiagnosisProblem) -> float:
+        """Time (s) below which lags and delays are rejected."""
         shortest = (_OF_A_STEP if self.resampled else _NO_TIME) * problem.data.dt
         if self.command_period > SPARSE * problem.data.dt:
             shortest = max(shortest, _OF_A_COMMAND * self.command_period)
-        return Search(nuisance, self.config.alpha, self.config.most, self.quiet, shortest)
+        return shortest
 
     def _validate(
         self,

@@ -14,6 +14,7 @@ from ....models.dynamics import Dynamics
 from ....models.effects.base import Effect
 from ....models.effects.extended import Extended
 from ....models.effects.library import KINDS, Library, kind
+from ....models.effects.traits import Region
 from ....models.recordings.store import Recording
 from ....models.vehicles.vehicle import Vehicle
 from ..data.arrays import Data, make_data
@@ -95,8 +96,11 @@ class DiagnosisProblem:
         vehicle: Vehicle,
         base: Dynamics | None = None,
         without: Sequence[int] = (),
+        beside: Data | None = None,
     ) -> "DiagnosisProblem":
         """The problem of `base` (default: the vehicle's preset), `without` the faulty runs.
+
+        With data `beside` these, effects that depend on the place refer to the region of both.
 
         Raises:
             ValueError: if JAX runs in single precision.
@@ -106,7 +110,8 @@ class DiagnosisProblem:
         believed = vehicle.dynamics() if base is None else base
         effects = believed.effects if isinstance(believed, Extended) else ()
         core = believed.base if isinstance(believed, Extended) else believed
-        library, theta = _library(data, effects)
+        region = data.region if beside is None else data.region.with_other(beside.region)
+        library, theta = _library(data, effects, region)
         model = Extended.create(core, (), vehicle.thrusters())
         data = with_latent(data, model, library, theta)
         return cls(data, vehicle, model, library, theta)
@@ -166,13 +171,15 @@ class DiagnosisProblem:
             raise FloatingPointError("predictions diverge")
         jacobian = np.asarray(p.jacobian)
         steps = Transition.along(jacobian, weight, p.late, p.latent)
-        mass = self.mass(theta)
-        noise = estimate(error, weight, steps, mass, self.data.dt)
-        if kalman is not None:
-            return p, noise, kalman
-        data, inverse = self.data, np.linalg.inv(mass)
-        given = data.dt, data.step, jacobian, p.latent
-        return p, noise, judging_filter(noise, steps, inverse, *given)
+        noise = estimate(error, weight, steps, self.mass(theta), self.data.dt)
+        return p, noise, self.filter_in(noise, theta, p) if kalman is None else kalman
+
+    def filter_in(self, noise: Noise, theta: Float[np.ndarray, " p"], p: Predictions) -> Filter:
+        """The filter of predictions in a noise."""
+        data, jacobian = self.data, np.asarray(p.jacobian)
+        steps = Transition.along(jacobian, data.weight, p.late, p.latent)
+        inverse = np.linalg.inv(self.mass(theta))
+        return judging_filter(noise, steps, inverse, data.dt, data.step, jacobian, p.latent)
 
     def errors(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "N 12 R"]:
         """Errors of one-step predictions, zero where a piece has no sample."""
@@ -359,10 +366,10 @@ def _key(entry: tuple) -> tuple[str, str, str]:
     return entry[0], entry[1], entry[2].name
 
 
-def _library(data: Data, effects: Sequence[Effect]) -> tuple[Library, np.ndarray]:
+def _library(data: Data, effects: Sequence[Effect], region: Region) -> tuple[Library, np.ndarray]:
     kinds = [k for k in KINDS.values() if not k.random and k.needs <= data.offers]
     own = [e for e in effects if e.name not in {k.name for k in kinds}]
-    n, region = data.u.shape[1], data.region
+    n = data.u.shape[1]
     library = Library([*(k.neutral(thrusters=n, **k.options_for(region)) for k in kinds), *own])
     theta = np.zeros(library.size)
     for effect in effects:

@@ -1,19 +1,18 @@
 """The result of a diagnosis: the content of `diagnosis.json`, and its schema."""
 
 import dataclasses
-import inspect
 import json
-import math
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal
 
 from ....models.files.atomic import atomic_path
+from .schema import described, plain, schema_of
+
+__all__ = ["described"]
 
 Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
-VERSION = 4
+VERSION = 5
 
 
 @dataclass(frozen=True)
@@ -245,6 +244,73 @@ class DataSummary:
 
 
 @dataclass(frozen=True)
+class Change:
+    """A cause that has changed since the healthy runs.
+
+    Attributes:
+        name: of the effect.
+        where: axis, thruster (1 to n, or `all`) or frame it is in.
+        text: the change in words.
+        before: value of each parameter in the healthy runs, in the unit of `change`.
+        change: new less healthy, by parameter; intervals hold the scatter between healthy units.
+        ratio: new over healthy, where the parameter is a factor or a coefficient of the vehicle.
+        p_value: probability of such a change of any cause between healthy data, from the scatter
+            between healthy units.
+    """
+
+    name: str
+    where: str
+    text: str
+    before: dict[str, float]
+    change: dict[str, Value]
+    ratio: Value | None
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Against:
+    """What differs from the healthy runs, with a rate of false alarms that these have set.
+
+    Attributes:
+        verdict: unchanged (no test exceeds what healthy units do when left out), changed (by the
+            named `changes`), changed_without_name (a test does, but no cause holds).
+        sentence: the verdict in words.
+        baseline: the diagnosis, or the healthy data.
+        changes: causes that differ, first found first.
+        noise: size of one-step errors over that of the healthy runs, by channel (x, y, z, roll,
+            pitch, yaw, u, v, w, p, q, r), where the changes leave a difference.
+        unit: what was left out of the healthy data in turn: scenario, run or stretch of a run.
+        units: number of healthy units.
+        judged: number of new units.
+        rate: of false alarms that was asked for.
+        counted_rate: least rate that so many healthy units can show by count; above `rate` where
+            they are too few, and the threshold is then that of the theory or the largest score of
+            healthy units, whichever is higher.
+        score: of the new data, the largest over all causes: minus the logarithm of the p value.
+        threshold: of the score; exceeded at half of the rate by healthy data.
+        noise_score: the same of the sizes of errors, the largest over all channels.
+        noise_threshold: of that score, for the other half of the rate.
+        alarms: number of healthy units above a threshold when left out.
+    """
+
+    verdict: Literal["unchanged", "changed", "changed_without_name"]
+    sentence: str
+    baseline: str
+    changes: list[Change]
+    noise: dict[str, Value]
+    unit: Literal["scenario", "run", "stretch"]
+    units: int
+    judged: int
+    rate: float
+    counted_rate: float
+    score: float
+    threshold: float
+    noise_score: float
+    noise_threshold: float
+    alarms: int
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """The whole diagnosis.
 
@@ -270,6 +336,8 @@ class Diagnosis:
             squares over position, rotation and velocity, m, rad and m/s counted alike) that causes
             and refitted coefficients explain; empty where there are none.
         left: what data speak against the claim that only noise is left, a sentence each.
+        against: with `--against`, what differs from the healthy runs; causes are then those that
+            have changed, and the believed model is that of the healthy runs.
     """
 
     version: int
@@ -288,10 +356,11 @@ class Diagnosis:
     seconds: float = field(default=0.0)
     explained: dict[str, Interval] = field(default_factory=dict)
     left: list[str] = field(default_factory=list)
+    against: Against | None = None
 
     def as_json(self) -> str:
         """Text of `diagnosis.json`; numbers that are not finite become null."""
-        return json.dumps(_plain(dataclasses.asdict(self)), indent=2, ensure_ascii=False) + "\n"
+        return json.dumps(plain(dataclasses.asdict(self)), indent=2, ensure_ascii=False) + "\n"
 
     def save(self, path: Path) -> None:
         """Write it as JSON; whole or not at all."""
@@ -299,65 +368,6 @@ class Diagnosis:
             partial.write_text(self.as_json(), encoding="utf-8")
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def schema(cls: Any = Diagnosis) -> dict[str, Any]:
-    """JSON Schema (2020-12) of `diagnosis.json`, from the dataclasses themselves."""
-    definitions: dict[str, Any] = {}
-    body = _schema(cls, definitions)
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **body, "$defs": definitions}
-
-
-def described(cls: type) -> dict[str, str]:
-    """Each field's description, from the attributes in a dataclass' docstring."""
-    text = inspect.cleandoc(cls.__doc__ or "").partition("Attributes:\n")[2]
-    entries = re.findall(r"^    (\w+): (.*(?:\n        .*)*)", text, re.MULTILINE)
-    return {name: " ".join(words.split()) for name, words in entries}
-
-
-def _schema(kind: Any, definitions: dict[str, Any]) -> dict[str, Any]:
-    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        name = kind.__name__
-        if name not in definitions:
-            definitions[name] = {}
-            hints, descriptions = get_type_hints(kind), described(kind)
-            definitions[name] = {
-                "type": "object",
-                "description": (kind.__doc__ or "").split("\n")[0],
-                "properties": {
-                    k: {**_schema(v, definitions), "description": descriptions.get(k, "")}
-                    for k, v in hints.items()
-                },
-                "required": [f.name for f in dataclasses.fields(kind)],
-                "additionalProperties": False,
-            }
-        return {"$ref": f"#/$defs/{name}"}
-    origin, arguments = get_origin(kind), get_args(kind)
-    if origin is Literal:
-        return {"enum": list(arguments)}
-    if origin is list:
-        return {"type": "array", "items": _schema(arguments[0], definitions)}
-    if origin is tuple:
-        size = len(arguments)
-        items = _schema(arguments[0], definitions)
-        return {"type": "array", "items": items, "minItems": size, "maxItems": size}
-    if origin is dict:
-        return {"type": "object", "additionalProperties": _schema(arguments[1], definitions)}
-    if origin in (Union, UnionType):
-        return {"anyOf": [_schema(a, definitions) for a in arguments]}
-    plain = {
-        float: ["number", "null"],
-        int: "integer",
-        str: "string",
-        bool: "boolean",
-        type(None): "null",
-    }
-    return {"type": plain[kind]}
+def schema(cls: Any = None) -> dict[str, Any]:
+    """JSON Schema (2020-12) of `diagnosis.json`."""
+    return schema_of(Diagnosis if cls is None else cls)

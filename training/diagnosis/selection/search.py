@@ -56,7 +56,7 @@ def refitted(problem: DiagnosisProblem, refit: Refit) -> list[int]:
     ]
 
 
-def _asks_for_commands(named: Hypothesis, quiet: Sequence[str]) -> bool:
+def asks_for_commands(named: Hypothesis, quiet: Sequence[str]) -> bool:
     """Whether a cause is not identifiable because its axis, or no axis at all, was driven."""
     name, where = named
     if len(quiet) == len(AXES):
@@ -89,7 +89,7 @@ class Search:
             h
             for h in problem.library.hypotheses(single=False)
             if h[0] not in free
-            and not _asks_for_commands(h, self.quiet)
+            and not asks_for_commands(h, self.quiet)
             and not acts_unseen(h[1], problem.data.unseen)
         ]
 
@@ -310,14 +310,15 @@ class Search:
             own = library.at(*choice.hypothesis)
             others = [i for i in chosen if i not in own]
             weight = 0.0
-            if current.theta[own].any():  # else the joint fit itself has set it to zero
+            change = current.theta[own] - problem.believed[own]
+            if change.any():  # else the joint fit itself has set it to zero
                 errors = current.evidence.fit(own, others).errors
-                weight = float(np.sum((current.theta[own] / np.maximum(errors, 1e-300)) ** 2)) / 2
+                weight = float(np.sum((change / np.maximum(errors, 1e-300)) ** 2)) / 2
             if weight > state.threshold:
                 kept.append(choice)
             else:
                 dropped.add(choice.hypothesis)
-                theta[own] = 0.0
+                theta[own] = problem.believed[own]
         if len(kept) == len(state.accepted):
             return state
         state = replace(state, accepted=tuple(kept), dropped=frozenset(dropped))

@@ -1,0 +1,1 @@
+"""What differs between new recordings and healthy ones."""

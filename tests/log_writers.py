@@ -83,6 +83,7 @@ def dive(
     silent=lambda t: False,
     jump=None,
     rates=(50.0, 25.0, 50.0),
+    hud=None,
     version=2,
 ):
     """A telemetry log of `duration` s from `start` (s since boot) and its writer.
@@ -94,6 +95,7 @@ def dive(
         silent: times at which nothing is sent.
         jump: time from which positions are 2 m further north.
         rates: of attitude, position and outputs (Hz).
+        hud: of VFR_HUD (Hz), which has the climb and no time; None for none.
     """
     log = Tlog(version)
 
@@ -125,6 +127,8 @@ def dive(
             height, down = round(-p[2] * 1e3), round(v[2] * 1e2)
             fields = (ms(t), 0, 0, 0, height, 0, 0, down, 0)
             log.send(t, dialect.MAVLink_global_position_int_message(*fields))
+    for t, (_, _, v, _) in moving(hud, 0.001) if hud else ():
+        log.send(t, dialect.MAVLink_vfr_hud_message(0.0, 0.0, 0, 0, 0.0, -v[2]))
     for t in times(rates[2], 0.002):
         pwm = [int(us) for us in outputs(t)] + [0] * 8
         fields = (round(t * 1e6) % 2**32, 0, *pwm[:8], *pwm[8:])

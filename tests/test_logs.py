@@ -284,6 +284,33 @@ def test_without_a_horizontal_estimate_only_the_vertical_is_kept(tmp_path):
     assert any("No horizontal estimate: surge and sway" in line for line in report.lacks)
 
 
+def test_the_climb_is_that_of_the_faster_message(tmp_path):
+    """VFR_HUD repeats the estimate of GLOBAL_POSITION_INT more often, and not rounded to 1 cm/s."""
+    slow = (50.0, 5.0, 50.0)
+    worst = []
+    for hud in (None, 2.0, 10.0):
+        recording, report = imported(tmp_path, dive(horizontal=False, rates=slow, hud=hud).bytes())
+        (run,) = recording.trajectories()
+        _, _, v_W = truth(run.start + recording.dt * np.arange(len(run)))
+        worst.append(np.abs(run.sensors["vertical_velocity"] - v_W[2]).max())
+        assert ("Climb from VFR_HUD at 10 Hz" in str(report)) == (hud == 10.0)
+    assert worst[0] == worst[1] > 4 * worst[2]
+
+
+@pytest.mark.parametrize("rate", [20.0, 25.0])
+def test_rates_as_fast_as_the_grid_are_not_interpolated(tmp_path, rate):
+    """Between samples a motion faster than them would be smoothed, and look slower than it was."""
+    data = dive(rates=(rate, 25.0, 50.0), parameters=PARAMETERS | {"INS_GYRO_FILTER": 20.0}).bytes()
+    (tmp_path / "dive.tlog").write_bytes(data)
+    recording, _ = import_log(tmp_path / "dive.tlog", rate=rate)
+    sampled = read_tlog(data, ("ATTITUDE_QUATERNION",)).tables["ATTITUDE_QUATERNION"]
+    (run,) = recording.trajectories()
+    after = np.searchsorted(sampled["t"], run.start)
+    logged = codec.body_vector(*(sampled[f"{n}speed"] for n in ("roll", "pitch", "yaw")))
+    following = logged[:, after : after + len(run)].T
+    np.testing.assert_allclose(run.V_WB_B[:, 3:], following, atol=1e-9)
+
+
 def test_slow_outputs_are_told_to_hide_the_lag(tmp_path):
     recording, report = imported(tmp_path, dive(rates=(50.0, 4.0, 10.0)).bytes())
     assert recording.command_period == pytest.approx(0.1, rel=0.05)
@@ -297,10 +324,14 @@ def test_the_gyro_filters_delay_is_taken_off(tmp_path):
     plain, _ = imported(tmp_path, dive().bytes())
     moved, report = imported(tmp_path, dive(parameters=filtered).bytes())
     rates = [r.dataset["V_WB_B"].to_numpy()[0, 0, :300, 3:] for r in (plain, moved)]
-    start = next(iter(moved.trajectories())).start
-    later = truth(start + moved.dt * np.arange(300) + codec.filter_delay(20.0))[1][3:].T
-    np.testing.assert_allclose(rates[1], later, atol=1e-3)
-    assert np.abs(rates[0] - later).max() > 3e-3
+    for r, omega, late in ((plain, rates[0], 0.0), (moved, rates[1], codec.filter_delay(20.0))):
+        start = next(iter(r.trajectories())).start
+        at, other = (
+            truth(start + r.dt * np.arange(300) + delay)[1][3:].T
+            for delay in (late, codec.filter_delay(20.0) - late)
+        )
+        np.testing.assert_allclose(omega, at, atol=1e-3)
+        assert np.abs(omega - other).max() > 3e-3
     assert any("moved back by 11 ms" in line for line in report.done)
 
 

@@ -108,6 +108,9 @@ def _motion(signals: Signals) -> list[str]:
     if p is not None:
         whose = "" if p.source.startswith("/") else " (the autopilot's estimate)"  # a ROS topic
         told.append(f"{_what(signals, p)} from {_at(p)}{whose}.")
+        if _climbs_apart(signals):
+            assert signals.velocity is not None
+            told.append(f"Climb from {_at(signals.velocity)}.")
     depth = signals.pressure_depth
     if depth is not None:
         told.append(f"Depth by pressure from {_at(depth)}.")
@@ -128,7 +131,17 @@ def _motion(signals: Signals) -> list[str]:
 def _what(signals: Signals, p: Series) -> str:
     if np.isfinite(p.x[0]).any():
         return "Position and velocity"
-    return "Velocity" if _moves_ahead(signals) else "Height and climb"
+    if _moves_ahead(signals):
+        return "Velocity"
+    return "Height" if _climbs_apart(signals) else "Height and climb"
+
+
+def _climbs_apart(signals: Signals) -> bool:
+    """Whether the climb is from another message than the height."""
+    p, v = signals.position, signals.velocity
+    if p is None or v is None or _moves_ahead(signals):
+        return False
+    return not v.source.startswith(p.source)  # "…, differentiated" is the height's own
 
 
 def _moves_ahead(signals: Signals) -> bool:

@@ -33,6 +33,7 @@ WANTED = (
     "SERVO_OUTPUT_RAW",
     "STATUSTEXT",
     "SYSTEM_TIME",
+    "VFR_HUD",
     "SYS_STATUS",
 )
 UNAIDED = "unaided"
@@ -170,7 +171,22 @@ def _motion(
     else:
         return None, None
     position, velocity = series(t, p, name, "position"), series(t, v, name, "velocity")
+    if local is None or local["t"].size < 2:
+        velocity = _finer_climb(tables, velocity)
     return in_water(position, velocity, known, density)
+
+
+def _finer_climb(tables: Mapping[str, Table], velocity: Series | None) -> Series | None:
+    """The climb of VFR_HUD where it comes more often: the same estimate, not rounded to 1 cm/s."""
+    hud = tables.get("VFR_HUD")
+    if hud is None:
+        return velocity
+    lacking = np.full(hud["t"].size, np.nan)
+    v = np.stack([lacking, lacking, np.asarray(hud["climb"], float)])
+    found = series(hud["t"], v, "VFR_HUD", "velocity")
+    if found is None or (velocity is not None and found.rate <= velocity.rate):
+        return velocity
+    return found
 
 
 def _aiding(tables: Mapping[str, Table]) -> dict[str, Spans]:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ....models.effects.library import COEFFICIENTS, Entry, kind
 from ....models.effects.traits import Group
@@ -125,6 +125,8 @@ class _Posterior:
         C, counts = _by_piece(self.problem, self.problem.errors(theta), common)
         if not np.isfinite(C).all():
             return np.inf
+        rows = _felt(self.problem)
+        C = C[:, rows[:, None], rows]
         return float(counts @ np.linalg.slogdet(C)[1] + away @ away) / 2
 
     def local(self, theta: np.ndarray) -> LocalModel:
@@ -165,13 +167,22 @@ def one_step(problem: DiagnosisProblem, theta: Float[np.ndarray, " p"]) -> Filte
     """
     error = problem.errors(theta)
     C, _ = _by_piece(problem, error, problem.covariance(error, apart=True))
-    whiten = np.moveaxis(np.linalg.inv(np.linalg.cholesky(C)), 0, -1)
-    whiten = np.repeat(whiten[None], len(problem.data.u), axis=0)
+    rows = _felt(problem)
+    C = C[:, rows[:, None], rows]
+    whiten = np.zeros((len(problem.data.u), 12, 12, len(C)))
+    inverse = np.moveaxis(np.linalg.inv(np.linalg.cholesky(C)), 0, -1)
+    whiten[:, rows[:, None], rows] = inverse
     log_det = np.broadcast_to(np.linalg.slogdet(C)[1] / 2, problem.data.weight.shape)
     keep = np.zeros_like(whiten)
     for i in problem.data.latent:
         keep[:, 6 + i, 6 + i] = 1.0
     return Filter(keep, whiten, log_det)
+
+
+def _felt(problem: DiagnosisProblem) -> Int[np.ndarray, " k"]:
+    """The errors that forces make: of twists, and of poses whose twists were not measured."""
+    twist = np.arange(6, 12)
+    return np.concatenate([np.flatnonzero(problem.data.measured[twist] == 0), twist])
 
 
 def _by_piece(

@@ -495,6 +495,25 @@ def test_how_thrusters_follow_is_told_with_number_and_place(tmp_path, name, seed
     assert words in told["description"]
 
 
+def test_what_runs_ahead_of_its_command_has_no_rate_limit(tmp_path, monkeypatch):
+    from spinndrift.models.effects.unknown import Unknown
+    from spinndrift.training.diagnosis.candidates.groups import FOLLOWED, _of_follower
+    from spinndrift.training.diagnosis.candidates.structures import Screen
+
+    problem = Diagnoser(recorded(tmp_path, 3, "null")[1], VEHICLE).problem
+    group = _of_follower(problem, "slew", "thrusters", FOLLOWED["slew"])
+
+    def won(lag):
+        theta = problem.believed.copy()
+        theta[problem.library.at("thruster_lag", "all")] = lag
+        screen = Screen(problem, problem.evaluate(theta), None)
+        return screen.match(group, 0.01, np.random.default_rng(0), draws=0).gain
+
+    assert won(0.1) < 8.0  # nats, below which no gain is tested
+    monkeypatch.setattr(Unknown, "is_share", False)
+    assert won(0.1) > 100.0, "a weight of any sign wins against a belief that lags"
+
+
 def test_single_precision_is_refused_with_a_remedy(tmp_path):
     recording = recorded(tmp_path, 3, "null")[1]
     with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):

@@ -1,6 +1,7 @@
 """Unnamed structure: a sparse residual of a few weighted terms in stated inputs."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -53,6 +54,7 @@ class Unknown(Effect):
     a rate limit of numbers[0] (N/s), or forces in multiples of numbers[0] (N) alone; the weight 0
     is no such effect, 1 the full one.
     `exchange`: two thrusters, by number, take a share (the weight) of each other's command.
+    Shares are not negative: what runs ahead of its command stands for something else.
     """
 
     name: ClassVar[str] = "unknown"
@@ -100,7 +102,13 @@ class Unknown(Effect):
     def parameters(self) -> tuple[Parameter, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
         units = {"flow": "m/s", "exchange": "1", **dict.fromkeys(FOLLOWERS, "1")}
         unit = units.get(self.kind, "N a unit or N·m a unit")
-        return tuple(Parameter(t, unit, (_SIZES.get(self.kind, 1.0),)) for t in self.terms)
+        least = 0.0 if self.is_share else -math.inf
+        return tuple(Parameter(t, unit, (_SIZES.get(self.kind, 1.0),), least) for t in self.terms)
+
+    @property
+    def is_share(self) -> bool:
+        """Whether its one weight is a share: 0 is no effect, 1 the full one."""
+        return self.kind in FOLLOWERS or self.kind == "exchange"
 
     def for_thrusters(self, count: int) -> "Unknown":
         return dataclasses.replace(self, thrusters=count)

@@ -158,16 +158,16 @@ def unsupported(
     """Causes that the joint fit does not bear out.
 
     Every interval includes no effect, or a parameter lies at a bound of its range other than no
-    effect: then it stands for something else.
+    effect: then it stands for something else. Weights of terms without a range are no parameters.
     """
     if joint is None:
         return []
     t = reported.quantile(joint)
     dropped: list[Hypothesis] = []
     for h in named:
-        if h[0] == Unknown.name:
-            continue
         rows = library.at(*h)
+        if h[0] == Unknown.name and not all(library.entries[i].parameter.low == 0 for i in rows):
+            continue
         values = theta[rows]
         errors = np.array([joint.errors[joint.parameters.index(i)] for i in rows])
         ranges = [library.entries[i].parameter for i in rows]

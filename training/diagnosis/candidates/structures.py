@@ -231,7 +231,8 @@ class Screen:
         size = np.sqrt(np.maximum(np.diag(folds.sum(axis=0)), 1e-12))
         picks = self._held_out(folds, free, group, size)[1]
         total = folds.sum(axis=0)
-        node = int(np.argmax([self._fit(total, free, n, size)[1] for n in group.nodes]))
+        share = group.effect.is_share
+        node = int(np.argmax([self._fit(total, free, n, size, share)[1] for n in group.nodes]))
         # by run: each with the weights of its own fold
         runs, of_run = np.unique(self.cluster, return_inverse=True)
         heldout = np.zeros(len(runs))
@@ -274,9 +275,12 @@ class Screen:
         return tuple(float(k) for k in sorted(chosen))
 
     def _fit(
-        self, T: np.ndarray, free: int, node: tuple[int, ...], size: np.ndarray
+        self, T: np.ndarray, free: int, node: tuple[int, ...], size: np.ndarray, share: bool = False
     ) -> tuple[np.ndarray, float]:
-        """Weights of all columns (1 for z), and the log evidence on T, for the best prior."""
+        """Weights of all columns (1 for z), and the log evidence on T, for the best prior.
+
+        Where the node's weight is a `share` and comes out negative, it is none, without evidence.
+        """
         c = np.array([*range(1, free), *(free + k for k in node)], int)
         if not len(c):
             w = np.zeros(len(T))
@@ -300,6 +304,8 @@ class Screen:
         assert best is not None
         w = np.zeros(len(T))
         w[0], w[c] = 1, best[1]
+        if share and np.any(w[[free + k for k in node]] < 0):
+            return self._fit(T, free, (), size)[0], -np.inf
         return w, best[0]
 
     def _held_out(
@@ -308,7 +314,7 @@ class Screen:
         total, gains, picks = folds.sum(axis=0), np.zeros(len(folds)), []
         for f, T in enumerate(folds):
             rest = total - T if len(folds) > 1 else total
-            fits = [self._fit(rest, free, n, size) for n in group.nodes]
+            fits = [self._fit(rest, free, n, size, group.effect.is_share) for n in group.nodes]
             w = max(fits, key=lambda fit: fit[1])[0]
             w0 = self._fit(rest, free, (), size)[0]
             gains[f] = (w0 @ T @ w0 - w @ T @ w) / 2

@@ -241,6 +241,7 @@ FAULTS = """[{sensor: imu, fault: frozen, start: 0.5, duration: 0.1},
 STATION = f"{{duration: 1.5, station: {{sensing: {{dvl: {{rate: 3.0}}, faults: {FAULTS}}}}}}}"
 
 
+@pytest.mark.slow
 def test_the_station_in_a_harbour_flies_as_in_drake():
     """All systems of a run without a planner; the DVL's period is no multiple of the IMU's, and
     sensors fail."""

@@ -155,6 +155,7 @@ def test_responses_of_instruments_are_derivatives_of_the_innovations(null):
         assert np.sum(off**2) < 5e-4 * np.sum(change**2)
 
 
+@pytest.mark.slow
 def test_one_step_finds_a_heading_error_where_a_sample_turns_less_than_a_probe(tmp_path):
     case = draw(0, names=("heading_error",), plan=replace(PLAN, rate=50.0))
     case.write(tmp_path / "data")
@@ -196,6 +197,7 @@ def test_causes_are_named_first(tmp_path, name):
     del case
 
 
+@pytest.mark.slow
 def test_a_lag_is_named_measured_and_extended(tmp_path):
     """The whole way: name, value inside three standard errors, gain, JSON as its schema says."""
     case, recording = recorded(tmp_path, 5, names=("thruster_lag",))
@@ -730,6 +732,7 @@ def test_simulated_states_without_noise_are_no_clock_that_is_off():
     assert diagnoser._selector(diagnoser.problem, []).propose(start).proposed[0] is None
 
 
+@pytest.mark.slow
 def test_bands_hold_what_a_law_of_the_disturbance_adds(tmp_path):
     """Simulated bands are too narrow without the slow pushes that were hidden, not with them."""
     from spinndrift.training.diagnosis.disturbance.found import laws_of

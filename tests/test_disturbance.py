@@ -131,6 +131,7 @@ def test_a_name_that_leaves_nothing_of_a_law_is_taken(tmp_path):
     assert choice.fit.heldout_gain > law
 
 
+@pytest.mark.slow
 def test_what_a_name_wins_exactly_is_likelihood(tmp_path):
     """A name's own noise is smaller: squares of innovations alone may even grow."""
     case = draw(5, names=("thruster_lag",), plan=Plan().short())
@@ -246,6 +247,7 @@ def test_levels_and_what_comes_and_goes_are_told_apart(problem_of, name, size):
         "disturbance_state_dependence",
     ],
 )
+@pytest.mark.slow
 def test_what_lasts_or_grows_is_no_level_in_calm_water(problem_of, name):
     """With a twentieth of the white disturbance, and as little of it believed."""
     calm = tuple(LEVELS / 20)

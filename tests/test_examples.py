@@ -3,6 +3,8 @@
 import re
 import runpy
 
+import pytest
+
 from helpers import ROOT, load_example
 
 
@@ -22,6 +24,7 @@ def test_own_filter_steers_a_figure(capsys):
     assert 0 < off < 0.3
 
 
+@pytest.mark.slow
 def test_own_task_comes_into_its_circle_and_stays(capsys):
     """The radius is 0.5 m; from 1.5 m, slow as speed costs, it is inside well before the end."""
     distance = load_example("own_task").main(8.0)

@@ -272,6 +272,7 @@ def test_it_gives_up_after_so_many_bad_steps_and_keeps_the_good_state(windows, t
 # learning
 
 
+@pytest.mark.slow
 def test_the_truth_is_found():
     """From 40 % off in M and D and 100 % in b; the caller's own model stays as it was."""
     windows, validation = simulated(TRUTH, 200, seed=2), simulated(TRUTH, 50, seed=3)
@@ -324,6 +325,7 @@ def test_steps_that_only_harm_leave_the_start(windows, validation):
         assert_same_bits(result.last, TRUTH)
 
 
+@pytest.mark.slow
 def test_pretraining_brings_the_networks_to_the_preset():
     vehicle = load_vehicle("bluerov2_heavy")
     target = vehicle.dynamics(np.full(6, 0.5), jnp.float32)

@@ -72,6 +72,7 @@ def test_the_constants_spread_as_the_cramer_rao_bound_says(model, found):
     assert count / 5 < np.sum(squares) < count + 5 * (2 * count) ** 0.5
 
 
+@pytest.mark.slow
 def test_the_diffusion_is_found(data, found):
     for windows, fitted in zip(data, found, strict=True):
         numbers = windows.steps * len(windows)

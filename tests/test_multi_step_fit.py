@@ -94,6 +94,7 @@ def test_drag_stays_passive_and_left_out_windows_are_not_used():
     np.testing.assert_array_equal(again.theta, fit.theta)
 
 
+@pytest.mark.slow
 def test_what_thrusters_did_before_a_run_shows_in_no_piece():
     """A run that begins as commands step: thrusters follow what was commanded before it."""
     problem = DiagnosisProblem.of(

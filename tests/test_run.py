@@ -202,6 +202,7 @@ def test_no_run_starts_or_ends_in_an_obstacle(text, message):
         simulate(scenario)
 
 
+@pytest.mark.slow
 def test_a_ringed_goal_is_said_and_the_vehicle_stays(crossing, tmp_path):
     angles = 2 * np.pi * np.arange(12) / 12
     pylons = ", ".join(

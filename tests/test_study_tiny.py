@@ -9,6 +9,8 @@ from spinndrift.sims.cli import main
 from spinndrift.sims.study.run import STUDY
 from spinndrift.sims.study.table import read_csv
 
+pytestmark = pytest.mark.slow
+
 METHODS = ("fdm-geodesic", "pinn")
 
 

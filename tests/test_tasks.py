@@ -91,6 +91,7 @@ def test_kinds_differ_in_what_they_ask_for():
     assert nearest - radius < float(clearance[0]) <= nearest
 
 
+@pytest.mark.slow
 def test_a_planned_vehicle_keeps_up_with_its_path_at_any_time():
     """The plan follows the path from the call's time on, here in a turn that lies far in the run.
 

@@ -86,7 +86,7 @@ def start(config):
     [
         "euclidean-fdm",
         pytest.param("euclidean-moments", marks=pytest.mark.slow),
-        "euclidean-distance-aware",
+        pytest.param("euclidean-distance-aware", marks=pytest.mark.slow),
         pytest.param("euclidean-unconstrained", marks=pytest.mark.slow),
     ],
 )
@@ -99,6 +99,7 @@ def test_a_few_steps_make_the_loss_smaller(name, windows):
     assert losses[-2:].mean() < losses[:2].mean()
 
 
+@pytest.mark.slow
 def test_instability_ends_training_with_a_report(windows, monkeypatch):
     found = Diagnosis((), (), (), "motion runs away")  # what it looks for is tested with the guard
     monkeypatch.setattr("spinndrift.training.fitting.fit.explain_non_finite", lambda *_: found)

@@ -8,6 +8,8 @@ from spinndrift.systems.mavlink.clock import (
     MILLISECONDS_32,
     VehicleClock,
 )
+from spinndrift.systems.mavlink.dialect import mavlink
+from spinndrift.systems.mavlink.link import boot_time
 
 BOOT = 1234.5  # local time of the vehicle's boot (s)
 
@@ -101,6 +103,21 @@ def test_clocks_of_any_age_agree_and_a_boot_is_counted_once(up: float):
         hear(0.1 * k, BOOT + 15.0 + 0.1 * k)
     assert clock.reboots == 1
     assert clock.local(0.0) == pytest.approx(BOOT + 15.0)
+
+
+def test_a_time_of_zero_is_the_counter_where_it_wraps_and_else_none():
+    def outputs(us: int):
+        return mavlink.MAVLink_servo_output_raw_message(us, 0, *[1500] * 8)
+
+    clock = VehicleClock()
+    assert boot_time(outputs(0), 10.0, clock) is None
+    before = boot_time(outputs(2**32 - 20_000), 10.0, clock)
+    assert before is not None
+    clock.arrived(before, 10.0)
+    assert boot_time(outputs(0), 10.02, clock) == pytest.approx(MICROSECONDS_32)
+    assert boot_time(outputs(0), 40.0 + MICROSECONDS_32 / 2, clock) is None
+    imu = mavlink.MAVLink_raw_imu_message(0, *[0] * 9)
+    assert boot_time(imu, 10.02, clock) is None
 
 
 def test_a_silent_hour_is_no_boot():

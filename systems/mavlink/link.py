@@ -332,7 +332,7 @@ class Link:
             return  # a camera's, a companion computer's
         with self._sending:
             self._keep(message.get_msgbuf())
-        found = Received(message, arrival, self._boot(message, name, arrival))
+        found = Received(message, arrival, boot_time(message, arrival, self.clock))
         if name == "TIMESYNC":
             self._exchanged(message, arrival)
         elif found.boot is not None and peer == self.vehicle:  # others may have other clocks
@@ -354,18 +354,6 @@ class Link:
         for reader in self._readers:
             reader(found)
 
-    def _boot(self, message: Message, name: str, arrival: float) -> float | None:
-        """The message's time on the boot clock."""
-        if (ms := getattr(message, "time_boot_ms", None)) is not None:
-            seconds, span = ms * 1e-3, MILLISECONDS_32
-        elif (us := getattr(message, "time_usec", None)) is not None and 0 < us < 1e15:
-            seconds, span = us * 1e-6, _BOOT_CLOCKS.get(name)  # beyond 1e15 it is a date
-        else:
-            return None
-        if span is None:
-            return seconds
-        return self.clock.continued(seconds, span, arrival)
-
     def _exchanged(self, message: Message, arrival: float) -> None:
         if message.tc1 > 0:  # an answer; requests of the vehicle are not answered
             self.clock.exchanged(message.ts1 * 1e-9, message.tc1 * 1e-9, arrival)
@@ -374,6 +362,21 @@ class Link:
         """Append a packet to the telemetry log: time in µs since 1970, then the packet."""
         if self._record is not None:
             self._record.write(struct.pack(">Q", time.time_ns() // 1000) + bytes(packet))
+
+
+def boot_time(message: Message, arrival: float, clock: VehicleClock) -> float | None:
+    """A message's time on the boot clock (s); None if it has none, or a date.
+
+    A `time_usec` of 0 means that it is not known, but where a counter of 32 bits has just wrapped.
+    """
+    if (ms := getattr(message, "time_boot_ms", None)) is not None:
+        return clock.continued(ms * 1e-3, MILLISECONDS_32, arrival)
+    us = getattr(message, "time_usec", None)
+    if us is None or not 0 <= us < 1e15:
+        return None
+    span = _BOOT_CLOCKS.get(message.get_type())
+    found = us * 1e-6 if span is None else clock.continued(us * 1e-6, span, arrival)
+    return found if found > 0 else None
 
 
 def _open_record(path: Path | None, transport: Transport) -> BinaryIO | None:

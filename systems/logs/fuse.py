@@ -30,7 +30,7 @@ from .streams import DEAD_RECKONING
 _FAST_HZ, _MEAN_S = 200.0, 0.01
 _LONGEST_S = 300.0
 _EQUAL = 0.95
-"""Least samples in a step of a signal that is as fast as the grid."""
+"""Samples in a step of the grid from which on a signal counts as no slower than it."""
 _STATES = {
     "disarmed": "disarmed",
     "pass-through": "passthrough",

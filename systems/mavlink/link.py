@@ -367,7 +367,7 @@ class Link:
 def boot_time(message: Message, arrival: float, clock: VehicleClock) -> float | None:
     """A message's time on the boot clock (s); None if it has none, or a date.
 
-    A `time_usec` of 0 means that it is not known, but where a counter of 32 bits has just wrapped.
+    A `time_usec` of 0 is an unknown time, except where a 32-bit counter has just wrapped.
     """
     if (ms := getattr(message, "time_boot_ms", None)) is not None:
         return clock.continued(ms * 1e-3, MILLISECONDS_32, arrival)

@@ -125,7 +125,7 @@ class _Posterior:
         C, counts = _by_piece(self.problem, self.problem.errors(theta), common)
         if not np.isfinite(C).all():
             return np.inf
-        rows = _felt(self.problem)
+        rows = _by_forces(self.problem)
         C = C[:, rows[:, None], rows]
         return float(counts @ np.linalg.slogdet(C)[1] + away @ away) / 2
 
@@ -167,7 +167,7 @@ def one_step(problem: DiagnosisProblem, theta: Float[np.ndarray, " p"]) -> Filte
     """
     error = problem.errors(theta)
     C, _ = _by_piece(problem, error, problem.covariance(error, apart=True))
-    rows = _felt(problem)
+    rows = _by_forces(problem)
     C = C[:, rows[:, None], rows]
     whiten = np.zeros((len(problem.data.u), 12, 12, len(C)))
     inverse = np.moveaxis(np.linalg.inv(np.linalg.cholesky(C)), 0, -1)
@@ -179,8 +179,8 @@ def one_step(problem: DiagnosisProblem, theta: Float[np.ndarray, " p"]) -> Filte
     return Filter(keep, whiten, log_det)
 
 
-def _felt(problem: DiagnosisProblem) -> Int[np.ndarray, " k"]:
-    """The errors that forces make: of twists, and of poses whose twists were not measured."""
+def _by_forces(problem: DiagnosisProblem) -> Int[np.ndarray, " k"]:
+    """Rows of the errors that forces show in: twists, and poses whose twists were not measured."""
     twist = np.arange(6, 12)
     return np.concatenate([np.flatnonzero(problem.data.measured[twist] == 0), twist])
 

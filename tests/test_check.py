@@ -204,7 +204,8 @@ def test_cases_are_judged_once_and_the_page_keeps_its_own_words(tmp_path, monkey
     assert "stale" not in text
     assert "| false alarms | 0 of 2 (0.00 to 0.84) |" in text
     assert "| thruster_lag | 0 of 1 | adequate |" in text
-    assert len(tables(rows)) == 2
+    assert "| usual | 2 of 2 (0.16 to 1.00) | 0 of 1 (0.00 to 0.97) | 2 of 3" in text
+    assert len(tables(rows)) == 3
 
     def broken(case, alpha, progress):
         if case.name == "null-0":

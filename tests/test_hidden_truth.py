@@ -2,7 +2,7 @@
 
 import ast
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,14 +13,17 @@ from hidden import effects_disturbance as disturbance
 from hidden import effects_environment as environment
 from hidden import effects_unknown as unknown
 from hidden import rotations, t200
+from hidden.blind import DATA
 from hidden.draw import TWINS, Case, draw, table
 from hidden.effect import Effect, Moment
 from hidden.effects import CAUSES, UNKNOWN, draw_effect
 from hidden.faults import FAULTS, spoil
+from hidden.instruments import low_pass
 from hidden.oracle import predict, recorded_errors, share, windows_of
 from hidden.plant import Plant
-from hidden.scenarios import Plan, allocate, build
+from hidden.scenarios import Plan, allocate, build, pulses
 from hidden.simulator import Noise, Setup, simulate
+from hidden.telemetry import BOOT, Streams, write_tlog
 from hidden.vehicle import GRAVITY, Vehicle
 from hidden.write import write_folder
 
@@ -30,6 +33,7 @@ from spinndrift.models.dynamics import Flow
 from spinndrift.models.recordings.csv import read_csv
 from spinndrift.models.thruster_curves import RESTING
 from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.systems.logs.load import load_data
 
 SMALL = Plan(scenarios=4, runs=1, seconds=2.0, h=0.01)
 EVERYTHING = [*CAUSES, *UNKNOWN]
@@ -669,3 +673,56 @@ def test_the_belief_starts_from_the_record_as_it_is(name):
     assert np.abs(turn[1:]).max() < 1e-4  # noise and deviation commute to first order
     oracle = predict(case, truth, [10], 5)
     assert np.abs(oracle.V[0, 0] - truth.V[10]).max() < 0.03
+
+
+# ----------------------------------------------------------------------------- as a vehicle logs it
+
+
+def test_a_dive_as_telemetry_shows_the_importer_what_was_measured(tmp_path):
+    """Written by hand and read by pymavlink and the importer: frames, units, times and outputs."""
+    plan = replace(DATA["piloted"](Plan()), scenarios=2, seconds=8.0)
+    case = draw(3, "null", plan=plan, noise=Noise.none())
+    truth, path = case.simulate(), tmp_path / "dive.tlog"
+    write_tlog(path, truth, Streams(4, 4, 1), 0.0)
+    recording = load_data(path, resample=False)
+    assert recording.vehicle == "bluerov2_heavy"
+    runs = list(recording.trajectories())
+    assert [run.scenario.split("_", 1)[1] for run in runs] == ["MANUAL", "STABILIZE"]
+    for b, run in enumerate(runs):
+        t = run.start + recording.dt * np.arange(len(run))  # since boot
+        at = np.rint((t - BOOT - 14.0 * b) * plan.rate).astype(int)
+        X, V = truth.X[at, :, b], truth.V[at, :, b]
+        from_start = (run.X_WB - run.X_WB[0])[:, 4:]
+        np.testing.assert_allclose(from_start, (X - X[0])[:, 4:], atol=1e-6)  # W is at the start
+        assert np.abs(np.sum(run.X_WB[:, :4] * X[:, :4], axis=1)).min() > 1 - 1e-9
+        np.testing.assert_allclose(run.V_WB_B, V, atol=1e-6)
+        pwm = pulses(truth.forces[:, :, b, None], truth.voltage[b, None])[..., 0]
+        step = round(recording.dt * plan.rate)
+        held = np.stack([pwm[i : i + step].mean(axis=0) for i in at])  # over the step that begins
+        assert np.sqrt(np.mean((run.commands["pwm"] - held) ** 2)) < 2.0
+        assert np.ptp(held) > 100
+
+
+def test_a_low_pass_has_the_gain_and_delay_of_its_cutoff():
+    """Butterworth of second order: 1/√2 and 90° at the cutoff, exact by the bilinear transform."""
+    h, f = 0.005, 10.0
+    t = np.arange(0, 2, h)
+    y = low_pass(np.sin(2 * np.pi * f * t)[None, :, None], f, h)[0, :, 0]
+    late = t > 1
+    parts = np.stack([np.sin(2 * np.pi * f * t), np.cos(2 * np.pi * f * t)], axis=1)[late]
+    found = np.linalg.lstsq(parts, y[late], rcond=None)[0]
+    np.testing.assert_allclose(found, [0.0, -np.sqrt(0.5)], atol=1e-6)
+
+
+def test_a_wrong_belief_is_wrong_in_ratios_that_are_told():
+    case = draw(52_000, "null", wrong=True)
+    assert case.answer()["verdict"] == "explained"
+    true, told = case.true_vehicle(), case.ratios()
+    inertia = np.diag(true.rigid_mass() + true.added_mass)
+    usual = np.diag(Vehicle().rigid_mass() + Vehicle().added_mass)
+    expected = true.quadratic / inertia / (Vehicle().quadratic / usual)
+    np.testing.assert_allclose(list(told["quadratic_drag"].values()), expected)
+    assert max(abs(np.log(list(told["quadratic_drag"].values())))) > np.log(1.3)
+    same = Case(52_000, wrong=True, plan=SMALL, noise=Noise.none()).simulate()
+    other = Case(52_000, plan=SMALL, noise=Noise.none()).simulate()
+    assert np.abs(same.V_true - other.V_true).max() > 0.01

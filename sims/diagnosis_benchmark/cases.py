@@ -18,12 +18,18 @@ from ...models.config import typed_yaml
 from ...models.config.errors import UserError
 from ...models.effects.library import kind
 from ...models.effects.unknown import Unknown
+from ...models.recordings.checks.examine import examine
+from ...models.recordings.csv import read_csv
+from ...models.recordings.csv_columns import METADATA
+from ...models.recordings.store import Recording
 from ...models.se3 import POSE, TWIST
+from ...models.vehicles.vehicle import load_vehicle
+from ...systems.logs.load import load_data
 from ...training.diagnosis.findings.result import Verdict
 
 USUAL = "usual"
 """Data recorded like those of most cases."""
-Kind = Literal["null", "single", "pair", "triple", "unknown", "fault"]
+Kind = Literal["null", "single", "pair", "triple", "unknown", "fault", "wrong"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,7 @@ class Truth:
         vehicle: the belief; empty for the one that the data name.
         diffusion: of the belief (N√s, N·m√s); empty for none.
         every: samples per window of the forecasts in `oracle/`.
+        ratios: true over believed coefficients, each over inertia, by name and axis.
         problems: words that must all be in the reported faults of the data.
         limits: words that must all be in the reported limits of identifiability.
     """
@@ -83,6 +90,7 @@ class Truth:
     vehicle: str = ""
     diffusion: tuple[float, ...] = ()
     every: int = 20
+    ratios: dict[str, dict[str, float]] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
     limits: tuple[str, ...] = ()
 
@@ -112,6 +120,24 @@ class Case:
 
     def __str__(self) -> str:
         return self.name
+
+    def read(self) -> Recording:
+        """The data to diagnose, as `spinndrift diagnose` reads them.
+
+        Raises:
+            UserError: there are none, several logs, or they can't be read.
+        """
+        folder = self.folder / "data"
+        if (folder / METADATA).exists():
+            return read_csv(folder, resample=False)
+        logs = sorted(path for path in folder.glob("*") if path.is_file())
+        if len(logs) != 1:
+            raise UserError(
+                f"{folder}: holds {len(logs)} files and no {METADATA}; give a folder of CSV runs "
+                "or one log"
+            )
+        recording = load_data(logs[0], resample=False)
+        return examine(recording, load_vehicle(recording.vehicle), str(logs[0]))
 
     @property
     def has_oracle(self) -> bool:

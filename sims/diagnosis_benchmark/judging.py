@@ -38,6 +38,8 @@ class Judgement:
         recalled, spurious: numbers of hidden causes that were named and of wrong names.
         z: deviation of each judged parameter in standard errors, by cause and name.
         ratio: found over true value.
+        coefficients: of each coefficient over inertia whose truth is stated, by name and axis:
+            deviation in standard errors, and found over true value.
         gain: share of the true model's gain over the belief, by part of the state and over `all`
             (m, rad, m/s and rad/s weighted equally); 1 is as good as the true model.
         told: whether each fault and limit of the data was reported; None if there are none.
@@ -60,6 +62,7 @@ class Judgement:
     spurious: int
     z: dict[str, float] = field(default_factory=dict)
     ratio: dict[str, float] = field(default_factory=dict)
+    coefficients: dict[str, tuple[float, float]] = field(default_factory=dict)
     gain: dict[str, float] = field(default_factory=dict)
     told: bool | None = None
     seconds: float = 0.0
@@ -123,8 +126,24 @@ def compare(truth: Truth, d: Diagnosis) -> dict[str, Any]:
         "spurious": sum(not any(fits(h, c) for h in truth.causes) for c in causes),
         "z": z,
         "ratio": ratio,
+        "coefficients": coefficients(truth, d),
         "told": told,
     }
+
+
+def coefficients(truth: Truth, d: Diagnosis) -> dict[str, tuple[float, float]]:
+    """Deviation in standard errors, and found over true value, of each stated ratio."""
+    found = {}
+    for r in d.ratios:
+        name = "thrust" if r.name == "half_thrust" else r.name
+        true = truth.ratios.get(name, {}).get(r.where)
+        low, high = r.found.interval95
+        if true is None or not r.believed or not high > low:
+            continue
+        expected = true * r.believed
+        z = (r.found.value - expected) / ((high - low) / 3.92)
+        found[f"{name}.{r.where}"] = (float(z), float(r.found.value / expected))
+    return found
 
 
 def gain_of(case: Case, base: Extended, extended: Extended, vehicle: Vehicle) -> dict[str, float]:
@@ -183,8 +202,7 @@ def judge(case: Case, alpha: float, progress: Update) -> tuple[Judgement, Findin
     Raises:
         UserError: the data can't be read.
     """
-    recording = read_csv(case.folder / "data", resample=False)
-    truth = case.truth
+    recording, truth = case.read(), case.truth
     vehicle, base = believed(truth, recording)
     finding = diagnose(recording, vehicle, base, DiagnoseConfig(alpha=alpha), progress)
     d = finding.diagnosis

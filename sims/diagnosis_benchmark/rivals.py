@@ -26,7 +26,6 @@ from jaxtyping import Array, Float
 
 from ...models import se3
 from ...models.config.errors import UserError
-from ...models.recordings.csv import read_csv
 from ...models.se3 import TWIST, WRENCH
 from ...training.diagnosis.data.arrays import Data
 from ...training.diagnosis.filter.innovations import predict
@@ -225,7 +224,7 @@ def compete(case: Case) -> dict[str, Rival]:
         UserError: the data can't be read, or pysindy is not installed.
     """
     pysindy()
-    recording = read_csv(case.folder / "data", resample=False)
+    recording = case.read()
     vehicle, base = believed(case.truth, recording)
     problem = DiagnosisProblem.of(recording, vehicle, base)
     predictions = predict(problem.model, problem.library, problem.believed, problem.data)

@@ -64,7 +64,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
     """All tables for which there are cases."""
     usual = [r for r in rows if r["data"] == USUAL]
     found = [_summary(usual), _confusion(usual), _sizes(usual), _mixed(usual), _faults(usual)]
-    found += [_varied(rows), _misses(rows), _rivals(usual)]
+    found += [_verdicts(rows), _varied(rows), _wrong(rows), _misses(rows), _rivals(usual)]
     return [table for table in found if table.rows]
 
 
@@ -188,14 +188,57 @@ def _sizes(rows: Sequence[Row]) -> Table:
     )
 
 
+def _verdicts(rows: Sequence[Row]) -> Table:
+    """What is claimed, by kind of recording."""
+    chosen = _of(rows, "null", "single", "pair", "triple", "unknown", "wrong")
+    lines = []
+    for kind in _kinds(chosen):
+        own = [r for r in chosen if r["data"] == kind]
+        nulls = _of(own, "null")
+        hidden = [r for r in own if r["kind"] != "null"]
+        lines.append(
+            (
+                kind,
+                share(sum(r["verdict"] == "adequate" for r in nulls), len(nulls)),
+                share(sum(r["verdict"] != "adequate" for r in hidden), len(hidden)),
+                share(sum(r["verdict_right"] for r in own), len(own)),
+            )
+        )
+    header = ("data", "adequate when it is", "not adequate when it is not", "verdict right")
+    return Table("Verdicts, by kind of recording.", header, lines)
+
+
+def _kinds(rows: Sequence[Row]) -> list[str]:
+    """Kinds of recording, the usual one first."""
+    return sorted(dict.fromkeys(r["data"] for r in rows), key=lambda k: (k != USUAL, k))
+
+
+def _wrong(rows: Sequence[Row]) -> Table:
+    """Beliefs that are off by factors, with and without a hidden cause."""
+    lines = []
+    for r in _of(rows, "wrong"):
+        off = list(r["coefficients"].values())
+        near = share(sum(abs(z) <= CLOSE for z, _ in off), len(off))
+        deviation = f"{100 * np.median([abs(x - 1) for _, x in off]):.1f} %" if off else "–"
+        hidden = ", ".join(r["hidden"]) or "–"
+        named = ", ".join(r["named"]) or "–"
+        lines.append((r["data"], hidden, r["verdict"], named, near, deviation))
+    header = (
+        "data", "hidden", "verdict", "reported causes", f"coefficients within {CLOSE:g} SE",
+        "median deviation",
+    )  # fmt: skip
+    caption = "Beliefs that are wrong by factors in nearly every coefficient, by case."
+    return Table(caption, header, lines)
+
+
 def _varied(rows: Sequence[Row]) -> Table:
     """Single causes of realistic size, by kind of recording."""
     chosen = [r for r in _of(rows, "single") if r["size"] == 1]
-    kinds = list(dict.fromkeys(r["data"] for r in chosen))
+    kinds = _kinds(chosen)
     if kinds in ([], [USUAL]):
         return Table("", (), [])
     lines = []
-    for kind in sorted(kinds, key=lambda k: (k != USUAL, k)):
+    for kind in kinds:
         own = [r for r in chosen if r["data"] == kind]
         z = np.abs([z for r in own for z in r["z"].values() if z == z])
         gains = [g for r in own if (g := gain_share(r)) is not None]

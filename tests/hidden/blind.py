@@ -25,7 +25,8 @@ from .faults import spoil
 from .oracle import predict
 from .scenarios import Plan
 from .simulator import Noise
-from .vehicle import Vehicle
+from .telemetry import Streams, write_tlog
+from .vehicle import AXES, Vehicle
 from .write import STATE, write_folder
 
 FRESH = 7_000_000
@@ -52,11 +53,16 @@ DATA: dict[str, Callable[[Plan], Plan]] = {
     "flights": lambda plan: replace(
         plan, scenarios=3, runs=1, seconds=90.0, loop="closed", dead_reckoned=True
     ),
+    "dive": lambda plan: replace(
+        plan, scenarios=4, runs=1, seconds=45.0, rate=200.0, form="pwm", dead_reckoned=True
+    ),
+    "piloted": lambda plan: replace(DATA["dive"](plan), loop="closed"),
     **dict.fromkeys(("calm", "exact", "coarse"), lambda plan: plan),
 }
 """How it is recorded: commands played, a pilot in closed loop, uneven time steps, 60 s in all, at
-10 or 50 Hz, a pilot's runs of a minute each, commands as PWM with each run's voltage; the real form
-(four stretches of 60 s at 50 Hz, or a pilot's three of 90 s, through an estimator); `NOISE`."""
+10 or 50 Hz, a pilot's runs of a minute each, commands as PWM with each run's voltage; the real
+form: four stretches of 60 s at 50 Hz, or a pilot's three of 90 s, through an estimator, and a
+telemetry log of four stretches of 45 s, played or piloted; `NOISE`."""
 ESTIMATED = Noise(
     velocity=0.012, attitude=0.0035, position=0.0, velocity_memory=0.8, attitude_memory=3.0
 )
@@ -67,10 +73,16 @@ NOISE = {
     "coarse": Noise(velocity=0.02, rate=0.004, attitude=0.007, position=0.02),
     "stretches": ESTIMATED,
     "flights": ESTIMATED,
+    "dive": replace(ESTIMATED, rate_filter=20.0),
+    "piloted": replace(ESTIMATED, rate_filter=20.0),
 }
 """Hardly a disturbance, nothing but it, instruments four times as noisy, and an estimator."""
-REAL = ("stretches", "flights")
+TLOG = ("dive", "piloted")
+"""Written as telemetry: filtered angular rates, streams at rates drawn from the seed."""
+REAL = ("stretches", "flights", *TLOG)
 """Data in the form of real logs; their users know no diffusion."""
+BESIDE_WRONG = ("thruster_gain", "thruster_lag", "tether", "current_steady", "dvl_misalignment")
+"""Hidden causes where the belief is off by factors as well, which no coefficient can stand for."""
 
 
 @dataclass(frozen=True)
@@ -88,13 +100,18 @@ class Blind:
         """Write data/, truth.yaml last, and, where means differ, fresh/ and oracle/."""
         case = self.case
         folder.mkdir(parents=True, exist_ok=True)
-        runs, limits, problems = case.logged(), [], []
+        shown = case.simulate()
+        runs, limits, problems = case.logged(truth=shown), [], []
         if self.fault:
             runs, _ = spoil(runs, self.fault, case.seed)
             problems = [SAID[self.fault]]
         if case.plan.idle:
             limits = [AXES[i] for i in case.plan.idle]
-        write_folder(folder / "data", runs, rate=case.plan.rate)
+        if self.data in TLOG:
+            sent = Streams.draw(case.seed)
+            write_tlog(folder / "data" / "dive.tlog", shown, sent, case.noise.rate_filter)
+        else:
+            write_folder(folder / "data", runs, rate=case.plan.rate)
         measured = not case.plan.dead_reckoned  # the oracle starts from measured positions
         if measured and case.plan.even and any(has_mean(e) for e in case.effects):
             fewer = replace(case, plan=replace(case.plan, runs=min(case.plan.runs, 2)))
@@ -113,6 +130,7 @@ class Blind:
             "causes": [told(e) for e in case.effects],
             "diffusion": [] if self.data in REAL else list(case.noise.diffusion),
             "every": every(case),
+            "ratios": case.ratios() if case.wrong else {},
             "problems": problems,
             "limits": limits,
         }
@@ -120,7 +138,6 @@ class Blind:
         (folder / "truth.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 SAID = {
     "stuck": "stuck",
     "lost_lock": "stuck",
@@ -269,6 +286,14 @@ def table(
         for i in range(nulls // 5):
             case = draw(51_000 + i, "null", **given)
             yield Blind(f"null-{variety}-{i}", "null", case, data=variety)
+        if variety not in REAL:
+            continue
+        for i in range(nulls // 5):
+            case = draw(52_000 + i, "null", wrong=True, **given)
+            yield Blind(f"wrong-{variety}-{i}", "wrong", case, data=variety)
+        for i, name in enumerate(BESIDE_WRONG):
+            case = draw(53_000 + i, names=(name,), wrong=True, **given)
+            yield Blind(f"wrong-{name}-{variety}", "wrong", case, data=variety)
     if "usual" not in data:
         return
     for size in sizes:

@@ -47,12 +47,14 @@ class Case:
         effects: what is hidden.
         plan: what is recorded.
         noise: of process and instruments; nominal unless changed.
+        wrong: whether the belief is off by factors in nearly everything.
     """
 
     seed: int
     effects: tuple[Effect, ...] = ()
     plan: Plan = field(default_factory=Plan)
     noise: Noise = field(default_factory=Noise)
+    wrong: bool = False
 
     def answer(self) -> dict[str, Any]:
         """What is hidden, in the words of a diagnosis; causes in the order drawn."""
@@ -67,7 +69,7 @@ class Case:
                 cause["family"] = FAMILY[effect.cause]
                 cause["twins"] = list(TWINS.get(effect.cause, ()))
         unknown = [e.cause == "unknown" for e in self.effects]
-        verdict = "explained" if self.effects else "adequate"
+        verdict = "explained" if self.effects or self.wrong else "adequate"
         if any(unknown):
             verdict = "unexplained" if all(unknown) else "partly_explained"
         return {"verdict": verdict, "causes": causes}
@@ -75,6 +77,18 @@ class Case:
     def vehicle(self) -> Vehicle:
         """The vehicle that is believed."""
         return Vehicle()
+
+    def true_vehicle(self) -> Vehicle:
+        """The one that is simulated."""
+        return self.vehicle().off(streams(self.seed, 7)) if self.wrong else self.vehicle()
+
+    def ratios(self) -> dict[str, dict[str, float]]:
+        """True over believed coefficients, each over inertia, by name and axis."""
+        true, believed = self.true_vehicle().over_inertia(), self.vehicle().over_inertia()
+        return {
+            name: {axis: value / believed[name][axis] for axis, value in of.items()}
+            for name, of in true.items()
+        }
 
     def scenarios(self, seed: int | None = None) -> Scenarios:
         """Commands, start states and time stamps; another `seed` gives fresh ones."""
@@ -88,6 +102,7 @@ class Case:
             self.effects,
             self.noise,
             [seed, 1],
+            self.true_vehicle(),
             dead_reckoned=self.plan.dead_reckoned,
         )
 
@@ -120,6 +135,7 @@ def draw(
     size: float = 1.0,
     plan: Plan | None = None,
     noise: Noise | None = None,
+    wrong: bool = False,
 ) -> Case:
     """Draw a case from a seed; `names` fixes the causes (or kinds of unknown) but not the rest."""
     rng = streams(seed, 6)
@@ -136,7 +152,7 @@ def draw(
     effects = tuple(draw_effect(name, rng, size) for name in names)
     if plan.form == "pwm" and "voltage_sag" in names:
         plan = replace(plan, voltage=False)  # who logs the voltage knows of the sag
-    return Case(seed, effects, plan, noise or Noise())
+    return Case(seed, effects, plan, noise or Noise(), wrong)
 
 
 def table(

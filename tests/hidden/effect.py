@@ -8,7 +8,6 @@ import numpy as np
 from .rotations import to_body, to_world
 from .vehicle import Vehicle
 
-AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 Parameters = dict[str, dict[str, Any]]
 Latent = dict[str, np.ndarray]
 

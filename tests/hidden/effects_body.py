@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from .effect import (
-    AXES,
     Effect,
     Latent,
     Moment,
@@ -18,7 +17,7 @@ from .effect import (
     value,
 )
 from .rotations import cross, skew
-from .vehicle import GRAVITY, WATER
+from .vehicle import AXES, GRAVITY, WATER
 
 
 def _units(axis: int, power: int) -> str:

@@ -5,8 +5,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from .effect import AXES, Effect, Latent, Moment, Parameters, around, one_axis, sign, value
+from .effect import Effect, Latent, Moment, Parameters, around, one_axis, sign, value
 from .rotations import cross
+from .vehicle import AXES
 
 
 @dataclass(frozen=True)

@@ -71,12 +71,18 @@ def record(
     errors: np.ndarray,
     plant: Plant,
     dead_reckoned: bool,
+    rate_filter: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     signals = instruments_show(history, at.astype(float), h, plant)
     p, q, v, w = _noisy(signals, errors)
+    if not (dead_reckoned or rate_filter):
+        X, V = np.concatenate([q, p]), np.concatenate([v, w])
+        return np.moveaxis(X, 0, 1), np.moveaxis(V, 0, 1)
+    every = np.arange(history.shape[0], dtype=float)[:, None] + np.zeros(at.shape[1])
+    fine = instruments_show(history, every, h, plant)
+    if rate_filter:
+        w = w - signals.w + low_pass(fine.w, rate_filter, h)[:, at, np.arange(at.shape[1])]
     if dead_reckoned:
-        every = np.arange(history.shape[0], dtype=float)[:, None] + np.zeros(at.shape[1])
-        fine = instruments_show(history, every, h, plant)
         speed = to_world(fine.q, fine.v)
         path = np.zeros_like(speed)
         path[:, 1:] = np.cumsum(0.5 * h * (speed[:, 1:] + speed[:, :-1]), axis=1)
@@ -88,6 +94,18 @@ def record(
         p = history[at[0], :3, np.arange(at.shape[1])].T[:, None] + path - path[:, :1] + walk
     X, V = np.concatenate([q, p]), np.concatenate([v, w])
     return np.moveaxis(X, 0, 1), np.moveaxis(V, 0, 1)
+
+
+def low_pass(x: np.ndarray, cutoff: float, h: float) -> np.ndarray:
+    """Butterworth's of second order by the bilinear transform, on x (k, N, B) each h s."""
+    c = np.tan(np.pi * cutoff * h)
+    a0 = 1 + np.sqrt(2) * c + c * c
+    b, a1, a2 = c * c / a0, 2 * (c * c - 1) / a0, (1 - np.sqrt(2) * c + c * c) / a0
+    y = x.copy()  # at rest in the first value
+    for n in range(2, x.shape[1]):
+        came = x[:, n] + 2 * x[:, n - 1] + x[:, n - 2]
+        y[:, n] = b * came - a1 * y[:, n - 1] - a2 * y[:, n - 2]
+    return y
 
 
 def specific_force(history: np.ndarray, samples: np.ndarray, h: float) -> np.ndarray:

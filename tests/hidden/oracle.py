@@ -22,7 +22,6 @@ from .plant import Plant, delayed
 from .rotations import conjugate, exponential, logarithm, product
 from .scenarios import build
 from .simulator import Noise, Truth, simulate, streams
-from .vehicle import Vehicle
 
 PARTS = ("position", "attitude", "velocity", "rate")
 
@@ -65,8 +64,8 @@ def predict(
     hidden = case.effects if effects is None else effects
     if not knows_latents:
         hidden = [e for e in hidden if not e.draw_latent(1, _Still())]
-    plant = Plant(Vehicle(), hidden)
-    full = Plant(Vehicle(), case.effects)
+    plant = Plant(case.true_vehicle(), hidden)
+    full = Plant(case.true_vehicle(), case.effects)
     h, lead = case.plan.h, round(LEAD / case.plan.h)
     B = truth.states.shape[2]
     run = np.arange(B)
@@ -188,7 +187,9 @@ def share(
 
 def noise_free(case: Case, seed: int) -> Truth:
     """Whole runs under the hidden effects without any noise, from the start states of `seed`."""
-    return simulate(build(case.plan, seed).setup, case.effects, Noise.none(), [seed, 1])
+    return simulate(
+        build(case.plan, seed).setup, case.effects, Noise.none(), [seed, 1], case.true_vehicle()
+    )
 
 
 def replicates(case: Case, seed: int, number: int) -> list[Truth]:
@@ -197,7 +198,8 @@ def replicates(case: Case, seed: int, number: int) -> list[Truth]:
     Their mean is what a perfect model of the law predicts over whole runs.
     """
     setup = build(case.plan, seed).setup
-    return [simulate(setup, case.effects, case.noise, [seed, 2, k]) for k in range(number)]
+    given = (setup, case.effects, case.noise)
+    return [simulate(*given, [seed, 2, k], case.true_vehicle()) for k in range(number)]
 
 
 def windows_of(case: Case, seed: int, count: int, steps: int) -> list[int]:

@@ -34,6 +34,7 @@ class Noise:
     position: float = 0.005
     velocity_memory: float = 0.0
     attitude_memory: float = 0.0
+    rate_filter: float = 0.0  # Hz of the two-pole low-pass in front of recorded rates; 0 for none
 
     @staticmethod
     def none() -> "Noise":
@@ -168,7 +169,7 @@ def simulate(
 
     # A command after a run's end acts on nothing, but a file has one.
     forces[-1] = forces[-2] if callable(setup.commands) else setup.commands[-1]
-    X, V = record(states, samples + lead, h, errors, plant, dead_reckoned)
+    X, V = record(states, samples + lead, h, errors, plant, dead_reckoned, noise.rate_filter)
     true = states[samples + lead, :13, run].transpose(0, 2, 1)
     return Truth(
         samples * h,

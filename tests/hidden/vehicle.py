@@ -12,6 +12,7 @@ from .rotations import skew
 
 GRAVITY = 9.80665
 WATER = 1025.0  # kg/m³, sea water
+AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 _S = np.sqrt(0.5)
 
 
@@ -83,3 +84,34 @@ class Vehicle:
 
     def but(self, **changes) -> "Vehicle":
         return replace(self, **changes)
+
+    def off(self, rng: np.random.Generator) -> "Vehicle":
+        """The vehicle that a believer in `self` is wrong about by factors in nearly everything."""
+
+        def factor(most: float, *shape: int) -> np.ndarray:
+            return most ** rng.uniform(-1, 1, shape)
+
+        mass = float(factor(1.2))
+        heavier = self.mass * (mass - 1) * GRAVITY  # ballast: as much more buoyancy
+        return self.but(
+            mass=self.mass * mass,
+            weight=self.weight + heavier,
+            buoyancy=self.buoyancy + heavier,
+            inertia=self.inertia * mass * factor(1.4),
+            added_mass=self.added_mass * factor(1.8, 6),
+            linear=self.linear * factor(2.0, 6),
+            quadratic=self.quadratic * factor(2.5, 6),
+            r_b=self.r_b * factor(1.6),
+            directions=self.directions * factor(1.7),
+        )
+
+    def over_inertia(self) -> dict[str, dict[str, float]]:
+        """What motion tells of it, by axis: coefficients over inertia."""
+        inertia = np.diag(self.rigid_mass() + self.added_mass)
+        found = {"quadratic_drag": self.quadratic, "linear_drag": self.linear}
+        pushes = np.abs(self.allocation()).sum(axis=1)
+        found["thrust"] = pushes
+        return {
+            name: dict(zip(AXES, (values / inertia).tolist(), strict=True))
+            for name, values in found.items()
+        }

@@ -72,7 +72,7 @@ smoke: $(INSTALLED) ## the tests marked smoke against the built wheel
 		build/wheel/spinndrift-*.whl
 	cd build/wheel/run && $(ONE_THREAD) PYTHONPATH="$(CURDIR)/build/wheel/installed" \
 		SPINNDRIFT_EXPECTED_UNDER="$(CURDIR)/build/wheel/installed" "$(CURDIR)/$(BIN)/python" -P \
-		-m pytest -m smoke -c "$(CURDIR)/pyproject.toml" --rootdir "$(CURDIR)" "$(CURDIR)/tests"
+		-m pytest -m smoke -n auto --dist worksteal -c "$(CURDIR)/pyproject.toml" --rootdir "$(CURDIR)" "$(CURDIR)/tests"
 
 .PHONY: format
 format: $(INSTALLED) ## let ruff mend and lay out the code

@@ -15,6 +15,7 @@ from spinndrift.training.diagnosis.validation.claims import (
     asserted,
     clearly_better,
     explained,
+    improves,
     outside_bands,
     vetoes,
 )
@@ -69,6 +70,25 @@ def test_the_share_that_is_explained_is_that_of_the_error():
     assert not clearly_better(models["base"], models["extended"], 0)
     assert not clearly_better(judged(0.95), judged(1.0), 0)
     assert clearly_better(judged(1.0), judged(np.inf), 0)
+
+
+def test_a_cause_forecasts_better_by_a_practical_share_of_one_part():
+    def better(new, old=None):
+        return improves(new, old or judged(1.0), np.random.default_rng(0))
+
+    one_part = np.array([1.0, 0.85, 1.0])
+    assert better(judged(one_part))
+    assert better(judged(0.95))
+    assert not better(judged(np.array([1.0, 0.93, 1.0])))
+    assert not better(judged(0.98))
+    assert not better(judged(np.array([1.2, 0.85, 1.0])))
+    few = judged(1.0)
+    few = few._replace(square=few.square * np.where(np.arange(FOLDS) < 1, 0.2, 1.0))
+    assert not better(few), "one of ten folds may be chance"
+    assert not better(judged(np.inf))
+    assert better(judged(1.0), judged(np.inf))
+    unseen = judged(1.0)._replace(square=judged(1.0).square * [[[0.0], [1.0], [1.0]]])
+    assert better(judged(np.array([0.0, 0.9, 0.93])), unseen), "a part without records counts not"
 
 
 def ratio(name, where, believed, found, half=0.01):

@@ -120,6 +120,7 @@ def test_innovations_of_latent_velocities_have_the_density_of_all_data_at_once()
     assert found == pytest.approx(wanted, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_weak_thruster_and_drag_are_named_without_u_and_v(tmp_path):
     """As with a DVL; from attitude, rates and w alone, and with an accelerometer."""
     for number, name in enumerate(("thruster_gain", "quadratic_drag")):

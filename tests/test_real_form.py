@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hidden.blind import DATA, ESTIMATED
+from hidden.blind import DATA, ESTIMATED, NOISE
 from hidden.draw import draw
 from hidden.scenarios import Plan
+from hidden.telemetry import Streams, write_tlog
 
 from helpers import shared_data
 from spinndrift.models.recordings.csv import read_csv
@@ -122,3 +123,17 @@ def test_a_dive_through_an_autopilot_is_adequate_with_the_truth_and_refitted_wit
         if r.where in truth.get(r.name, ()):
             assert r.found.value == pytest.approx(truth[r.name][r.where], rel=0.03), r
     assert min(s.value for s in found.explained.values()) > 0.85
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("data", "seed", "name"), [("piloted", 3, "tether"), ("dive", 5, "quadratic_drag")]
+)
+def test_causes_are_named_from_a_dive_as_a_vehicle_logs_it(tmp_path, data, seed, name):
+    """Telemetry: every state an estimate, rates filtered, outputs sent at 10 to 50 Hz."""
+    plan, noise = DATA[data](Plan()), NOISE[data]
+    case = draw(seed, "single", names=(name,), plan=plan, noise=noise)
+    write_tlog(tmp_path / "dive.tlog", case.simulate(), Streams.draw(seed), noise.rate_filter)
+    found = diagnose(load_data(tmp_path / "dive.tlog", resample=False), VEHICLE).diagnosis
+    assert found.verdict == "explained", found.sentence
+    assert [c.name for c in found.causes] == [name], found.sentence

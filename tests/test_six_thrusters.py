@@ -61,6 +61,7 @@ def hidden(tmp_path):
     return read_csv(tmp_path / "data")
 
 
+@pytest.mark.slow
 def test_a_weak_thruster_of_six_is_found(tmp_path):
     recording = hidden(tmp_path)
     config = DiagnoseConfig(most=1, horizon=2.0)

@@ -1,5 +1,6 @@
 """From a recording and a believed model to named causes."""
 
+import math
 import time
 from dataclasses import dataclass, replace
 
@@ -47,8 +48,10 @@ _RESAMPLED, _OF_A_STEP, _NO_TIME = 0.02, 0.1, 0.06
 """In resampled data: nats a sample that a law must win, and least lag or delay (share of a step).
 In any data, delays below 6 % of a step are rejected: integration error looks like one. With ten
 substeps a step, a pose half a substep late shows, without noise, as a clock offset of 5 %."""
-_OF_A_COMMAND = 0.1
-"""Least lag or delay, as a share of the period of sparse commands: interpolation looks like one."""
+_OF_A_COMMAND = 1 / math.sqrt(12)
+"""Least lag or delay, as a share of the period of sparse commands, or of the step over which
+frequent ones were averaged: a command changed somewhere within it, and this is the standard
+deviation of a uniform time. In closed loop it follows from the motion, so that means come early."""
 _FINEST = 0.02
 """Shortest step (s) that the extended model supports: it sets the length of delay buffers."""
 
@@ -258,13 +261,15 @@ class Diagnoser:
 
     def _selector(self, problem: DiagnosisProblem, nuisance: list[int]) -> Search:
         shortest = self._shortest(problem)
-        return Search(nuisance, self.config.alpha, self.config.most, self.quiet, shortest)
+        config = self.config
+        return Search(nuisance, config.alpha, config.most, self.quiet, shortest, config.horizon)
 
     def _shortest(self, problem: DiagnosisProblem) -> float:
         """Time (s) below which lags and delays are rejected."""
         shortest = (_OF_A_STEP if self.resampled else _NO_TIME) * problem.data.dt
-        if self.command_period > SPARSE * problem.data.dt:
-            shortest = max(shortest, _OF_A_COMMAND * self.command_period)
+        period, dt = self.command_period, problem.data.dt
+        if not dt / SPARSE <= period <= SPARSE * dt:
+            shortest = max(shortest, _OF_A_COMMAND * max(period, dt))
         return shortest
 
     def _validate(

@@ -87,6 +87,14 @@ class Fit:
         """Nats won on data that the fit has not seen."""
         return float(self.heldout.sum())
 
+    def added_to(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """θ with the changes of the fit."""
+        moved = theta.copy()
+        moved[list(self.parameters)] += self.values
+        for i, change in self.others.items():
+            moved[i] += change
+        return moved
+
 
 class Chance(NamedTuple):
     """Largest gain in noise alone: P(more than g nats) = exp((start - g) / scale) where small."""

@@ -16,6 +16,7 @@ from ..disturbance.waves import correlated_noise_of
 from ..filter.kalman import Filter
 from ..filter.problem import DiagnosisProblem, Evaluation
 from ..validation.validation import Contender, scores
+from .forecasting import forecast_better
 from .hypotheses import Fit
 from .model_selection import (
     Choice,
@@ -34,6 +35,8 @@ from .state import OF_ESTIMATES, Fits, Selection
 Refit = Group | Literal["none", "auto"]
 _CLOSE = 0.7
 _TAKEN_BACK = 2
+_FORECAST = 4
+"""Causes that are tried by their forecasts, in the order of their gains."""
 _OF_A_LAW = 0.02
 """Share of the best law's gain that a cause must win where the law wins more."""
 _LEFT = 0.05
@@ -74,6 +77,7 @@ class Search:
         most: causes at most.
         quiet: axes that were not driven.
         shortest: time (s) below which lags and delays are rejected.
+        horizon: time (s) over which causes must forecast better where states were estimated.
     """
 
     nuisance: Sequence[int] = ()
@@ -81,6 +85,7 @@ class Search:
     most: int = 6
     quiet: Sequence[str] = ()
     shortest: float = 0.0
+    horizon: float = 4.0
 
     def names(self, problem: DiagnosisProblem) -> list[Hypothesis]:
         """Causes that are identifiable, of single thrusters none."""
@@ -222,15 +227,19 @@ class Search:
                 del fits[h]
         gains = {c.hypothesis[0]: c.fit.heldout_gain for c in state.accepted}
 
-        def best(least: float) -> Choice | None:
+        def best(least: float, among: Fits) -> Choice | None:
             needed = max(threshold, state.left_undescribed, least)
-            return choose(problem.library, current.theta, fits, needed, self.alpha, gains, strict)
+            return choose(problem.library, current.theta, among, needed, self.alpha, gains, strict)
 
         def chosen() -> Choice | None:
-            first = best(least)
+            first = best(least, fits)
             if first is None or not current.noise.estimated or _halves(state, first):
                 return first
-            return best(max(least, OF_ESTIMATES * problem.data.steps))
+            enough = best(max(least, OF_ESTIMATES * problem.data.steps), fits)
+            if enough is not None:
+                return enough
+            names = [first.hypothesis, *(h for h, _ in first.rivals)][:_FORECAST]
+            return best(least, forecast_better(state, self.nuisance, names, fits, self.horizon))
 
         choice = chosen()
         if choice is not None and _about_thrust(problem, choice):
@@ -264,7 +273,7 @@ class Search:
         """
         problem, own = state.problem, state.problem.library.at(*h)
         chosen = [*own, *self.nuisance, *parameters_of(problem.library, state.hypotheses)]
-        start = _start(fits[h], state.current.theta)
+        start = fits[h].added_to(state.current.theta)
         theta, seen, joint = problem.polish(start, chosen, kalman, origin=state.current)
         return theta, seen, _of_one(own, theta, joint)
 
@@ -327,18 +336,9 @@ class Search:
         return state.at(problem.evaluate(theta))
 
 
-def _start(fit: Fit, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """θ with the changes of a fit."""
-    moved = theta.copy()
-    moved[list(fit.parameters)] += fit.values
-    for i, change in fit.others.items():
-        moved[i] += change
-    return moved
-
-
 def _halves(state: Selection, choice: Choice) -> bool:
     """Whether a cause makes the one-step errors much smaller."""
-    problem, theta = state.problem, _start(choice.fit, state.current.theta)
+    problem, theta = state.problem, choice.fit.added_to(state.current.theta)
     won = problem.loss_of(state.current) - problem.loss(theta)
     return bool(won >= _HALVED * problem.data.steps)
 

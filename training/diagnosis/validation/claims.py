@@ -163,6 +163,28 @@ class Judgement(NamedTuple):
         return Claim(vetoes(self.judged, name, at, bands, self.seed), shares)
 
 
+def improves(new: Judged, old: Judged, rng: np.random.Generator) -> bool:
+    """Whether a model saves as much as a practical share of the forecast error of one part.
+
+    By the mean logarithm of the ratio over parts and horizons, which must clearly be below zero.
+    """
+    values, draws = [], []
+    for g in range(len(GROUPS)):
+        if old.square[:, g].any():
+            value, drawn = _saved(new.square[:, g], old.square[:, g], rng)
+            values.append(value)
+            draws.append(drawn)
+    if not np.isfinite(values).all():
+        return False
+    with np.errstate(divide="ignore"):
+        mean, spread = (
+            np.log(np.maximum(1 - np.array(a), 1e-12)).mean(axis=axis)
+            for a, axis in ((values, None), (draws, (0, 2)))
+        )
+    bar = np.log(1 - PRACTICAL) / len(values)
+    return bool(mean < bar and np.nanpercentile(spread, 97.5) < 0)
+
+
 def clearly_better(new: Judged, old: Judged, seed: int) -> bool:
     """Whether a model saves a practical share of another one's forecast error, over all horizons.
 

@@ -154,6 +154,7 @@ def test_concatenation_keeps_every_run():
     sparse = Recording(a.dataset.assign_attrs(command_period=0.2))
     assert a.command_period == a.dt
     assert Recording.concat([a, sparse]).command_period == 0.2
+    assert [r.commands_sampled for r in (a, sparse, both)] == [False, True, False]
     other = Recording.from_trajectories(
         [trajectory(commands={"pwm": np.full((40, 8), 1500.0)})], DT, vehicle="test"
     )

@@ -34,6 +34,9 @@ from .schema import (
 )
 from .splits import run_parts, time_parts
 
+_PERIOD = "command_period"
+"""Attribute of a log's recording: period (s) of its commands."""
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -78,7 +81,12 @@ class Recording:
     @property
     def command_period(self) -> float:
         """Period (s) of the commands in the log; `dt` if unknown."""
-        return float(self.dataset.attrs.get("command_period", self.dt))
+        return float(self.dataset.attrs.get(_PERIOD, self.dt))
+
+    @property
+    def commands_sampled(self) -> bool:
+        """Whether commands are a log's samples of faster ones; else each was held over its step."""
+        return _PERIOD in self.dataset.attrs
 
     @property
     def scenarios(self) -> tuple[str, ...]:
@@ -340,8 +348,8 @@ class Recording:
             source="; ".join(source for source in sources if source),
             notes=list(notes),
         )
-        period = max(recording.command_period for recording in recordings)
-        return cls(joined.dataset.assign_attrs(command_period=period))
+        sampled = [r.command_period for r in recordings if r.commands_sampled]
+        return cls(joined.dataset.assign_attrs({_PERIOD: max(sampled)} if sampled else {}))
 
     # files
 

@@ -1,6 +1,5 @@
 """From a recording and a believed model to named causes."""
 
-import math
 import time
 from dataclasses import dataclass, replace
 
@@ -26,7 +25,7 @@ from .causes import (
 )
 from .config import DiagnoseConfig
 from .data.arrays import Data
-from .data.checks import SPARSE, limits, problems, require_enough, settled, unexcited
+from .data.checks import limits, problems, require_enough, settled, unexcited
 from .disturbance.found import OF_OTHERS, all_laws, reported_laws
 from .disturbance.laws import Law
 from .disturbance.levels import LEVEL
@@ -48,10 +47,9 @@ _RESAMPLED, _OF_A_STEP, _NO_TIME = 0.02, 0.1, 0.06
 """In resampled data: nats a sample that a law must win, and least lag or delay (share of a step).
 In any data, delays below 6 % of a step are rejected: integration error looks like one. With ten
 substeps a step, a pose half a substep late shows, without noise, as a clock offset of 5 %."""
-_OF_A_COMMAND = 1 / math.sqrt(12)
-"""Least lag or delay, as a share of the period of sparse commands, or of the step over which
-frequent ones were averaged: a command changed somewhere within it, and this is the standard
-deviation of a uniform time. In closed loop it follows from the motion, so that means come early."""
+_OF_A_COMMAND = 0.5
+"""Least lag or delay of sampled commands, as a share of their period or, if longer, of the step
+over which they were averaged: lines between samples of held commands come early by half of it."""
 _FINEST = 0.02
 """Shortest step (s) that the extended model supports: it sets the length of delay buffers."""
 
@@ -103,7 +101,7 @@ class Diagnoser:
         if self.config.refit == "command":
             self.problem = with_coefficients(self.problem, "command")
         self.resampled = any("resampled" in note for note in recording.notes)
-        self.command_period = recording.command_period
+        self.command_period, self.sampled = recording.command_period, recording.commands_sampled
         directions = np.asarray(self.problem.model.allocate(jnp.eye(self.problem.data.u.shape[1])))
         self.quiet = unexcited(self.problem.data, directions)
         self.driven = len(self.quiet) < len(AXES)
@@ -267,9 +265,9 @@ class Diagnoser:
     def _shortest(self, problem: DiagnosisProblem) -> float:
         """Time (s) below which lags and delays are rejected."""
         shortest = (_OF_A_STEP if self.resampled else _NO_TIME) * problem.data.dt
-        period, dt = self.command_period, problem.data.dt
-        if not dt / SPARSE <= period <= SPARSE * dt:
-            shortest = max(shortest, _OF_A_COMMAND * max(period, dt))
+        if self.sampled:
+            period = max(self.command_period, problem.data.dt)
+            shortest = max(shortest, _OF_A_COMMAND * period)
         return shortest
 
     def _validate(

@@ -470,10 +470,10 @@ def test_structure_without_a_name_is_found_where_it_is(tmp_path):
 @pytest.mark.parametrize(
     ("name", "seed", "kind", "words"),
     [
-        ("backlash", 70013, "play", "backlash"),
+        pytest.param("backlash", 70013, "play", "backlash", marks=pytest.mark.slow),
         ("slew", 70004, "slew", "N/s at most"),
         ("exchange", 70005, "exchange", "take each other's command"),
-        ("steps", 70006, "steps", "in steps of"),
+        pytest.param("steps", 70006, "steps", "in steps of", marks=pytest.mark.slow),
     ],
 )
 def test_how_thrusters_follow_is_told_with_number_and_place(tmp_path, name, seed, kind, words):

@@ -228,9 +228,21 @@ def agrees(law, omega, direction, amplitude, within=0.15):
 
 
 @pytest.mark.parametrize(
-    "name", ["disturbance_level", "disturbance_state_dependence", "disturbance_impacts"]
+    ("name", "size"),
+    [
+        ("disturbance_impacts", 3.0),
+        *(
+            pytest.param(f"disturbance_{name}", size, marks=pytest.mark.slow)
+            for name, size in (
+                ("level", 3.0),
+                ("state_dependence", 3.0),
+                ("level", 1.0),
+                ("state_dependence", 1.0),
+                ("impacts", 1.0),
+            )
+        ),
+    ],
 )
-@pytest.mark.parametrize("size", [pytest.param(1.0, marks=pytest.mark.slow), 3.0])
 def test_levels_and_what_comes_and_goes_are_told_apart(problem_of, name, size):
     problem, _ = problem_of(name, size)
     evaluation = problem.evaluate(problem.believed)

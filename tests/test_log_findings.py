@@ -51,6 +51,32 @@ def test_frames_that_contradict_the_outputs_or_have_no_preset_are_refused(tmp_pa
     assert found == []
 
 
+def named_frame(name: bytes, parameters: dict[str, float]):
+    """A dive before which the autopilot named its frame."""
+    log = dive(duration=8.0, parameters=parameters)
+    log.send(100.0, dialect.MAVLink_statustext_message(6, b"Frame: " + name))
+    return log.bytes()
+
+
+def test_the_frame_that_the_autopilot_names_counts_where_the_parameter_is_missing(tmp_path):
+    recording, found, report = imported(tmp_path, named_frame(b"VECTORED", {}))
+    assert (recording.vehicle, found) == ("bluerov2", [])
+    assert any("Frame: VECTORED: 6 thrusters" in line for line in report.done)
+    other = named_frame(b"SOMETHING_NEW", {})
+    assert imported(tmp_path, other)[0].vehicle == "bluerov2_heavy"
+    with pytest.raises(UserError, match="Frame: VECTORED is that of a vehicle with 6 thrusters"):
+        imported(tmp_path, named_frame(b"VECTORED", {}), vehicle="bluerov2_heavy")
+
+
+def test_a_frame_that_was_changed_without_a_start_is_refused(tmp_path):
+    """The motors of FRAME_CONFIG were not in force."""
+    changed = named_frame(b"VECTORED_6DOF", {"FRAME_CONFIG": 1.0})
+    with pytest.raises(UserError, match="FRAME_CONFIG 1.*VECTORED, and the autopilot started as"):
+        imported(tmp_path, changed)
+    same = named_frame(b"VECTORED", {"FRAME_CONFIG": 1.0})
+    assert imported(tmp_path, same)[1] == []
+
+
 def moved_to_port_1(log):
     """The same log with the pulses in messages of port 1."""
     servo = dialect.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW

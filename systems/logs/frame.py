@@ -30,6 +30,7 @@ _KINDS = {
 _MAKERS = {12: "PX4"}
 _SUBMARINE, _ARDUPILOT = 12, 3
 _FIRMWARE = re.compile(r"(Ardu(?:Copter|Plane|Rover)|APM:(?:Copter|Plane|Rover)|PX4|Rover|Blimp)\b")
+_SAID = re.compile(r"Frame: *(\w+)")
 _MOVES_US = 20.0
 
 
@@ -54,6 +55,21 @@ def firmware_findings(place: str, texts: Iterable[str]) -> list[Finding]:
     return []
 
 
+def frame_said(texts: Iterable[str]) -> int | None:
+    """FRAME_CONFIG of the frame that the autopilot names at its start, as in "Frame: VECTORED"."""
+    numbers = {name: number for number, (name, _) in _FRAMES.items()}
+    for text in texts:
+        found = _SAID.match(text.strip())
+        if found is not None and found[1] in numbers:
+            return numbers[found[1]]
+    return None
+
+
+def frame_in_words(frame: int) -> str:
+    """The message with which the autopilot names a frame; its number, if that is unknown."""
+    return f"Frame: {_FRAMES[frame][0] if frame in _FRAMES else frame}"
+
+
 def _not_a_submarine(place: str, said: list[str]) -> Finding:
     return Finding(
         "not-a-submarine",
@@ -65,17 +81,29 @@ def _not_a_submarine(place: str, said: list[str]) -> Finding:
 
 def frame_findings(
     frame: int | None,
+    source: str,
+    said: int | None,
     motors: Mapping[int, int],
     outputs_us: Float[np.ndarray, "32 n"],
     named: bool,
 ) -> list[Finding]:
-    """Contradictions of FRAME_CONFIG; `motors` are those of the output channels (from 1).
+    """Contradictions of a log's frame; `motors` are those of the output channels (from 1).
 
-    `named` tells whether the user named a vehicle.
+    `source` is where the log has the frame, `said` the frame that the autopilot named, `named`
+    whether the user named a vehicle.
     """
     if frame not in _FRAMES:
         return []
     name, count = _FRAMES[frame]
+    if said is not None and said != frame:
+        return [
+            Finding(
+                "frame-contradiction",
+                source,
+                f"the parameter is frame {name}, and the autopilot started as {_FRAMES[said][0]}",
+                "correct FRAME_CONFIG and start the autopilot anew before the next dive",
+            )
+        ]
     extra = [
         c for c, motor in sorted(motors.items()) if motor > count and _moves(outputs_us[c - 1])
     ]
@@ -84,7 +112,7 @@ def frame_findings(
         return [
             Finding(
                 "frame-contradiction",
-                f"FRAME_CONFIG {frame}",
+                source,
                 f"frame {name} has {count} thrusters, and outputs {which} drive more of them",
                 "correct FRAME_CONFIG or SERVOn_FUNCTION in the log's parameters",
             )
@@ -93,7 +121,7 @@ def frame_findings(
         return [
             Finding(
                 "frame-without-preset",
-                f"FRAME_CONFIG {frame}",
+                source,
                 f"no preset has the thrusters of frame {name}",
                 "name the vehicle (--vehicle FILE)",
             )

@@ -11,7 +11,7 @@ from ...models.recordings.resample import linear
 from ..mavlink import codec
 from .dataflash import BinLog
 from .depth import in_water
-from .frame import firmware_findings, frame_findings
+from .frame import firmware_findings, frame_said
 from .signals import (
     Series,
     Signals,
@@ -78,7 +78,8 @@ def signals_from_bin(
         ([], []) if table is None else parameters_of(table["t"], table["Name"], table["Value"])
     )
     known = {p.name: p.value for p in parameters}
-    wired = wiring(parameters, first, last, vehicle)
+    texts = [] if "MSG" not in tables else [m.decode("ascii", "replace") for m in _messages(tables)]
+    wired = wiring(parameters, first, last, vehicle, frame_said(texts))
     outputs, notes, frame = _outputs(tables, wired, vehicle is not None)
     position, velocity = _motion(tables, core, known, density)
     rates, rate_notes = _rates(tables, core)
@@ -94,7 +95,6 @@ def signals_from_bin(
     spans = {"wiring": wired.spans, **_states(tables, first, last), **_aiding(tables, core)}
     voltage = _voltage(tables)
     batteries = [name for name in ("BAT",) if name in tables]
-    texts = [] if "MSG" not in tables else [m.decode("ascii", "replace") for m in _messages(tables)]
     findings = [*firmware_findings("MSG", texts), *frame, *stops]
     findings += [*missing_states(spans, voltage, batteries), *direction_findings(wired)]
     return Signals(
@@ -285,7 +285,7 @@ def _outputs(
     )
     if outputs is None:
         raise UserError("RCOU: a single record is no record of the thrusters")
-    return outputs, notes, frame_findings(wired.frame, wired.motors, channels, named)
+    return outputs, notes, wired.frame_findings(channels, named)
 
 
 def _pressure_depth(

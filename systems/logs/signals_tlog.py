@@ -8,7 +8,7 @@ from ...models.config.errors import UserError
 from ...models.recordings.checks.finding import Finding
 from ..mavlink import codec
 from .depth import in_water
-from .frame import firmware_findings, frame_findings, kind_findings
+from .frame import firmware_findings, frame_said, kind_findings
 from .signals import Series, Signals, Spans, parameters_of, sampled_spans, series, undelayed
 from .streams import aid_spans, missing_states
 from .table import Table
@@ -62,7 +62,8 @@ def signals_from_tlog(
     table = tables.get("PARAM_VALUE")
     columns = None if table is None else (table[c] for c in ("t", "param_id", "param_value"))
     parameters, strange = ([], []) if columns is None else parameters_of(*columns)
-    wired = wiring(parameters, first, last, vehicle)
+    texts = [] if "STATUSTEXT" not in tables else _texts(tables["STATUSTEXT"]["text"])
+    wired = wiring(parameters, first, last, vehicle, frame_said(texts))
     known = {p.name: p.value for p in parameters}
     outputs, notes, frame = _outputs(outputs_table, wired, vehicle is not None)
     aiding = _aiding(tables)
@@ -75,7 +76,6 @@ def signals_from_tlog(
     spans = {"wiring": wired.spans, **_states(tables), **aiding, **no_aid}
     voltage = _voltage(tables)
     batteries = [name for name in ("BATTERY_STATUS", "SYS_STATUS") if name in tables]
-    texts = [] if "STATUSTEXT" not in tables else _texts(tables["STATUSTEXT"]["text"])
     findings = kind_findings(*log.kind) or firmware_findings("STATUSTEXT", texts)
     findings += [*frame, *stops, *missing_states(spans, voltage, batteries)]
     has = [f"Horizontal aid: {', '.join(aids)}."] if aids else []
@@ -246,7 +246,7 @@ def _outputs(table: Table, wired: Wiring, named: bool) -> tuple[Series, list[str
     outputs, notes = thruster_outputs(t, channels, wired, "SERVO_OUTPUT_RAW")
     if outputs is None:
         raise UserError("SERVO_OUTPUT_RAW: a single message is no record of the thrusters")
-    return outputs, notes, frame_findings(wired.frame, wired.motors, channels, named)
+    return outputs, notes, wired.frame_findings(channels, named)
 
 
 def _silent(rows: Table, wanted: set[int]) -> bool:

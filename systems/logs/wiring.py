@@ -5,11 +5,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Float
 
 from ...models.config.errors import UserError
 from ...models.recordings.checks.finding import Finding
 from ...models.vehicles.vehicle import load_vehicle
 from ..mavlink.codec import FRAME_THRUSTERS, MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS, thruster_pwm
+from .frame import frame_findings, frame_in_words
 from .signals import Parameter, Series, Spans, series
 
 PRESETS, _USUAL = {6: "bluerov2", 8: "bluerov2_heavy"}, 8
@@ -26,7 +28,9 @@ class Wiring:
         mirrored: those that turn the other way than in the vehicle's file, by time: from each
             time on (s).
         spans: of reassigned outputs.
-        frame: FRAME_CONFIG, if the log has it.
+        frame: FRAME_CONFIG, if the log has it, or the frame that the autopilot named.
+        frame_source: where the log has the frame, in words.
+        said: the frame that the autopilot named, by its FRAME_CONFIG.
         motors: motor of each output channel (from 1) that has one.
         turned: thrusters (from 1) whose output has SERVOn_REVERSED.
     """
@@ -37,6 +41,8 @@ class Wiring:
     spans: Spans
     notes: tuple[str, ...]
     frame: int | None = None
+    frame_source: str = ""
+    said: int | None = None
     motors: Mapping[int, int] = field(default_factory=dict)
     turned: tuple[int, ...] = ()
 
@@ -45,19 +51,29 @@ class Wiring:
         """Times (s) at which a thruster's direction changed."""
         return tuple(t for t, _ in self.mirrored[1:])
 
+    def frame_findings(self, outputs_us: Float[np.ndarray, "32 n"], named: bool) -> list[Finding]:
+        """Contradictions of the frame; `named` tells whether the user named a vehicle."""
+        given = self.frame, self.frame_source, self.said
+        return frame_findings(*given, self.motors, outputs_us, named)
+
 
 DIRECTION_CHANGED = "change of a thruster's direction"
 _SETTLING_S = 1.3  # an output's new function is in force by then
 
 
 def wiring(
-    parameters: Sequence[Parameter], first: float, last: float, vehicle: str | None = None
+    parameters: Sequence[Parameter],
+    first: float,
+    last: float,
+    vehicle: str | None = None,
+    said: int | None = None,
 ) -> Wiring:
     """Read frame and thruster wiring from the parameters as they were during the log.
 
     A channel that ever had motor function 33 … 40 drives that thruster, even while it is set to
     pass-through (1, 51 … 66) or off. Without a named `vehicle` it is the preset with the frame's
-    number of thrusters, with eight if the log doesn't tell.
+    number of thrusters, with eight if the log doesn't tell. `said` is the frame that the autopilot
+    named, which counts where the log lacks FRAME_CONFIG.
 
     Raises:
         UserError: the log's frame has another number of thrusters than the named vehicle.
@@ -83,7 +99,10 @@ def wiring(
         for channel, history in sorted(functions.items())
     }
     channel_of = {motor: channel for channel, motor in motor_of.items() if motor is not None}
-    name, notes = _vehicle(vehicle, frame, channel_of, functions)
+    source = f"FRAME_CONFIG {frame}"
+    if frame is None and said is not None:
+        frame, source = said, frame_in_words(said)
+    name, notes = _vehicle(vehicle, frame, source, channel_of, functions)
     mounts = load_vehicle(name).propulsion.mounts
     channels, told = _channels(len(mounts), channel_of, functions)
     if not directions:
@@ -99,6 +118,8 @@ def wiring(
         _settled(changes, first, last),
         (*notes, *told),
         frame,
+        source,
+        said,
         motors,
         turned,
     )
@@ -126,10 +147,14 @@ _Functions = Mapping[int, Sequence[tuple[float, int]]]
 
 
 def _vehicle(
-    named: str | None, frame: int | None, channel_of: Mapping[int, int], functions: _Functions
+    named: str | None,
+    frame: int | None,
+    source: str,
+    channel_of: Mapping[int, int],
+    functions: _Functions,
 ) -> tuple[str, list[str]]:
     """The vehicle's name, and a sentence if it is not the usual one."""
-    count, told = FRAME_THRUSTERS.get(-1 if frame is None else frame), f"FRAME_CONFIG {frame}"
+    count, told = FRAME_THRUSTERS.get(-1 if frame is None else frame), source
     six = set(channel_of) == set(range(1, 7)) and functions.keys() >= {7, 8}
     if count is None and six and not _drives(functions[7]) and not _drives(functions[8]):
         count, told = 6, "SERVOn_FUNCTION"

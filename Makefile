@@ -9,6 +9,8 @@ SHELL := /bin/bash
 # The editable install names this folder, so a moved or copied checkout installs again.
 INSTALLED := .venv/.installed-$(shell printf %s "$(CURDIR)" | cksum | cut -d' ' -f1)
 BIN := .venv/bin
+# Bytecode is kept whatever the shell says: tests start many processes.
+unexport PYTHONDONTWRITEBYTECODE
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
 # One thread a test worker: pytest runs one worker a core. Tests compile more than they compute: without
@@ -37,7 +39,7 @@ $(INSTALLED): requirements.txt pyproject.toml
 				"(on Debian: apt-get install python3-venv)" >&2; exit 1; }; \
 	fi
 	@echo "installing the versions that requirements.txt names (about 1 GB, once)"
-	@$(PIP) install $(if $(CI),--quiet) --no-deps -r requirements.txt
+	@$(PIP) install $(if $(CI),--quiet) --no-compile --no-deps -r requirements.txt
 	@$(PIP) install --quiet --no-deps --no-index --no-build-isolation --editable .
 	@$(PIP) check
 	@rm -f .venv/.installed-* && touch $@
@@ -47,12 +49,20 @@ demo: $(INSTALLED) ## a log goes in, a learned vehicle flies a dive; LOG=path ta
 	@$(BIN)/spinndrift demo $(if $(LOG),--log "$(LOG)")
 
 .PHONY: test
-test: lint unit smoke ## lint, types, all tests, and the smoke part against the built wheel
+test: style ## lint, types, all tests, and the smoke part against the built wheel
+	@$(MAKE) --no-print-directory --jobs 2 types unit
+	@$(MAKE) --no-print-directory smoke
 
 .PHONY: lint
-lint: $(INSTALLED) ## ruff (lint and format) and basedpyright
+lint: style types ## ruff (lint and format) and basedpyright
+
+.PHONY: style
+style: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check --quiet . || { echo "run: make format" >&2; exit 1; }
+
+.PHONY: types
+types: $(INSTALLED)
 	$(BIN)/basedpyright --warnings
 
 .PHONY: unit
@@ -64,6 +74,7 @@ slow: $(INSTALLED) ## the tests left out of `make test` for the time they take
 	$(ONE_THREAD) $(BIN)/python -m pytest -n auto -m slow
 
 # `-P` and another working folder keep the tree out; a test checks which copy was imported.
+SMOKE := $(shell grep -l "mark\.smoke" tests/test_*.py)
 .PHONY: smoke
 smoke: $(INSTALLED) ## the tests marked smoke against the built wheel
 	@rm -rf build/wheel build/lib build/bdist.* && mkdir -p build/wheel/run
@@ -72,7 +83,8 @@ smoke: $(INSTALLED) ## the tests marked smoke against the built wheel
 		build/wheel/spinndrift-*.whl
 	cd build/wheel/run && $(ONE_THREAD) PYTHONPATH="$(CURDIR)/build/wheel/installed" \
 		SPINNDRIFT_EXPECTED_UNDER="$(CURDIR)/build/wheel/installed" "$(CURDIR)/$(BIN)/python" -P \
-		-m pytest -m smoke -n auto --dist worksteal -c "$(CURDIR)/pyproject.toml" --rootdir "$(CURDIR)" "$(CURDIR)/tests"
+		-m pytest -m smoke -n auto --dist worksteal -c "$(CURDIR)/pyproject.toml" \
+		--rootdir "$(CURDIR)" $(addprefix "$(CURDIR)"/,$(SMOKE))
 
 .PHONY: format
 format: $(INSTALLED) ## let ruff mend and lay out the code

@@ -472,7 +472,9 @@ def test_structure_without_a_name_is_found_where_it_is(tmp_path):
     [
         pytest.param("backlash", 70013, "play", "backlash", marks=pytest.mark.slow),
         ("slew", 70004, "slew", "N/s at most"),
-        ("exchange", 70005, "exchange", "take each other's command"),
+        pytest.param(
+            "exchange", 70005, "exchange", "take each other's command", marks=pytest.mark.slow
+        ),
         pytest.param("steps", 70006, "steps", "in steps of", marks=pytest.mark.slow),
     ],
 )

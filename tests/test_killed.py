@@ -4,6 +4,7 @@ test_diagnose_command have the same of their commands."""
 import os
 
 import numpy as np
+import pytest
 from diagonal import Diagonal
 from killing import killed, litter
 from motion import smooth_motion
@@ -29,6 +30,7 @@ def recorded(path):
     Recording.from_trajectories(runs, 0.05, vehicle="bluerov2_heavy").save(path)
 
 
+@pytest.mark.slow  # test_cli has a training that goes on, test_study one that was killed
 def test_training_that_was_killed_goes_on_to_the_same_bits(tmp_path, monkeypatch):
     start = Diagonal.of(mass=20.0, drag=20.0, diffusion=1.0)
     monkeypatch.setattr(learning, "starting_model", lambda *_: start)

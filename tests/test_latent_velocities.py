@@ -136,6 +136,7 @@ def test_a_weak_thruster_and_drag_are_named_without_u_and_v(tmp_path):
         assert fit.errors[0] < 0.05 * abs(value)
 
 
+@pytest.mark.slow
 def test_nothing_is_named_without_u_and_v_where_nothing_is_hidden(tmp_path):
     """Innovations are white and of the predicted size, and axes that no instrument tells of have
     no causes."""

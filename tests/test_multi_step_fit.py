@@ -75,6 +75,7 @@ def test_gains_and_drag_come_back_from_forecasts():
     assert max(high for _, _, high in ratio.values()) < 0.1
 
 
+@pytest.mark.slow
 def test_drag_stays_passive_and_left_out_windows_are_not_used():
     truth = (
         KINDS["quadratic_drag"].of("surge", change=-62.0),

@@ -121,6 +121,7 @@ def test_records_lead_to_records(name):
     np.testing.assert_allclose(Vr, [v for _, v in seen[1:]], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_late_instruments_show_what_was():
     """Late by 0.6 of a step; what is left is what linear motion within steps leaves."""
     late, fine = 0.6 * DT, 20

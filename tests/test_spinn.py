@@ -248,7 +248,10 @@ def test_a_deterministic_model_ignores_brownian_increments():
     np.testing.assert_array_equal(noisy[1], quiet[1])
 
 
-@pytest.mark.parametrize(("spd", "potential"), [("cholesky", "gravity"), ("eigenvalues", "pose")])
+@pytest.mark.parametrize(
+    ("spd", "potential"),
+    [("cholesky", "gravity"), pytest.param("eigenvalues", "pose", marks=pytest.mark.slow)],
+)
 def test_float32_gradients_are_finite_from_rest_and_scales_have_none(spd, potential):
     config = SpinnConfig(**SMALL, spd=spd, potential=potential)
     model = Spinn.create(config, body(jnp.float32), jax.random.key(0), jnp.float32)

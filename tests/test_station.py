@@ -172,6 +172,7 @@ def test_it_runs_in_drakes_monte_carlo_simulation(diagram):
     assert len(set(values)) == 3
 
 
+@pytest.mark.slow
 def test_the_planner_crosses_between_pylons_and_keeps_clear():
     """A short crossing in the harbour; `sims` flies the long one over many seeds."""
     pylons = (Pylon(1.0, -0.1), Pylon(1.0, 1.4), Pylon(1.0, -1.6))

@@ -244,6 +244,7 @@ def test_a_killed_study_goes_on_to_the_same_numbers(finished, quick, tmp_path, m
     assert litter(tmp_path / seed.parent) == []
 
 
+@pytest.mark.slow
 def test_seeds_trained_together_are_those_trained_alone(finished, quick, tmp_path):
     """Equal data and starts; the batched program sums in another order, hence the tolerance."""
     run_task(TINY, replace(TASK, seeds=(0, 1)), str(tmp_path))

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from spinndrift.models import se3
 from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu
 from spinndrift.systems.estimation import error_state as es
-from spinndrift.systems.estimation import measurement
+from spinndrift.systems.estimation import measurement, recovery
 from spinndrift.systems.estimation.config import EkfConfig
 from spinndrift.systems.estimation.delayed import DelayedFilter
 from spinndrift.systems.estimation.state import FilterState, Readings
@@ -80,6 +80,30 @@ def test_the_transition_is_the_derivative_of_a_step(time):
     np.testing.assert_allclose(F, exact, atol=max(1e-12, 10 * angle**4))
 
 
+def test_without_a_force_the_transition_is_the_derivative_of_a_velocity_that_is_held():
+    imu, x, rate = Imu(), navigation(), jnp.array([0.3, -0.5, 0.4])
+    T = jnp.asarray(0.05)
+
+    def step(state: es.Navigation) -> es.Navigation:
+        omega = rate + x.gyro_bias - state.gyro_bias
+        force = es.held_force(state, omega, imu.gravity)
+        after = es.apply(state, es.sample_increment(force, omega, T), imu.gravity)
+        decay = jnp.exp(-T / Compass().wander_time)
+        return after._replace(sensors=after.sensors * jnp.stack([1.0, 1.0, decay]))
+
+    after = step(x)
+    unmeasured = es.Unmeasured(T, jnp.asarray(0.3), jnp.asarray(0.0))
+    force = es.held_force(x, rate, imu.gravity)
+    F, Q = es.transition(x, after, force, rate, T, imu, AIDS, unmeasured)
+    exact = jax.jacfwd(lambda d: es.error(after, step(es.retract(x, d))))(jnp.zeros(ERRORS))
+    # what is held is so to first order in the angle, and gravity turns with it
+    angle = float(jnp.linalg.norm(rate) * T)
+    size = angle * max(float(jnp.linalg.norm(x.v_B)), imu.gravity * float(T))
+    np.testing.assert_allclose(F[es.VELOCITY], exact[es.VELOCITY], atol=size)
+    np.testing.assert_array_equal(F[es.VELOCITY, es.ROTATION], 0)
+    np.testing.assert_allclose(jnp.diag(Q)[es.VELOCITY], 0.3, rtol=1e-3)
+
+
 def test_the_transitions_noise_is_that_of_many_small_steps():
     imu = Imu()
     x = navigation()
@@ -101,7 +125,7 @@ def test_the_transitions_noise_is_that_of_many_small_steps():
 def _innovations(x: es.Navigation) -> list[measurement.Innovation]:
     rate = jnp.array([0.2, -0.1, 0.3])
     return [
-        measurement.innovation(each, i, x, rate, jnp.zeros(each.value_size))
+        measurement.innovation(each, i, x, rate, jnp.zeros((3, 3)), jnp.zeros(each.value_size))
         for i, each in enumerate(AIDS)
     ]
 
@@ -413,3 +437,50 @@ def test_a_lost_filter_opens_its_gate_after_some_patience():
     assert (
         float(jnp.linalg.norm(state.nominal.accel_bias)) < 0.2
     )  # the biases were not dragged along
+
+
+# ------------------------------------------------------------------------------------ finding back
+
+
+def test_the_force_shows_where_up_is_after_a_gap_and_is_not_asked_before():
+    gravity, usual = 9.81, jnp.asarray(0.3**2)
+    x = navigation()._replace(v_B=jnp.zeros(3))
+    tilt = 0.2 * jnp.array([1.0, -1.0, 0.0])
+    turned = es.retract(x, jnp.zeros(ERRORS).at[es.ROTATION].set(tilt))
+    force = es.held_force(turned, jnp.zeros(3), gravity)
+    given = (force, jnp.array(True), jnp.zeros(3), usual, gravity)
+    eye = jnp.eye(ERRORS)
+    level = jax.jit(lambda P: recovery.levelled(x, P, eye, *given))
+    found, P, _ = level(0.3**2 * eye)
+    up = jnp.array([0.0, 0.0, 1.0])
+    left = se3.rotate_inverse(found.X_WB, up) - se3.rotate_inverse(turned.X_WB, up)
+    assert jnp.linalg.norm(left) < 0.3 / gravity
+    tilts = jnp.linalg.eigvalsh(P[es.ROTATION, es.ROTATION])
+    np.testing.assert_allclose(jnp.sqrt(tilts[:2]), 0.3 / gravity, rtol=0.05)
+    np.testing.assert_allclose(jnp.sqrt(tilts[2]), 0.3, rtol=0.05)  # no force shows the heading
+    certain = 0.01**2 * eye
+    np.testing.assert_array_equal(level(certain)[1], certain)
+
+
+def test_an_outlier_that_decided_alone_is_outvoted_by_the_next_two():
+    """Velocity was unknown; the first DVL reading is an outlier, those after it are right."""
+    config = EkfConfig(velocity_std=(1.0, 1.0, 1.0), attitude_std=(1e-3, 1e-3, 1e-3))
+    core = DelayedFilter(Imu(), (Dvl(),), config)
+    start = se3.identity(jnp.float64)
+    step, present = jax.jit(core.step), jax.jit(lambda state: core.present(state, core.period))
+    still = jnp.array([0, 0, 9.80665, 0, 0, 0])
+    state, errors = core.init(start, jnp.zeros(6)), []
+    rng = np.random.default_rng(0)
+    noise = 0.01 * rng.standard_normal((5, 3))
+    for k in range(100):
+        n = (k - 20) // 20
+        shown = noise[n] + (np.array([0.4, -0.3, 0.2]) if n == 0 else 0)
+        reading = jnp.asarray([*shown, float(k >= 20), 0.2 * n + 0.05])
+        imu = still + 1e-3 * jnp.asarray(rng.standard_normal(6))  # without noise it is stuck
+        state = step(state, Readings(imu, (reading,)), jnp.asarray(float(k)))
+        _, V, P = present(state)
+        v = V[:3]
+        errors.append(float(v @ jnp.linalg.solve(P[es.VELOCITY, es.VELOCITY], v)))
+    assert max(errors) > 14.2, "the outlier was not believed"
+    assert errors[-1] < 14.2
+    assert float(jnp.linalg.norm(v)) < 0.03  # three deviations of a reading

@@ -6,6 +6,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from spinndrift.models.sensors import Imu
 from spinndrift.systems.estimation.inertial import FEW, LEFT_OPEN, Motion, Samples, take
@@ -146,3 +147,20 @@ def test_how_a_vehicle_usually_moves():
     for _ in range(12000):
         motion = after(motion, jnp.zeros(3), jnp.zeros(3))
     np.testing.assert_allclose(motion.usual, [0.1**2, 0.05**2])  # no vehicle is quite at rest
+
+
+@pytest.mark.parametrize("integrating", [True, False])
+def test_the_rate_between_samples_is_as_uncertain_as_is_said(integrating):
+    """A Brownian rate: means over a period, or points, and the rate at the end of a sample."""
+    fine, n, density = 64, 20_000, 0.3
+    rng = np.random.default_rng(0)
+    rate = np.cumsum(density * np.sqrt(T / fine) * rng.standard_normal((3, n * fine)), axis=1)
+    ends = rate[:, fine - 1 :: fine]
+    points = np.concatenate([np.zeros((3, 1)), ends[:, :-1]], axis=1)
+    rows = rate.reshape(3, n, fine).mean(axis=2) if integrating else (points + ends) / 2
+    error = (rows[:, :-1] + rows[:, 1:]) / 2 - ends[:, :-1]
+    bends = np.diff(rows if integrating else ends, 2, axis=1)
+    start = Samples.start(jnp.zeros(3))
+    steps = start.bends.at[3:, 3:].set(bends @ bends.T / bends.shape[1])
+    claimed = start._replace(bends=steps).between(integrating)
+    np.testing.assert_allclose(np.diag(claimed), (error**2).mean(axis=1), rtol=0.05)

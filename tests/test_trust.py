@@ -11,6 +11,7 @@ from spinndrift.systems.estimation.trust import (
     counted,
     imu_off,
     judged,
+    others,
     sizes,
     suspected,
     with_doubt,
@@ -75,7 +76,7 @@ def test_zeros_of_lost_lock_sentinels_and_what_is_not_finite_are_not_used():
     assert not usable(changing(5), range(5), NONE).any()
 
 
-def judge(rejected: float, jump: float, well: bool, **more) -> tuple:
+def judge(rejected: float, jump: float, well: bool, cleared: bool = False, **more) -> tuple:
     """The verdict on a compass of which a reading came."""
     start = Trust.start(AIDS, jnp.dtype("float64"))
     trust = start._replace(
@@ -83,7 +84,9 @@ def judge(rejected: float, jump: float, well: bool, **more) -> tuple:
     )
     used = jnp.array([False, False, True])
     off = imu_off(Imu(), AIDS)
-    trust, (left_out, follow) = judged(trust, used, off, PATIENCE, jnp.full(3, well))
+    trust, (left_out, follow) = judged(
+        trust, used, off, PATIENCE, jnp.full(3, well), jnp.full(3, cleared)
+    )
     return trust, bool(left_out[2]), bool(follow[2])
 
 
@@ -105,6 +108,25 @@ def test_a_sensor_comes_back_when_its_readings_pass_again():
     assert not left_out
     assert not follow
     assert trust.rejected[2] == 0
+
+
+def test_a_sensor_at_fault_is_followed_once_most_others_contradict_the_filter_too():
+    distrusted = {"distrusted": jnp.array([0.0, 0, 1])}
+    assert judge(PATIENCE, 0.7, well=False, **distrusted)[1:] == (True, False)
+    assert judge(PATIENCE, 0.7, well=False, cleared=True, **distrusted)[1:] == (False, True)
+
+
+def test_silent_sensors_vouch_for_nothing():
+    start = Trust.start(AIDS, jnp.dtype("float64"))
+    at = jnp.asarray(100.0)
+
+    def counted_others(accepted_at: list[float], rejected: list[float]) -> list[list[float]]:
+        trust = start._replace(accepted_at=jnp.array(accepted_at), rejected=jnp.array(rejected))
+        return [x.tolist() for x in others(trust, at, PATIENCE, 3.0)]
+
+    assert counted_others([99.0, 99, 99], [0.0, 0, 0]) == [[2, 2, 2], [0, 0, 0]]
+    assert counted_others([99.0, 90, 99], [0.0, 0, 0]) == [[1, 2, 1], [0, 0, 0]]
+    assert counted_others([90.0, 90, 99], [10.0, 10, 0]) == [[1, 1, 0], [1, 1, 2]]
 
 
 def test_noise_is_raised_by_the_mean_nis_and_not_by_chance():

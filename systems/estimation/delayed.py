@@ -16,29 +16,34 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 from scipy.stats import chi2
 
-from ...models import se3
 from ...models.config.checks import require
 from ...models.sensors import Imu, Sensor
-from . import error_state, inertial, measurement
+from . import error_state, inertial, measurement, recovery
 from .config import EkfConfig
 from .error_state import Navigation
 from .inertial import Motion, Samples
-from .state import FilterState, Readings
-from .trust import Shown, Trust, counted, imu_off, judged, pulls, sizes, suspected, with_doubt
+from .state import FilterState, Readings, health, status
+from .trust import (
+    Shown,
+    Trust,
+    counted,
+    imu_off,
+    judged,
+    others,
+    pulls,
+    sizes,
+    suspected,
+    with_doubt,
+)
 
 _SAMPLE = 7
 """Columns of a slot: has sample, force 3, mean rate 3 | has reading, values, for each sensor | rate
 at the end 3 | `inertial.LEFT_OPEN`."""
-_SINCE = 9  # components of `FilterState.since` that are sums
+_SINCE = 10  # components of `FilterState.since` that are sums
 _LONGEST = 0.1  # s: longest interval between predictions of the covariance
-_OBSERVED = {
-    "velocity": error_state.VELOCITY,
-    "position": error_state.POSITION,
-    "attitude": error_state.ROTATION,
-}
 
 
 class DelayedFilter(eqx.Module):
@@ -190,11 +195,6 @@ class DelayedFilter(eqx.Module):
         ring = jnp.concatenate(columns, axis=1)
         return state._replace(ring=ring[n:], samples=memory, shown=shown), ring[:n]
 
-    def _still(self, x: Navigation, omega: Float[Array, "3"]) -> Float[Array, "3"]:
-        """The specific force without bias that keeps v_B constant at angular rate ω."""
-        up = jnp.asarray((0.0, 0.0, self.imu.gravity), x.v_B.dtype)
-        return se3.rotate_inverse(x.X_WB, up) + se3.cross(omega, x.v_B)
-
     def move(
         self, state: FilterState, slots: Float[Array, "n row"], first: Float[Array, ""]
     ) -> tuple[FilterState, Float[Array, ""]]:
@@ -218,7 +218,7 @@ class DelayedFilter(eqx.Module):
             x, motion, since = given
             dt, values = slot
             force, omega = values[1:4] - x.accel_bias, values[4:_SAMPLE] - x.gyro_bias
-            still = self._still(x, omega)
+            still = error_state.held_force(x, omega, self.imu.gravity)
             force = jnp.where(values[open_] > 0, still, force)
             known = jnp.all(values[open_:] <= 0)
             motion = motion.after(force - still, omega, jnp.where(known, dt, 0))
@@ -227,7 +227,8 @@ class DelayedFilter(eqx.Module):
             x = error_state.apply(x, sample, self.imu.gravity)
             x = x._replace(sensors=decay * x.sensors)
             left_open = jnp.where(dt > 0, motion.variances(values[open_:]), 0)
-            gone = jnp.concatenate([dt[None], force * dt, omega * dt, left_open])
+            held = jnp.where(values[open_] > 0, dt, 0)[None]
+            gone = jnp.concatenate([dt[None], force * dt, omega * dt, held, left_open])
             return (x, motion, jnp.concatenate([since[:_SINCE] + gone, since[_SINCE:]])), None
 
         start = (state.nominal, state.motion, state.since)
@@ -241,34 +242,58 @@ class DelayedFilter(eqx.Module):
         x, trust = state.nominal, state.trust
         F, P = self._covariance(state, x, state.since[:_SINCE])
         rate = slot[self.rate_column : self.rate_column + 3]
+        x, P, F = recovery.levelled(
+            x,
+            P,
+            F,
+            slot[1:4] - x.accel_bias,
+            (slot[0] > 0) & (slot[self.rate_column + 3] <= 0),
+            rate - x.gyro_bias,
+            state.motion.usual[0],
+            self.imu.gravity,
+        )
         places = zip(self.aids, self.flags, strict=True)
         values = [slot[flag + 1 : flag + 1 + each.value_size] for each, flag in places]
+        turning = slot[self.rate_column + 3 + inertial.LEFT_OPEN // 2] > 0  # without a rate
+        between = state.samples.between(self.imu.integrating)
+        between = between + jnp.where(turning, state.motion.usual[1], 0) * jnp.eye(3)
         plain = [
-            measurement.innovation(each, i, x, rate, values[i]) for i, each in enumerate(self.aids)
+            measurement.innovation(each, i, x, rate, between, values[i])
+            for i, each in enumerate(self.aids)
         ]
-        factors = jnp.unstack(trust.noise_factor)
-        found = [each._replace(R=f * each.R) for each, f in zip(plain, factors, strict=True)]
         used = jnp.stack([slot[flag] > 0 for flag in self.flags])
         time = (k - self.slots) * self.period
 
         off = imu_off(self.imu, self.aids)
-        well = self._vouched_for(state, time)
-        trust, (left_out, follow) = judged(trust, used, off, self.config.patience, well)
-        for i, (each, sensor) in enumerate(zip(plain, self.aids, strict=True)):
-            # a followed sensor's quantity is as uncertain as its residual is large
-            part = _OBSERVED[str(sensor.observes)]
-            H, unknown = each.H[:, part], jnp.where(follow[i], each.residual**2, 0)
-            P = P.at[part, part].add(H.T @ (unknown[:, None] * H))
+        agree, against = others(trust, time, self.config.patience, self.config.silence)
+        well = (agree > against) & (state.samples.calm > self.config.silence)
+        trust, (left_out, follow) = judged(
+            trust, used, off, self.config.patience, well, against > agree
+        )
         gates = tuple(float(chi2.ppf(self.config.gate, size)) for size in sizes(self.aids))
-        together = measurement.together(plain)
-        S = together.H @ (P @ together.H.T) + together.R
-        plain_nis = measurement.normalized_squares(S, together.residual, sizes(self.aids))
+        limits = jnp.asarray(gates, P.dtype)
+        alone = jnp.stack([recovery.decides_alone(each, P) for each in plain])
+        nis = measurement.plain_nis(plain, P)[0]
+        torn = used & ~left_out & (trust.unconfirmed > 0) & (nis > limits)
+        age = jnp.maximum(time - trust.accepted_at, self.period)
+        for i, (each, sensor) in enumerate(zip(plain, self.aids, strict=True)):
+            marks = (torn[i], follow[i])
+            P = recovery.opened(P, x, sensor, each, *marks, age[i], self.imu.gravity)
+        found = [
+            each._replace(R=f * each.R + jnp.diag(jnp.where(mark, each.residual**2, 0)))
+            for each, f, mark in zip(
+                plain, jnp.unstack(trust.noise_factor), jnp.unstack(torn), strict=True
+            )
+        ]
+        plain_nis, together, S = measurement.plain_nis(plain, P)
         done = measurement.update(x, P, found, used & ~left_out, gates)
 
         innovations = (together.residual, jnp.sqrt(jnp.diag(S)))
         trust = counted(
             self.aids, trust, used, done.accepted, done.nis, plain_nis, gates, innovations, time
         )
+        unconfirmed = (alone | follow | torn).astype(P.dtype)
+        trust = trust._replace(unconfirmed=jnp.where(done.accepted, unconfirmed, trust.unconfirmed))
         pulled = pulls(self.aids, trust.pulled @ F.T, done, together, used)
         trust = suspected(
             self.aids,
@@ -288,65 +313,49 @@ class DelayedFilter(eqx.Module):
             trust=trust,
         )
 
-    def _vouched_for(self, state: FilterState, time: Float[Array, ""]) -> Bool[Array, "n"]:
-        """For each sensor, whether the IMU and another sensor are well."""
-        c, trust = self.config, state.trust
-        well = (time - trust.accepted_at <= c.silence) & (trust.distrusted < 1)
-        well = well & (trust.rejected < c.patience) & (trust.accepted_at > 0)
-        others = jnp.sum(well) - well.astype(int)
-        return (others > 0) & (state.samples.calm > c.silence)
-
     def covariance(self, state: FilterState) -> Float[Array, "e e"]:
         """P at the horizon."""
         return self._covariance(state, state.nominal, state.since[:_SINCE])[1]
 
     def _covariance(
-        self, state: FilterState, after: Navigation, gone: Float[Array, "9"]
+        self, state: FilterState, after: Navigation, gone: Float[Array, "10"]
     ) -> tuple[Float[Array, "e e"], Float[Array, "e e"]]:
         """F and P after an interval with the sums `gone` (as in `FilterState.since`)."""
         time = gone[0]
         some = jnp.maximum(time, self.period)
         before = state.nominal._replace(v_B=state.since[_SINCE:])
+        unmeasured = error_state.Unmeasured(*jnp.unstack(gone[7:]))
         F, Q = error_state.transition(
-            before, after, gone[1:4] / some, gone[4:7] / some, time, self._noisy_imu, self.aids
+            before,
+            after,
+            gone[1:4] / some,
+            gone[4:7] / some,
+            time,
+            self._noisy_imu,
+            self.aids,
+            unmeasured,
+            state.trust.imu_factor,
         )
-        moves = slice(0, error_state.VELOCITY.stop)
-        Q = Q.at[moves, moves].multiply(state.trust.imu_factor)
         P = F @ state.P @ F.T + Q
-        open_ = jnp.zeros_like(jnp.diag(P)).at[error_state.VELOCITY].set(gone[7])
-        P = P + jnp.diag(open_.at[error_state.ROTATION].set(gone[8]))
         if not self.imu.integrating:
             turn, force = state.samples.interpolation(self.period)
             P = P.at[error_state.ROTATION, error_state.ROTATION].add(time / self.period * turn)
             P = P.at[error_state.VELOCITY, error_state.VELOCITY].add(time / self.period * force)
         return F, (P + P.T) / 2
 
+    def _time(self, k: Float[Array, ""]) -> Float[Array, ""]:
+        """Time of the horizon (s) after `step` number k."""
+        return jnp.maximum(k - self.slots, 0) * self.period
+
     def status(self, state: FilterState, k: Float[Array, ""]) -> Float[Array, "_"]:
         """The status vector after `step` number k; see `status_names`."""
-        time = jnp.maximum(k - self.slots, 0) * self.period
-        age, trust = time - state.trust.accepted_at, state.trust
-        return jnp.concatenate([time[None], trust.nis, trust.rejected, age])
+        return status(state.trust, self._time(k))
 
     def health(
         self, state: FilterState, P: Float[Array, "e e"], k: Float[Array, ""]
     ) -> Float[Array, "_"]:
         """The health vector after `step` number k, for the covariance P that is shown."""
-        c, variance, trust = self.config, jnp.diag(P), state.trust
-        age = jnp.maximum(k - self.slots, 0) * self.period - trust.accepted_at
-        fit = (age <= c.silence) & (trust.rejected < c.patience) & (trust.distrusted < 1)
-        time = jnp.maximum(k - self.slots, 0) * self.period
-        fit = (
-            fit
-            & ~state.shown.stuck(self.aids)
-            & ~trust.suspect(time, c.silence)
-            & (trust.noise_factor <= 1)
-        )
-        imu = (state.samples.calm > 1) & (trust.imu_factor < 2)
-        fit = jnp.concatenate([imu[None], fit])
-        lost = jnp.any(variance[error_state.VELOCITY] > c.lost_velocity**2)
-        lost = lost | jnp.any(variance[error_state.ROTATION] > c.lost_attitude**2)
-        overall = jnp.where(lost, 2.0, jnp.where(jnp.all(fit), 0.0, 1.0))
-        return jnp.concatenate([overall[None].astype(P.dtype), fit.astype(P.dtype)])
+        return health(self.config, self.aids, state, P, self._time(k))
 
     def present(
         self, state: FilterState, ahead: float | Float[Array, ""]
@@ -361,14 +370,13 @@ class DelayedFilter(eqx.Module):
         time = ring[:, 0] * self.period
         open_ = ring[:, self.rate_column + 3 :]
         missing, left_open = open_[:, 0] > 0, jax.vmap(state.motion.variances)(open_)
-        still = self._still(x, jnp.zeros_like(x.v_B))[:, None]
+        still = error_state.held_force(x, jnp.zeros_like(x.v_B), self.imu.gravity)[:, None]
         force = jnp.where(missing[None], still, ring[:, 1:4].T - x.accel_bias[:, None])
         omega = ring[:, 4:7].T - x.gyro_bias[:, None]
         increment = error_state.chain_all(error_state.sample_increment(force, omega, time))
         now = error_state.apply(x, increment, self.imu.gravity)
-        waiting = jnp.concatenate(
-            [time[:, None], force.T * time[:, None], omega.T * time[:, None], left_open], 1
-        )
+        parts = [jnp.ones_like(force[:1]), force, omega, missing[None].astype(force.dtype)]
+        waiting = jnp.concatenate([(jnp.concatenate(parts) * time[None]).T, left_open], 1)
         _, P = self._covariance(state, now, state.since[:_SINCE] + jnp.sum(waiting, axis=0))
         foreseen = state.samples.foreseen - jnp.concatenate([x.accel_bias, x.gyro_bias])
         rate = foreseen[3:]

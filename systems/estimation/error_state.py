@@ -39,6 +39,17 @@ class Navigation(NamedTuple):
     sensors: Float[Array, "n"]
 
 
+class Unmeasured(NamedTuple):
+    """What an interval's missing inertial samples leave unknown."""
+
+    held: Float[Array, ""]
+    """Time for which v_B was held constant, as the force was missing (s)."""
+    velocity: Float[Array, ""]
+    """Variance of velocity (m²/s²)."""
+    angle: Float[Array, ""]
+    """Variance of angle (rad²)."""
+
+
 class Increment(NamedTuple):
     """Preintegrated samples of an interval T: rotation, position and velocity increments.
 
@@ -127,6 +138,12 @@ def apply(nominal: Navigation, increment: Increment, gravity: float) -> Navigati
     return nominal._replace(X_WB=X, v_B=v)
 
 
+def held_force(nominal: Navigation, omega: Float[Array, "3"], gravity: float) -> Float[Array, "3"]:
+    """The specific force without bias that keeps v_B constant at angular rate ω."""
+    up = -_gravity(nominal.X_WB, gravity)
+    return se3.rotate_inverse(nominal.X_WB, up) + se3.cross(omega, nominal.v_B)
+
+
 def _gravity(like: Array, gravity: float) -> Float[Array, "3"]:
     return jnp.asarray((0.0, 0.0, -gravity), like.dtype)
 
@@ -144,16 +161,26 @@ def transition(
     time: Float[Array, ""],
     imu: Imu,
     aids: Sequence[Sensor],
+    unmeasured: Unmeasured | None = None,
+    factor: float | Float[Array, ""] = 1.0,
 ) -> tuple[Float[Array, "e e"], Float[Array, "e e"]]:
     """F and Q of δ⁺ = F δ + noise over one sample (bias-free `force`, `rate`), first order in δ.
+
+    `factor` is that on the variances of the IMU's white noise.
 
     With φ = rate · time, A = exp(φ)ᵀ and J = J_r(φ):
 
         δθ⁺ = A δθ − T J δb_g
         δv⁺ = A δv − T (A v)^ J δb_g + T g_B⁺^ δθ⁺ − T δb_a
         δp⁺ = A (δp + T δv − T v^ δθ) − T²/2 (f^ δθ⁺ + δb_a).
+
+    While the force is missing v_B is held, whatever attitude and biases are: δv⁺ = δv + noise.
+    Readings of velocity then tell nothing of the attitude.
     """
     eye = jnp.eye(3, dtype=force.dtype)
+    nothing = jnp.zeros_like(time)
+    held, of_velocity, of_angle = unmeasured or (nothing, nothing, nothing)
+    m = jnp.clip(held / jnp.maximum(time, 1e-9), 0, 1)
     zero = jnp.zeros_like(eye)
     T = time
     W = skew(rate * T)
@@ -162,7 +189,7 @@ def transition(
     J = eye - W / 2 + W2 / 6
     g_B = se3.rotate_inverse(after.X_WB, _gravity(after.X_WB, imu.gravity))
     G, H = T * skew(g_B), -(T * T / 2) * skew(force)
-    C_v = -(skew(A @ before.v_B) + G) @ J
+    C_v = -(1 - m) * (skew(A @ before.v_B) + G) @ J
     C_p = -H @ J
     rho = decays(aids, T)
     rows = [
@@ -170,7 +197,9 @@ def transition(
             [A, H @ A - T * A @ skew(before.v_B), T * A, T * C_p, -(T * T / 2) * eye], 1
         ),
         jnp.concatenate([zero, A, zero, -T * J, zero], 1),
-        jnp.concatenate([zero, G @ A, A, T * C_v, -T * eye], 1),
+        jnp.concatenate(
+            [zero, (1 - m) * G @ A, (1 - m) * A + m * eye, T * C_v, -(1 - m) * T * eye], 1
+        ),
         jnp.concatenate([zero, zero, zero, eye, zero], 1),
         jnp.concatenate([zero, zero, zero, zero, eye], 1),
     ]
@@ -184,8 +213,9 @@ def transition(
     rest = jnp.zeros((6 + n, 3), force.dtype)
     N_g = jnp.concatenate([C_p, -J, C_v, rest])
     N_a = jnp.concatenate([-(T / 2) * eye, zero, -eye, rest])
-    s_g, s_a = imu.gyroscope_density**2 / 2, imu.accelerometer_density**2 / 2
-    Q = s_g * T * (N_g @ N_g.T) + s_a * T * (N_a @ N_a.T)
+    s_g = factor * imu.gyroscope_density**2 / 2
+    s_a = factor * imu.accelerometer_density**2 / 2
+    Q = (s_g * T + of_angle) * (N_g @ N_g.T) + (s_a * T + of_velocity) * (N_a @ N_a.T)
     # White noise over T has a mean and an independent first moment of variance T³ / 12. The moment
     # adds to position through the accelerometer and to velocity through the gyroscope and gravity.
     moment = T**3 / 12

@@ -92,6 +92,15 @@ class Samples(NamedTuple):
         """
         return self.bends[3:, 3:] * T**2 / 24, self.bends[:3, :3] * T**2 / 6
 
+    def between(self, integrating: bool) -> Float[Array, "3 3"]:
+        """Covariance of the rate at a sample's end, taken as the mean of the rows before and after.
+
+        For a Brownian rate of density σ², means over a period T have second differences of variance
+        σ² T, and the mean of two neighbouring means is σ² T / 6 from the rate between them. For
+        point samples the error is a quarter of their second difference.
+        """
+        return self.bends[3:, 3:] / (6 if integrating else 16)
+
 
 class Motion(NamedTuple):
     """Statistics of the vehicle's motion, for the covariance of a missing sample."""

@@ -25,9 +25,13 @@ def innovation(
     number: int,
     nominal: Navigation,
     rate: Float[Array, "3"],
+    rate_covariance: Float[Array, "3 3"],
     values: Float[Array, "m"],
 ) -> Innovation:
-    """The innovation of sensor `number`; `rate` is the gyroscope's, with its bias."""
+    """The innovation of sensor `number`; `rate` is the gyroscope's, with its bias.
+
+    `rate_covariance` is that of the rate between samples, without the bias.
+    """
     V = jnp.concatenate([nominal.v_B, rate - nominal.gyro_bias])
     slow = nominal.sensors[number : number + 1]
     found = sensor.innovation(nominal.X_WB, V, slow, values)
@@ -38,8 +42,10 @@ def innovation(
         H = H.at[:, GYRO_BIAS].set(-found.rate)
     if found.slow is not None:
         H = H.at[:, INERTIAL + number].set(found.slow)
-    variances = [std**2 for std in sensor.noise_std]
-    return Innovation(found.residual, H, jnp.diag(jnp.asarray(variances, V.dtype)))
+    R = jnp.diag(jnp.asarray([std**2 for std in sensor.noise_std], V.dtype))
+    if found.rate is not None:
+        R = R + found.rate @ rate_covariance @ found.rate.T
+    return Innovation(found.residual, H, R)
 
 
 def small_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
@@ -87,6 +93,15 @@ def normalized_squares(
         own = slice(end - size, end)
         scores.append(residual[own] @ small_inverse(S[own, own]) @ residual[own])
     return jnp.stack(scores)
+
+
+def plain_nis(
+    found: Sequence[Innovation], P: Float[Array, "e e"]
+) -> tuple[Float[Array, " n"], Innovation, Float[Array, "m m"]]:
+    """The NIS of each sensor; all innovations stacked, and their covariance S."""
+    joined = together(found)
+    S = joined.H @ (P @ joined.H.T) + joined.R
+    return normalized_squares(S, joined.residual, [each.residual.size for each in found]), joined, S
 
 
 class Update(NamedTuple):

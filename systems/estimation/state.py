@@ -1,4 +1,4 @@
-"""State and inputs of the delayed filter, and the names of its outputs."""
+"""State and inputs of the delayed filter, its status and health, and their names."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,6 +6,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ...models.sensors import Sensor
+from . import error_state
+from .config import EkfConfig
 from .error_state import Navigation
 from .inertial import Motion, Samples
 from .trust import Shown, Trust
@@ -17,9 +20,9 @@ class FilterState(NamedTuple):
     nominal: Navigation
     P: Float[Array, "e e"]
     ring: Float[Array, "slots row"]
-    since: Float[Array, "12"]
-    """Since the time of P: elapsed time, sums of force · dt and rate · dt, variances due to missing
-    forces and rates; and v_B at the time of P."""
+    since: Float[Array, "13"]
+    """Since the time of P: elapsed time, sums of force · dt and rate · dt, time without force,
+    variances due to missing forces and rates; and v_B at the time of P."""
     samples: Samples
     motion: Motion
     shown: Shown
@@ -57,3 +60,28 @@ def health_names(fused: Sequence[str]) -> tuple[str, ...]:
     0 good, 1 degraded, 2 lost; then 1 where a sensor is trusted.
     """
     return ("state", "imu", *fused)
+
+
+def status(trust: Trust, time: Float[Array, ""]) -> Float[Array, "_"]:
+    """The status vector of `status_names` at the horizon's time (s)."""
+    return jnp.concatenate([time[None], trust.nis, trust.rejected, time - trust.accepted_at])
+
+
+def health(
+    config: EkfConfig,
+    aids: Sequence[Sensor],
+    state: FilterState,
+    P: Float[Array, "e e"],
+    time: Float[Array, ""],
+) -> Float[Array, "_"]:
+    """The health vector of `health_names` at the horizon's time (s), for the shown covariance P."""
+    c, variance, trust = config, jnp.diag(P), state.trust
+    fit = (time - trust.accepted_at <= c.silence) & (trust.rejected < c.patience)
+    fit = fit & (trust.distrusted < 1) & (trust.noise_factor <= 1)
+    fit = fit & ~state.shown.stuck(aids) & ~trust.suspect(time, c.silence)
+    imu = (state.samples.calm > 1) & (trust.imu_factor < 2)
+    fit = jnp.concatenate([imu[None], fit])
+    lost = jnp.any(variance[error_state.VELOCITY] > c.lost_velocity**2)
+    lost = lost | jnp.any(variance[error_state.ROTATION] > c.lost_attitude**2)
+    overall = jnp.where(lost, 2.0, jnp.where(jnp.all(fit), 0.0, 1.0))
+    return jnp.concatenate([overall[None].astype(P.dtype), fit.astype(P.dtype)])

@@ -4,8 +4,9 @@ A reading that fails the gate is left out. After `patience` consecutive failures
 judged:
 
 - A sensor that *jumped* by more than the IMU can have drifted since its previous reading, while the
-  IMU and another sensor are healthy, is at fault. It is left out until `patience` readings in a row
-  pass the gate again.
+  IMU is healthy and more of the other sensors agree with the filter than do not, is at fault. It is
+  left out until `patience` readings in a row pass the gate again, or until more of the others
+  disagree with the filter than agree: then it is the filter that is wrong.
 - Otherwise filter and sensor drifted apart, and the faulty one cannot be identified: the sensor's
   readings are followed.
 
@@ -142,6 +143,8 @@ class Trust(NamedTuple):
     """When its values were last stuck (s)."""
     pulled: Float[Array, "n e"]
     """Error δ of the estimate without a sensor's readings relative to the one with them."""
+    unconfirmed: Float[Array, "n"]
+    """1 where the estimate rests on a sensor's last accepted reading alone."""
     imu_factor: Float[Array, ""]
     """Factor on the variances of the IMU's noises."""
 
@@ -151,7 +154,9 @@ class Trust(NamedTuple):
         n = len(aids)
         zero, one, never = jnp.zeros(n, dtype), jnp.ones(n, dtype), jnp.full(n, -1e9, dtype)
         mean, pulled = jnp.zeros(sum(sizes(aids)), dtype), jnp.zeros((n, INERTIAL + n), dtype)
-        return cls(zero, zero, zero, zero, zero, zero, one, mean, never, never, pulled, one[0])
+        return cls(
+            zero, zero, zero, zero, zero, zero, one, mean, never, never, pulled, zero, one[0]
+        )
 
     @property
     def _scattered(self) -> Bool[Array, "n"]:
@@ -180,6 +185,16 @@ def imu_off(imu: Imu, aids: Sequence[Sensor]) -> tuple[float, ...]:
     return tuple(bounds[str(each.observes)](each.rate) for each in aids)
 
 
+def others(
+    trust: Trust, time: Float[Array, ""], patience: int, silence: float
+) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """For each sensor, how many of the others agree with the filter and how many do not."""
+    against = (trust.rejected >= patience) | (trust.distrusted > 0)
+    agree = (time - trust.accepted_at <= silence) & (trust.accepted_at > 0) & ~against
+    for_, not_ = agree.astype(time.dtype), against.astype(time.dtype)
+    return for_.sum() - for_, not_.sum() - not_
+
+
 class Verdict(NamedTuple):
     """The judgement on the sensors before their readings are used."""
 
@@ -193,18 +208,22 @@ def judged(
     off: tuple[float, ...],
     patience: int,
     well: Bool[Array, "n"],
+    cleared: Bool[Array, "n"],
 ) -> tuple[Trust, Verdict]:
     """Before an update: which sensors to leave out and which to follow regardless of their NIS.
 
-    `used` says which readings came, `well` whether the IMU and another sensor are healthy.
+    `used` says which readings came, `well` whether the IMU and most other sensors are healthy,
+    `cleared` whether most other sensors disagree with the filter too.
     """
     dtype = trust.nis.dtype
-    back = (trust.distrusted > 0) & (trust.passed >= patience)
-    limit = used & (trust.rejected >= patience) & ~back
+    cleared = (trust.distrusted > 0) & cleared
+    back = (trust.distrusted > 0) & (trust.passed >= patience) | cleared
+    limit = used & (trust.rejected >= patience) & (~back | cleared)
     fault = limit & (trust.jump > jnp.asarray(off, dtype)) & well
     distrusted = (fault | (trust.distrusted > 0)) & ~back
     after = trust._replace(
-        distrusted=distrusted.astype(dtype), rejected=jnp.where(back, 0, trust.rejected)
+        distrusted=distrusted.astype(dtype),
+        rejected=jnp.where(back & ~limit, 0, trust.rejected),
     )
     return after, Verdict(distrusted, limit & ~distrusted)
 

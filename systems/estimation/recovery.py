@@ -1,0 +1,96 @@
+"""How the filter regains what it lost: the vertical after a gap in the rates, and a quantity that
+its sensor contradicts.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ...models import se3
+from ...models.sensors import Sensor
+from . import error_state, measurement
+from .error_state import Navigation
+from .measurement import Innovation
+
+OBSERVED = {
+    "velocity": error_state.VELOCITY,
+    "position": error_state.POSITION,
+    "attitude": error_state.ROTATION,
+}
+_ALONE = 9.0
+"""Ratio of a prediction's variance to a reading's above which the reading decides alone."""
+
+
+def levelled(
+    x: Navigation,
+    P: Float[Array, "e e"],
+    F: Float[Array, "e e"],
+    force: Float[Array, "3"],
+    measured: Bool[Array, ""],
+    omega: Float[Array, "3"],
+    usual: Float[Array, ""],
+    gravity: float,
+) -> tuple[Navigation, Float[Array, "e e"], Float[Array, "e e"]]:
+    """State, P and F after the accelerometer has shown where up is, if that was uncertain.
+
+    The `measured` force without bias is that which keeps v_B constant, apart from an acceleration
+    of the mean square `usual` (m²/s⁴). It is used where roll and pitch have twice the deviation
+    with which it shows them, as after a gap in the rates. A velocity shows them as well, but later
+    and by the sine of the tilt: with large errors a filter that is linear in them claims too much.
+    """
+    up_B = _up(x, gravity)
+    H = jnp.zeros((3, P.shape[0]), P.dtype)
+    H = H.at[:, error_state.ROTATION].set(error_state.skew(up_B))
+    H = H.at[:, error_state.VELOCITY].set(error_state.skew(omega))
+    uncertain = jnp.max(jnp.diag(H @ P @ H.T)) > 4 * usual
+
+    def level() -> tuple[Navigation, Array, Array]:
+        residual = force - error_state.held_force(x, omega, gravity)
+        found = Innovation(residual, H, usual * jnp.eye(3, dtype=P.dtype))
+        done = measurement.update(x, P, [found], jnp.ones(1, bool), [math.inf])
+        return done.nominal, done.P, F - done.gain @ (H @ F)
+
+    return jax.lax.cond(uncertain & measured, level, lambda: (x, P, F))
+
+
+def decides_alone(found: Innovation, P: Float[Array, "e e"]) -> Bool[Array, ""]:
+    """Whether a reading is so much better than the prediction that nothing confirms it."""
+    predicted = jnp.sum((found.H @ P) * found.H, axis=1)
+    return jnp.any(predicted > _ALONE * jnp.diag(found.R))
+
+
+def opened(
+    P: Float[Array, "e e"],
+    x: Navigation,
+    sensor: Sensor,
+    found: Innovation,
+    torn: Bool[Array, ""],
+    follow: Bool[Array, ""],
+    age: Float[Array, ""],
+    gravity: float,
+) -> Float[Array, "e e"]:
+    """P with the observed quantity as uncertain as the residual is large, if either mark is set.
+
+    A sensor that is to be followed contradicts the filter since its last accepted reading, `age`
+    (s) ago. The quantity then went wrong through its rate, which is as uncertain: a position
+    through velocity, a velocity through gravity along a wrong vertical. Where two readings are
+    `torn`, one of them is an outlier.
+    """
+    part = OBSERVED[str(sensor.observes)]
+    square = jnp.where(follow | torn, found.residual**2, 0)
+    H = found.H[:, part]
+    P = P.at[part, part].add(H.T @ (square[:, None] * H))
+    rates = jnp.where(follow, square, 0) / age**2
+    if sensor.observes == "position":
+        P = P.at[error_state.VELOCITY, error_state.VELOCITY].add(H.T @ (rates[:, None] * H))
+    elif sensor.observes == "velocity":
+        G = error_state.skew(_up(x, gravity) / gravity**2)
+        P = P.at[error_state.ROTATION, error_state.ROTATION].add(jnp.max(rates) * (G @ G.T))
+    return P
+
+
+def _up(x: Navigation, gravity: float) -> Float[Array, "3"]:
+    """The specific force at rest, in body axes."""
+    return se3.rotate_inverse(x.X_WB, jnp.asarray((0.0, 0.0, gravity), x.v_B.dtype))

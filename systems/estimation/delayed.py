@@ -385,7 +385,7 @@ class DelayedFilter(eqx.Module):
         P = P + self._foreseen(state, now, ahead)
         time = (state.samples.count - 1 - self.slots) * self.period
         P = with_doubt(P, state.trust.pulled, state.trust.suspect(time))
-        return now.X_WB, jnp.concatenate([now.v_B, rate]), P
+        return now.X_WB, jnp.concatenate([now.v_B, rate]), (P + P.T) / 2
 
     def _foreseen(
         self, state: FilterState, now: Navigation, ahead: float | Float[Array, ""]

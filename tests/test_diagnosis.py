@@ -13,6 +13,8 @@ from hidden.scenarios import Plan
 
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects import KINDS, Extended, Library
+from spinndrift.models.recordings.checks.finding import Finding as Checked
+from spinndrift.models.recordings.checks.finding import with_findings
 from spinndrift.models.recordings.csv import read_csv
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.se3 import AXES, CHANNELS
@@ -34,6 +36,7 @@ from spinndrift.training.diagnosis.findings.reported import following, noise_lev
 from spinndrift.training.diagnosis.findings.result import (
     AxisResidual,
     Cause,
+    DataFinding,
     Diagnosis,
     Support,
     schema,
@@ -611,7 +614,12 @@ def test_axes_that_are_not_driven_and_filled_samples_are_told(tmp_path):
 
     idle = draw(3, "null", plan=Plan(scenarios=2, runs=1, seconds=4.0, idle=(1,)))
     idle.write(tmp_path / "idle")
-    assert Diagnoser(read_csv(tmp_path / "idle"), VEHICLE).quiet == ["sway"]
+    recording = read_csv(tmp_path / "idle")
+    checked = Checked("axis-silent", "sway", "it does not answer", "drive it")
+    diagnoser = Diagnoser(Recording(with_findings(recording.dataset, [checked])), VEHICLE)
+    assert diagnoser.quiet == ["sway"]
+    (told,) = diagnoser.checked  # go into diagnosis.json
+    assert told == DataFinding("axis-silent", "note", "sway", "it does not answer", "drive it")
     case = draw(3, "null", plan=PLAN)
     assert problems(_read(tmp_path / "clean", case.logged())) == ([], [])
     faults = (("stuck", "stuck"), ("clock_jump", "clock"), ("outliers", "outliers"))

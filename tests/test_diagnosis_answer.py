@@ -106,6 +106,9 @@ def test_a_diagnosis_is_read_as_it_was_written(tmp_path):
     SAID.save(path)
     assert read_diagnosis(path) == SAID
     data = json.loads(path.read_text())
+    del data["data"]["findings"]  # older files lack them
+    path.write_text(json.dumps(data))
+    assert read_diagnosis(path) == SAID
     data["threshold"] = None
     path.write_text(json.dumps(data))
     assert np.isnan(read_diagnosis(path).threshold)

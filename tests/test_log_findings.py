@@ -71,7 +71,7 @@ def test_the_frame_that_the_autopilot_names_counts_where_the_parameter_is_missin
 def test_a_frame_that_was_changed_without_a_start_is_refused(tmp_path):
     """The motors of FRAME_CONFIG were not in force."""
     changed = named_frame(b"VECTORED_6DOF", {"FRAME_CONFIG": 1.0})
-    with pytest.raises(UserError, match="FRAME_CONFIG 1.*VECTORED, and the autopilot started as"):
+    with pytest.raises(UserError, match=r"FRAME_CONFIG 1.*VECTORED, and the autopilot started as"):
         imported(tmp_path, changed)
     same = named_frame(b"VECTORED", {"FRAME_CONFIG": 1.0})
     assert imported(tmp_path, same)[1] == []

@@ -12,6 +12,7 @@ from ...models.dynamics import Dynamics
 from ...models.effects.base import Effect
 from ...models.effects.extended import Extended
 from ...models.effects.library import Library
+from ...models.recordings.checks.finding import findings_of
 from ...models.recordings.store import Recording
 from ...models.se3 import AXES
 from ...models.vehicles.vehicle import Vehicle
@@ -96,6 +97,10 @@ class Diagnoser:
         self.furthest = 0.0
         self.report = progress
         self.faults, faulty = problems(recording)
+        self.checked = [
+            result.DataFinding(f.word, f.severity, f.place, f.text, f.remedy)
+            for f in findings_of(recording.dataset)
+        ]
         self.problem = DiagnosisProblem.of(recording, vehicle, base, faulty)
         require_enough(self.problem.data)
         if self.config.refit == "command":
@@ -218,6 +223,7 @@ class Diagnoser:
                 *(settled(kept, d.dt) if d.latent else []),
             ],
             noise=reported.noise_levels(problem, final),
+            findings=self.checked,
         )
 
     def _believed(self, problem: DiagnosisProblem) -> Evaluation:

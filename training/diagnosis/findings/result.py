@@ -215,6 +215,25 @@ class Ratio:
 
 
 @dataclass(frozen=True)
+class DataFinding:
+    """A finding of the checks that ran on the data before the diagnosis.
+
+    Attributes:
+        word: its kind, as in docs/checks.md.
+        severity: severe (accepted by name), cut (left out or set apart) or note.
+        place: file, stretch, seconds, column or parameter.
+        text: what it is.
+        remedy: what helps, if anything.
+    """
+
+    word: str
+    severity: Literal["severe", "cut", "note"]
+    place: str
+    text: str
+    remedy: str
+
+
+@dataclass(frozen=True)
 class DataSummary:
     """The data that were used, their faults, and what is not identifiable from them.
 
@@ -231,6 +250,7 @@ class DataSummary:
             estimator's pose (`slip_position` in m/√s, `slip_attitude` in rad/√s) where it slips,
             and the diffusion of the disturbance (`diffusion_surge`, sway, heave in N√s; roll,
             pitch, yaw in N·m√s).
+        findings: of the checks that every command runs on its data.
     """
 
     scenarios: list[str]
@@ -241,6 +261,7 @@ class DataSummary:
     problems: list[str]
     limits: list[str]
     noise: dict[str, float]
+    findings: list[DataFinding] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

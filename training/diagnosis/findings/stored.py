@@ -33,8 +33,8 @@ def _made(kind: Any, value: Any) -> Any:
     if dataclasses.is_dataclass(kind):
         hints = get_type_hints(kind)
         make: Any = kind
-        fields = [f.name for f in dataclasses.fields(kind)]
-        return make(**{name: _made(hints[name], value[name]) for name in fields})
+        names = [f.name for f in dataclasses.fields(kind) if f.name in value or not _optional(f)]
+        return make(**{name: _made(hints[name], value[name]) for name in names})
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is list:
         return [_made(arguments[0], one) for one in value]
@@ -51,3 +51,9 @@ def _made(kind: Any, value: Any) -> Any:
     if kind is float:
         return math.nan if value is None else float(value)
     return kind(value)
+
+
+def _optional(field: dataclasses.Field) -> bool:
+    """Whether a field has a default, as one that was added within a version."""
+    none = dataclasses.MISSING
+    return field.default is not none or field.default_factory is not none

@@ -469,7 +469,7 @@ def test_an_outlier_that_decided_alone_is_outvoted_by_the_next_two():
     start = se3.identity(jnp.float64)
     step, present = jax.jit(core.step), jax.jit(lambda state: core.present(state, core.period))
     still = jnp.array([0, 0, 9.80665, 0, 0, 0])
-    state, errors = core.init(start, jnp.zeros(6)), []
+    state, errors, v = core.init(start, jnp.zeros(6)), [], jnp.zeros(3)
     rng = np.random.default_rng(0)
     noise = 0.01 * rng.standard_normal((5, 3))
     for k in range(100):

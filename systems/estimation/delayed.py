@@ -272,9 +272,9 @@ class DelayedFilter(eqx.Module):
         )
         gates = tuple(float(chi2.ppf(self.config.gate, size)) for size in sizes(self.aids))
         limits = jnp.asarray(gates, P.dtype)
-        alone = jnp.stack([recovery.decides_alone(each, P) for each in plain])
-        nis = measurement.plain_nis(plain, P)[0]
-        torn = used & ~left_out & (trust.unconfirmed > 0) & (nis > limits)
+        predicted = recovery.unconfirmed(plain, P)
+        torn = recovery.contradict(plain, trust.unconfirmed, limits)
+        torn = torn & used & ~left_out & (measurement.plain_nis(plain, P)[0] > limits)
         age = jnp.maximum(time - trust.accepted_at, self.period)
         for i, (each, sensor) in enumerate(zip(plain, self.aids, strict=True)):
             marks = (torn[i], follow[i])
@@ -292,8 +292,7 @@ class DelayedFilter(eqx.Module):
         trust = counted(
             self.aids, trust, used, done.accepted, done.nis, plain_nis, gates, innovations, time
         )
-        unconfirmed = (alone | follow | torn).astype(P.dtype)
-        trust = trust._replace(unconfirmed=jnp.where(done.accepted, unconfirmed, trust.unconfirmed))
+        trust = trust._replace(unconfirmed=jnp.where(done.accepted, predicted, trust.unconfirmed))
         pulled = pulls(self.aids, trust.pulled @ F.T, done, together, used)
         trust = suspected(
             self.aids,

@@ -3,6 +3,7 @@ its sensor contradicts.
 """
 
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -55,10 +56,29 @@ def levelled(
     return jax.lax.cond(uncertain & measured, level, lambda: (x, P, F))
 
 
-def decides_alone(found: Innovation, P: Float[Array, "e e"]) -> Bool[Array, ""]:
-    """Whether a reading is so much better than the prediction that nothing confirms it."""
-    predicted = jnp.sum((found.H @ P) * found.H, axis=1)
-    return jnp.any(predicted > _ALONE * jnp.diag(found.R))
+def unconfirmed(found: Sequence[Innovation], P: Float[Array, "e e"]) -> Float[Array, "n"]:
+    """For each reading the variance with which it was predicted, if nothing confirms it; else 0.
+
+    Nothing does if the prediction is much worse than the reading, which then decides alone.
+    """
+    variances = [jnp.sum((each.H @ P) * each.H, axis=1) for each in found]
+    alone = [
+        jnp.any(v > _ALONE * jnp.diag(each.R)) for v, each in zip(variances, found, strict=True)
+    ]
+    return jnp.where(jnp.stack(alone), jnp.stack([v.max() for v in variances]), 0)
+
+
+def contradict(
+    found: Sequence[Innovation], before: Float[Array, "n"], limits: Float[Array, "n"]
+) -> Bool[Array, "n"]:
+    """For each reading whether it is as probable as the sensor's last, if nothing confirms that.
+
+    `before` are the variances with which those were predicted (`unconfirmed`). A reading that such
+    a prediction would have rejected, too, is an outlier.
+    """
+    squares = jnp.stack([jnp.sum(each.residual**2) for each in found])
+    noises = jnp.stack([jnp.max(jnp.diag(each.R)) for each in found])
+    return (before > 0) & (squares <= limits * (before + noises))
 
 
 def opened(

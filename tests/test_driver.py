@@ -14,11 +14,11 @@ from served_vehicle import Served
 
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.vehicles.vehicle import load_vehicle
-from spinndrift.systems.mavlink import telemetry
+from spinndrift.systems.mavlink import commands, telemetry
 from spinndrift.systems.mavlink.config import Mavlink
 from spinndrift.systems.mavlink.driver import Acted, Driver
 from spinndrift.systems.mavlink.link import Link
-from spinndrift.systems.mavlink.parameters import Parameters
+from spinndrift.systems.mavlink.parameters import Borrowed, Parameters, borrowed_file
 from spinndrift.systems.mavlink.transport import Connection
 
 WAYS = ("manual_control", "rc_override", "thruster_passthrough")
@@ -201,6 +201,20 @@ def test_a_killed_or_hung_process_leaves_no_thruster_running(port: int, how: sig
     process.wait(5.0)  # the guard has killed a process that hangs
     process.stdout.close()
     check_at_rest(port)
+
+
+def test_borrowed_parameters_belong_to_a_vehicle_and_not_to_its_address(served: Served):
+    """A flight that died is mended through another address, and on no other vehicle."""
+    port = served.ports[0]
+    died = Connection.parse(f"tcp:localhost:{port}")
+    with Link(died) as link:
+        number = commands.serial_number(link)
+        assert number == served.simulation.vehicle.serial_number.hex() + "0000"
+        Borrowed(Parameters(link), borrowed_file(died, number)).borrow({"FS_PILOT_TIMEOUT": 0.5})
+    assert borrowed_file(died, "another") != borrowed_file(died, number)
+    with connect(port) as driver:
+        assert driver.restore() == {"FS_PILOT_TIMEOUT": 3.0}
+    assert served.simulation.vehicle.parameters["FS_PILOT_TIMEOUT"] == 3.0
 
 
 def test_a_frame_that_is_not_the_scenarios_is_refused(port: int):

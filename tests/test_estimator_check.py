@@ -18,6 +18,7 @@ from spinndrift.sims.estimator_check.scores import (
     average_nis,
     score,
     stacked,
+    time_averages,
     within_three_sigma,
 )
 from spinndrift.sims.estimator_check.settings import (
@@ -61,6 +62,13 @@ def test_an_average_of_chi_square_values_is_within_its_bounds():
     some = Average.of(squares, 3)
     assert some.values.size == 1999
     assert some.values[5] == pytest.approx(squares[30:, 5].mean())
+
+
+def test_the_average_over_time_is_that_of_what_a_run_has():
+    squares = np.arange(18.0).reshape(2, 3, 3)
+    squares[0, 2], squares[1, :, 1] = np.nan, np.nan
+    found = time_averages({"nees": squares})
+    np.testing.assert_array_equal(found, [[1.5, 2.5, 3.5], [12.0, np.nan, 14.0]])
 
 
 def test_three_sigma_hold_what_they_say():

@@ -101,6 +101,13 @@ def average_nees(scores: Scores, block: int) -> Average:
     return Average.of(scores["nees"][:, :, block].astype(float), 3)
 
 
+def time_averages(scores: Scores) -> Float[np.ndarray, "runs 3"]:
+    """Average over time of each run's NEES; NaN for a run without any."""
+    squares = scores["nees"].astype(float)
+    counts = np.isfinite(squares).sum(axis=1)
+    return np.where(counts > 0, np.nansum(squares, axis=1) / np.maximum(counts, 1), np.nan)
+
+
 def average_nis(scores: Scores, sensor: str) -> Average:
     """NIS of a sensor's fused readings."""
     column = FUSED.index(sensor)

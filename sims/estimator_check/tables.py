@@ -9,7 +9,14 @@ from ..diagnosis_benchmark.tables import Table
 from ..run.estimate import BLOCKS, HEALTH, TRUSTED, average_bound
 from ..run.log import FUSED
 from .run import Result
-from .scores import FREEDOM, Average, average_nees, average_nis, within_three_sigma
+from .scores import (
+    FREEDOM,
+    Average,
+    average_nees,
+    average_nis,
+    time_averages,
+    within_three_sigma,
+)
 
 PROMISED = 0.95
 """Required share of runs whose final error lies within three estimated standard deviations."""
@@ -35,13 +42,22 @@ def _nees(results: Sequence[Result]) -> Table:
     caption = (
         f"NEES, average of {count} runs of {seconds:g} s: value at the end, range over time, share "
         f"of times inside the 95 % bounds {low:.2f} to {high:.2f}. A consistent filter has 3; "
-        f"values outside are bold. {good} of {len(results)} settings end with all three inside."
+        f"values outside are bold. {good} of {len(results)} settings end with all three inside. "
+        "Errors of one run last, so one time has no more than so many independent errors; after "
+        "the semicolon, the average over runs and time with one standard error over runs."
     )
     header = ("setting", *BLOCKS, "not finite")
     rows = []
-    for result, row in zip(results, averages, strict=True):
+    of_runs = [time_averages(r.scores) for r in results]
+    for result, row, each in zip(results, averages, of_runs, strict=True):
         cells = [_average(a, a.values[-1] if a.values.size else math.nan) for a in row]
-        rows.append((result.setting.words, *cells, _lost(result)))
+        means = [_with_error(each[:, i]) for i in range(3)]
+        joined = [f"{cell}; {mean}" for cell, mean in zip(cells, means, strict=True)]
+        rows.append((result.setting.words, *joined, _lost(result)))
+    if len(results) > 1:
+        together = np.concatenate(of_runs)
+        means = [_with_error(together[:, i]) for i in range(3)]
+        rows.append((f"all {len(together)} runs", *means, ""))
     return Table(caption, header, rows)
 
 
@@ -100,6 +116,14 @@ def _average(average: Average, value: float) -> str:
         return "–"
     ends = f"{_short(average.values.min())} to {_short(average.values.max())}"
     return f"{_marked(_short(value), average.holds(value))} ({ends}), {100 * average.share:.0f} %"
+
+
+def _with_error(values: np.ndarray) -> str:
+    """Mean and standard error of the finite ones."""
+    values = values[np.isfinite(values)]
+    if values.size < 2:
+        return "–"
+    return f"{values.mean():.2f} ± {values.std(ddof=1) / math.sqrt(values.size):.2f}"
 
 
 def _errors(result: Result, block: int, unit: float) -> str:

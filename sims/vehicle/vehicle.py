@@ -1,5 +1,6 @@
 """The vehicle as its links see it: an autopilot, its motion, its clock and its reboots."""
 
+import uuid
 from collections.abc import Mapping
 
 from ...systems.mavlink.dialect import Message
@@ -14,6 +15,7 @@ class Vehicle:
 
     `step` takes the time of the simulation; the autopilot's own begins anew with each boot. Its
     boot clock shows `clock` (s) at the boot, so that its 32 bits can be made to overflow at will.
+    `serial_number` (16 bytes) is no other vehicle's.
     """
 
     def __init__(self, parameters: Mapping[str, float | int] | None = None, clock: float = 0.0):
@@ -25,6 +27,7 @@ class Vehicle:
         self.parameters = Parameters(parameters)
         self.time = 0.0
         self.boots = 0
+        self.serial_number = uuid.uuid4().bytes
         self.origin: Place | None = None
         self.frozen_alt = 0.0
         self.broadcast: list[Message] = []

@@ -239,28 +239,8 @@ class DelayedFilter(eqx.Module):
         self, state: FilterState, slot: Float[Array, "row"], k: Float[Array, ""]
     ) -> FilterState:
         """Predict P and fuse the readings of the slot that left with sample number k."""
-        x, trust = state.nominal, state.trust
-        F, P = self._covariance(state, x, state.since[:_SINCE])
-        rate = slot[self.rate_column : self.rate_column + 3]
-        x, P, F = recovery.levelled(
-            x,
-            P,
-            F,
-            slot[1:4] - x.accel_bias,
-            (slot[0] > 0) & (slot[self.rate_column + 3] <= 0),
-            rate - x.gyro_bias,
-            state.motion.usual[0],
-            self.imu.gravity,
-        )
-        places = zip(self.aids, self.flags, strict=True)
-        values = [slot[flag + 1 : flag + 1 + each.value_size] for each, flag in places]
-        turning = slot[self.rate_column + 3 + inertial.LEFT_OPEN // 2] > 0  # without a rate
-        between = state.samples.between(self.imu.integrating)
-        between = between + jnp.where(turning, state.motion.usual[1], 0) * jnp.eye(3)
-        plain = [
-            measurement.innovation(each, i, x, rate, between, values[i])
-            for i, each in enumerate(self.aids)
-        ]
+        x, F, P = self._predicted(state, slot)
+        plain, trust = self._innovations(state, x, slot), state.trust
         used = jnp.stack([slot[flag] > 0 for flag in self.flags])
         time = (k - self.slots) * self.period
 
@@ -311,6 +291,39 @@ class DelayedFilter(eqx.Module):
             since=jnp.concatenate([jnp.zeros(_SINCE, P.dtype), done.nominal.v_B]),
             trust=trust,
         )
+
+    def _predicted(
+        self, state: FilterState, slot: Float[Array, "row"]
+    ) -> tuple[Navigation, Float[Array, "e e"], Float[Array, "e e"]]:
+        """State, F and P at the horizon, levelled where roll and pitch are uncertain."""
+        F, P = self._covariance(state, state.nominal, state.since[:_SINCE])
+        x = state.nominal
+        x, P, F = recovery.levelled(
+            x,
+            P,
+            F,
+            slot[1:4] - x.accel_bias,
+            (slot[0] > 0) & (slot[self.rate_column + 3] <= 0),
+            slot[self.rate_column : self.rate_column + 3] - x.gyro_bias,
+            state.motion.usual[0],
+            self.imu.gravity,
+        )
+        return x, F, P
+
+    def _innovations(
+        self, state: FilterState, x: Navigation, slot: Float[Array, "row"]
+    ) -> list[measurement.Innovation]:
+        """Those of a slot's readings at the sensors' configured noises."""
+        rate = slot[self.rate_column : self.rate_column + 3]
+        turning = slot[self.rate_column + 3 + inertial.LEFT_OPEN // 2] > 0  # without a rate
+        between = state.samples.between(self.imu.integrating)
+        between = between + jnp.where(turning, state.motion.usual[1], 0) * jnp.eye(3)
+        return [
+            measurement.innovation(
+                each, i, x, rate, between, slot[flag + 1 : flag + 1 + each.value_size]
+            )
+            for i, (each, flag) in enumerate(zip(self.aids, self.flags, strict=True))
+        ]
 
     def covariance(self, state: FilterState) -> Float[Array, "e e"]:
         """P at the horizon."""
@@ -381,18 +394,7 @@ class DelayedFilter(eqx.Module):
         rate = foreseen[3:]
         beyond = error_state.sample_increment(foreseen[:3], rate, ahead * ring[-1, 0])
         now = error_state.apply(now, beyond, self.imu.gravity)
-        P = P + self._foreseen(state, now, ahead)
+        P = P + error_state.foreseen_covariance(state.samples.steps, now.v_B, ahead, self.errors)
         time = (state.samples.count - 1 - self.slots) * self.period
         P = with_doubt(P, state.trust.pulled, state.trust.suspect(time))
         return now.X_WB, jnp.concatenate([now.v_B, rate]), (P + P.T) / 2
-
-    def _foreseen(
-        self, state: FilterState, now: Navigation, ahead: float | Float[Array, ""]
-    ) -> Float[Array, "e e"]:
-        """Covariance due to the error of the predicted mean force and rate over `ahead`."""
-        a = ahead * jnp.eye(3, dtype=state.P.dtype)
-        J = jnp.zeros((self.errors, 6), state.P.dtype)
-        J = J.at[error_state.POSITION, :3].set(ahead / 2 * a)
-        J = J.at[error_state.ROTATION, 3:].set(a).at[error_state.VELOCITY, :3].set(a)
-        J = J.at[error_state.VELOCITY, 3:].set(ahead * error_state.skew(now.v_B))
-        return J @ state.samples.steps @ J.T

@@ -203,25 +203,28 @@ def transition(
         jnp.concatenate([zero, zero, zero, eye, zero], 1),
         jnp.concatenate([zero, zero, zero, zero, eye], 1),
     ]
-    n, slow = len(aids), jnp.diag(jnp.stack(rho))
-    F = jnp.concatenate(
-        [
-            jnp.concatenate([jnp.concatenate(rows), jnp.zeros((INERTIAL, n), force.dtype)], 1),
-            jnp.concatenate([jnp.zeros((n, INERTIAL), force.dtype), slow], 1),
-        ]
-    )
-    rest = jnp.zeros((6 + n, 3), force.dtype)
+    F = jax.scipy.linalg.block_diag(jnp.concatenate(rows), jnp.diag(jnp.stack(rho)))
+    rest = jnp.zeros((6 + len(aids), 3), force.dtype)
     N_g = jnp.concatenate([C_p, -J, C_v, rest])
     N_a = jnp.concatenate([-(T / 2) * eye, zero, -eye, rest])
     s_g = factor * imu.gyroscope_density**2 / 2
     s_a = factor * imu.accelerometer_density**2 / 2
     Q = (s_g * T + of_angle) * (N_g @ N_g.T) + (s_a * T + of_velocity) * (N_a @ N_a.T)
-    # White noise over T has a mean and an independent first moment of variance T³ / 12. The moment
-    # adds to position through the accelerometer and to velocity through the gyroscope and gravity.
-    moment = T**3 / 12
-    Q = Q.at[POSITION, POSITION].add(s_a * moment * eye)
-    Q = Q.at[VELOCITY, VELOCITY].add(s_g * moment * (skew(g_B) @ skew(g_B).T))
-    return F, Q + jnp.diag(_walks(imu, aids, rho, T))
+    return F, Q + _moments(s_g, s_a, g_B, T, Q.shape[0]) + jnp.diag(_walks(imu, aids, rho, T))
+
+
+def _moments(
+    s_g: float | Array, s_a: float | Array, g_B: Float[Array, "3"], time: Array, size: int
+) -> Float[Array, "e e"]:
+    """What the first moments of white noise over a time (s) add to Q.
+
+    The noise has a mean and an independent first moment of variance T³ / 12. The moment adds to
+    position through the accelerometer and to velocity through the gyroscope and gravity.
+    """
+    moment = time**3 / 12
+    Q = jnp.zeros((size, size), g_B.dtype)
+    Q = Q.at[POSITION, POSITION].set(s_a * moment * jnp.eye(3, dtype=g_B.dtype))
+    return Q.at[VELOCITY, VELOCITY].set(s_g * moment * (skew(g_B) @ skew(g_B).T))
 
 
 def _walks(
@@ -238,6 +241,24 @@ def _walks(
     gyroscope = jnp.full(3, imu.gyroscope_walk**2, dtype) * time
     accelerometer = jnp.full(3, imu.accelerometer_walk**2, dtype) * time
     return jnp.concatenate([jnp.zeros(9, dtype), gyroscope, accelerometer, *slow])
+
+
+def foreseen_covariance(
+    steps: Float[Array, "6 6"],
+    v_B: Float[Array, "3"],
+    ahead: float | Float[Array, ""],
+    size: int,
+) -> Float[Array, "e e"]:
+    """Covariance due to the error of a predicted mean force and rate over `ahead` (s).
+
+    `steps` is the mean square of the errors of [force, rate].
+    """
+    a = ahead * jnp.eye(3, dtype=v_B.dtype)
+    J = jnp.zeros((size, 6), v_B.dtype)
+    J = J.at[POSITION, :3].set(ahead / 2 * a)
+    J = J.at[ROTATION, 3:].set(a).at[VELOCITY, :3].set(a)
+    J = J.at[VELOCITY, 3:].set(ahead * skew(v_B))
+    return J @ steps @ J.T
 
 
 def decays(aids: Sequence[Sensor], time: Float[Array, ""]) -> list[Float[Array, ""]]:

@@ -78,22 +78,7 @@ def wiring(
     Raises:
         UserError: the log's frame has another number of thrusters than the named vehicle.
     """
-    functions: dict[int, list[tuple[float, int]]] = {}
-    directions: list[tuple[float, int, int]] = []
-    reverse: dict[int, bool] = {}
-    frame = None
-    for p in parameters:
-        servo = re.fullmatch(r"SERVO([1-9]|[12][0-9]|3[0-2])_FUNCTION", p.name)
-        turned = re.fullmatch(r"SERVO([1-9]|[12][0-9]|3[0-2])_REVERSED", p.name)
-        motor = re.fullmatch(r"MOT_([1-8])_DIRECTION", p.name)
-        if servo:
-            functions.setdefault(int(servo[1]), []).append((p.t, round(p.value)))
-        elif motor:
-            directions.append((p.t, int(motor[1]), -1 if p.value < 0 else 1))
-        elif turned:
-            reverse[int(turned[1])] = p.value > 0
-        elif p.name == "FRAME_CONFIG":
-            frame = round(p.value)
+    functions, directions, reverse, frame = _parsed(parameters)
     motor_of = {
         channel: next((f - 32 for _, f in history if f in MOTOR_FUNCTIONS), None)
         for channel, history in sorted(functions.items())
@@ -123,6 +108,31 @@ def wiring(
         motors,
         turned,
     )
+
+
+def _parsed(
+    parameters: Sequence[Parameter],
+) -> tuple[
+    dict[int, list[tuple[float, int]]], list[tuple[float, int, int]], dict[int, bool], int | None
+]:
+    """Functions of outputs by time, directions of motors by time, reversed outputs, frame."""
+    functions: dict[int, list[tuple[float, int]]] = {}
+    directions: list[tuple[float, int, int]] = []
+    reverse: dict[int, bool] = {}
+    frame = None
+    for p in parameters:
+        servo = re.fullmatch(r"SERVO([1-9]|[12][0-9]|3[0-2])_FUNCTION", p.name)
+        turned = re.fullmatch(r"SERVO([1-9]|[12][0-9]|3[0-2])_REVERSED", p.name)
+        motor = re.fullmatch(r"MOT_([1-8])_DIRECTION", p.name)
+        if servo:
+            functions.setdefault(int(servo[1]), []).append((p.t, round(p.value)))
+        elif motor:
+            directions.append((p.t, int(motor[1]), -1 if p.value < 0 else 1))
+        elif turned:
+            reverse[int(turned[1])] = p.value > 0
+        elif p.name == "FRAME_CONFIG":
+            frame = round(p.value)
+    return functions, directions, reverse, frame
 
 
 def _mirrored(

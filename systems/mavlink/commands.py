@@ -53,6 +53,34 @@ def command(
     return None
 
 
+def serial_number(link: Link, timeout: float = 0.5, attempts: int = 4) -> str:
+    """The autopilot's serial number (`uid2` of AUTOPILOT_VERSION, or `uid`) in hexadecimal.
+
+    Empty if it does not answer or has none.
+
+    Raises:
+        UserError: there is no vehicle.
+    """
+    vehicle = link.find_vehicle()
+    number = float(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+    for attempt in range(attempts):
+        started = time.monotonic()
+        request = mavlink.MAV_CMD_REQUEST_MESSAGE
+        link.send(command_long(vehicle, request, number, attempt=attempt))
+        found = link.wait_for(
+            "AUTOPILOT_VERSION",
+            timeout,
+            lambda message: message.get_srcComponent() == vehicle.component,
+            started,
+        )
+        if found is not None:
+            long = bytes(found.message.uid2)
+            if any(long):
+                return long.hex()
+            return f"{found.message.uid:x}" if found.message.uid else ""
+    return ""
+
+
 def mode_of(heartbeat: Message) -> int:
     """The mode's number (`codec.MODES`)."""
     return int(heartbeat.custom_mode)

@@ -105,6 +105,7 @@ class Driver:
         self.link = Link(connection, system=config.system, record=record)
         try:
             self.vehicle = self.link.find_vehicle()
+            number = commands.serial_number(self.link)
             self._parameters = Parameters(self.link)
             self._read_vehicle()
             rates = _STREAMS | {"RAW_IMU": config.imu_rate}
@@ -113,7 +114,7 @@ class Driver:
         except BaseException:
             self.link.close()
             raise
-        self._borrowed = Borrowed(self._parameters, borrowed_file(connection))
+        self._borrowed = Borrowed(self._parameters, borrowed_file(connection, number))
         self._guard: Guard | None = None
         self.use(config)
         self._state: State | None = None

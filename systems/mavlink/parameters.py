@@ -220,7 +220,12 @@ class Borrowed:
         return former
 
 
-def borrowed_file(connection: Connection) -> Path:
-    """The file of borrowed parameters of the vehicle behind a connection."""
-    name = hashlib.sha256(str(connection).encode()).hexdigest()[:16]
+def borrowed_file(connection: Connection, serial_number: str = "") -> Path:
+    """The file of a vehicle's borrowed parameters, by its serial number.
+
+    A vehicle is found again behind another connection, and another one behind the same connection
+    does not get its values. One without a number is known by its connection.
+    """
+    key = serial_number or str(connection)
+    name = hashlib.sha256(key.encode()).hexdigest()[:16]
     return user_state_path("spinndrift") / f"borrowed-{name}.param"

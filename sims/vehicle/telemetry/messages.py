@@ -22,6 +22,7 @@ class State(Protocol):
     autopilot: Autopilot
     origin: Place | None
     frozen_alt: float
+    serial_number: bytes
 
     @property
     def motion(self) -> Motion: ...
@@ -244,10 +245,9 @@ def _battery(s: State) -> Message:
 
 
 def _version(s: State) -> Message:
-    del s
-    zero = [0] * 8
+    zero, number = [0] * 8, [*s.serial_number, 0, 0]
     return mavlink.MAVLink_autopilot_version_message(
-        _CAPABILITIES, _VERSION, 0, 0, 0, zero, zero, zero, 0, 0, 0
+        _CAPABILITIES, _VERSION, 0, 0, 0, zero, zero, zero, 0, 0, 0, number
     )
 
 

@@ -73,7 +73,9 @@ def in_library(effect):
     return theta
 
 
-@pytest.mark.parametrize("name", MEANS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "thruster_lag")) for n in MEANS]
+)
 def test_truths_in_published_definitions_are_what_was_simulated(folder, name):
     """A model with the parameters that truth.yaml tells forecasts what the true model does."""
     case = draw(31, names=(name,), plan=PLAN)

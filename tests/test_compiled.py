@@ -282,7 +282,15 @@ def test_a_planner_flies_as_in_drake():
     assert loop.timing.summary()["planner_median_ms"] is None  # it is not a step of its own
 
 
-@pytest.mark.parametrize("name", [n for n in scenario_names() if not n.endswith("_vehicle")])
+@pytest.mark.parametrize(
+    "name",
+    [
+        # test_every_scenario_flies has the others in Drake's loop
+        pytest.param(n, marks=[pytest.mark.slow] * ("pylon" in n and "calm" in n))
+        for n in scenario_names()
+        if not n.endswith("_vehicle")
+    ],
+)
 def test_every_shipped_scenario_is_one_loop(name):
     """All of its systems tell what they compute; tracing, not compiling, shows that it fits.
 

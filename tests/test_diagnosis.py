@@ -527,6 +527,7 @@ def test_single_precision_is_refused_with_a_remedy(tmp_path):
         Diagnoser(recording, VEHICLE)
 
 
+@pytest.mark.slow
 def test_a_swaying_mass_ahead_of_the_origin_is_seen_in_yaw(tmp_path):
     """The turning moment remembers the velocity to the side, and rings with the hidden spring."""
     from spinndrift.training.diagnosis.candidates.unknowns import screened
@@ -714,6 +715,7 @@ def _read(folder, runs):
     return read_csv(folder)
 
 
+@pytest.mark.slow
 def test_a_name_nested_in_another_keeps_the_data(tmp_path):
     """A tether can push up as buoyancy does, with six numbers more: the simple name is given."""
     _, recording = recorded(tmp_path, 12, names=("net_buoyancy",))
@@ -731,6 +733,7 @@ def test_a_name_nested_in_another_keeps_the_data(tmp_path):
     assert is_itself(problem.library, evaluation.theta, held)
 
 
+@pytest.mark.slow
 def test_simulated_states_without_noise_are_no_clock_that_is_off():
     """Of ten substeps a sample: the pose feels a push half a substep late."""
     config = GenerateConfig(

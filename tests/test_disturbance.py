@@ -230,11 +230,11 @@ def agrees(law, omega, direction, amplitude, within=0.15):
 @pytest.mark.parametrize(
     ("name", "size"),
     [
-        ("disturbance_impacts", 3.0),
+        ("disturbance_level", 3.0),
         *(
             pytest.param(f"disturbance_{name}", size, marks=pytest.mark.slow)
             for name, size in (
-                ("level", 3.0),
+                ("impacts", 3.0),
                 ("state_dependence", 3.0),
                 ("level", 1.0),
                 ("state_dependence", 1.0),

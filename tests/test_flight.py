@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 import threading
@@ -51,7 +50,7 @@ def port() -> Iterator[int]:
     found = re.search(r"tcpin:127.0.0.1:(\d+)", served.stderr.readline())
     assert found is not None
     yield int(found[1])
-    served.send_signal(signal.SIGINT)
+    served.terminate()  # a shell in the background has its children ignore SIGINT
     served.wait(30.0)
     served.stderr.close()
 

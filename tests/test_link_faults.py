@@ -17,7 +17,7 @@ from spinndrift.systems.mavlink.link import Link
 from spinndrift.systems.mavlink.parameters import Parameters
 from spinndrift.systems.mavlink.transport import Connection
 
-pytestmark = pytest.mark.parametrize("kind", ["tcp", "udp"])
+KINDS = ["tcp", "udp"]
 RATES = {"ATTITUDE_QUATERNION": 100.0, "SERVO_OUTPUT_RAW": 50.0, "RAW_IMU": 100.0}
 
 
@@ -49,6 +49,7 @@ def until(true: Callable[[], bool]) -> bool:
     return true()
 
 
+@pytest.mark.parametrize("kind", KINDS)
 def test_commands_get_through_and_the_counts_say_what_was_lost(kind: str, plant: Plant):
     faults = "{loss: 0.1, corruption: 0.05, reordering: 0.1, delay: 0.03, jitter: 0.02}"
     with linked(kind, plant, f"{{faults: {faults}}}") as (link, served):
@@ -69,6 +70,7 @@ def test_commands_get_through_and_the_counts_say_what_was_lost(kind: str, plant:
         commands.disarm(link)
 
 
+@pytest.mark.parametrize("kind", ["tcp", pytest.param("udp", marks=pytest.mark.slow)])
 def test_a_boot_in_mid_dive_begins_clock_counts_and_rates_anew(kind: str, plant: Plant):
     with linked(kind, plant, "{reboots: [6.0], clock: 2500.0}") as (link, served):
         assert not commands.request_rates(link, RATES)
@@ -99,6 +101,7 @@ def test_a_boot_in_mid_dive_begins_clock_counts_and_rates_anew(kind: str, plant:
         assert link.statistics().reboots == 1
 
 
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_clock_that_wraps_goes_on(kind: str, plant: Plant):
     start = MICROSECONDS_32 - 4.0
     with linked(kind, plant, f"{{clock: {start}}}") as (link, _):
@@ -118,6 +121,7 @@ def test_a_clock_that_wraps_goes_on(kind: str, plant: Plant):
         assert link.statistics().reboots == 0
 
 
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_stream_is_split_into_packets_whatever_its_chunks(kind: str):
     sender = Parser(1, 1)
     messages = [

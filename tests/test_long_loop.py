@@ -71,6 +71,7 @@ def looped(seconds: float, samples: int) -> list[Used]:
     return found
 
 
+@pytest.mark.slow
 def test_ten_seconds_hold_what_their_beginning_held():
     before = used()
     found = looped(10.0, 2)

@@ -64,6 +64,7 @@ def test_a_rollout_feels_them_as_a_wrench(model):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_white_noise_of_the_same_strength_strays_as_far_over_long_times(model):
     """Without drag's help: after 20 τ the impulse of both has the same variance within 5 %."""
     dt, T, n = 0.05, 800, 4000

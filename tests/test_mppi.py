@@ -416,7 +416,8 @@ def test_the_system_plans_from_its_ports_and_repeats_itself():
     assert figures["effective_samples"] == pytest.approx(12, rel=0.02)
 
 
-@pytest.mark.parametrize("threads", [pytest.param(1, marks=pytest.mark.slow), 7])
+@pytest.mark.slow
+@pytest.mark.parametrize("threads", [1, 7])
 def test_threads_change_nothing_but_the_time(threads):
     """120 sequences in 1 or 7 parts (of 18 and 17) give what one program gives for all."""
     noise = np.array([0.3, -1.2, 0.0, 2.5])

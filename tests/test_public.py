@@ -21,7 +21,7 @@ NAMES = """
     StationConfig make_station build_diagram seeded logged CompiledSimulator
     MppiConfig MppiImpedance Own OwnFilter Scenario load_scenario simulate
 """.split()  # noqa: SIM905 - grouped by topic
-SLOW = ("diagnose",)
+SLOW = ("diagnose", "CompiledSimulator")
 USED = {"np": np, "jax": jax, "dataclasses": dataclasses, "Path": Path, "Simulator": Simulator}
 
 

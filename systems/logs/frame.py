@@ -56,9 +56,12 @@ def firmware_findings(place: str, texts: Iterable[str]) -> list[Finding]:
 
 
 def frame_said(texts: Iterable[str]) -> int | None:
-    """FRAME_CONFIG of the frame that the autopilot names at its start, as in "Frame: VECTORED"."""
+    """FRAME_CONFIG of the frame that the autopilot named last, as in "Frame: VECTORED".
+
+    It does so at each start; parameters, too, count as they were last.
+    """
     numbers = {name: number for number, (name, _) in _FRAMES.items()}
-    for text in texts:
+    for text in reversed(list(texts)):
         found = _SAID.match(text.strip())
         if found is not None and found[1] in numbers:
             return numbers[found[1]]

@@ -162,5 +162,5 @@ def test_the_rate_between_samples_is_as_uncertain_as_is_said(integrating):
     bends = np.diff(rows if integrating else ends, 2, axis=1)
     start = Samples.start(jnp.zeros(3))
     steps = start.bends.at[3:, 3:].set(bends @ bends.T / bends.shape[1])
-    claimed = start._replace(bends=steps).between(integrating)
+    claimed = start._replace(bends=steps).rate_covariance(integrating)
     np.testing.assert_allclose(np.diag(claimed), (error**2).mean(axis=1), rtol=0.05)

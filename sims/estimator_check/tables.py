@@ -43,8 +43,8 @@ def _nees(results: Sequence[Result]) -> Table:
         f"NEES, average of {count} runs of {seconds:g} s: value at the end, range over time, share "
         f"of times inside the 95 % bounds {low:.2f} to {high:.2f}. A consistent filter has 3; "
         f"values outside are bold. {good} of {len(results)} settings end with all three inside. "
-        "Errors of one run last, so one time has no more than so many independent errors; after "
-        "the semicolon, the average over runs and time with one standard error over runs."
+        "Errors within a run are correlated in time: the value at one time averages over runs "
+        "alone. After the semicolon: average over runs and time, with its standard error over runs."
     )
     header = ("setting", *BLOCKS, "not finite")
     rows = []

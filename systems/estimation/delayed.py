@@ -253,16 +253,16 @@ class DelayedFilter(eqx.Module):
         gates = tuple(float(chi2.ppf(self.config.gate, size)) for size in sizes(self.aids))
         limits = jnp.asarray(gates, P.dtype)
         predicted = recovery.unconfirmed(plain, P)
-        torn = recovery.contradict(plain, trust.unconfirmed, limits)
-        torn = torn & used & ~left_out & (measurement.plain_nis(plain, P)[0] > limits)
+        conflict = recovery.contradict(plain, trust.unconfirmed, limits)
+        conflict = conflict & used & ~left_out & (measurement.plain_nis(plain, P)[0] > limits)
         age = jnp.maximum(time - trust.accepted_at, self.period)
         for i, (each, sensor) in enumerate(zip(plain, self.aids, strict=True)):
-            marks = (torn[i], follow[i])
+            marks = (conflict[i], follow[i])
             P = recovery.opened(P, x, sensor, each, *marks, age[i], self.imu.gravity)
         found = [
             each._replace(R=f * each.R + jnp.diag(jnp.where(mark, each.residual**2, 0)))
             for each, f, mark in zip(
-                plain, jnp.unstack(trust.noise_factor), jnp.unstack(torn), strict=True
+                plain, jnp.unstack(trust.noise_factor), jnp.unstack(conflict), strict=True
             )
         ]
         plain_nis, together, S = measurement.plain_nis(plain, P)
@@ -316,7 +316,7 @@ class DelayedFilter(eqx.Module):
         """Those of a slot's readings at the sensors' configured noises."""
         rate = slot[self.rate_column : self.rate_column + 3]
         turning = slot[self.rate_column + 3 + inertial.LEFT_OPEN // 2] > 0  # without a rate
-        between = state.samples.between(self.imu.integrating)
+        between = state.samples.rate_covariance(self.imu.integrating)
         between = between + jnp.where(turning, state.motion.usual[1], 0) * jnp.eye(3)
         return [
             measurement.innovation(

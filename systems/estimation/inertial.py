@@ -92,7 +92,7 @@ class Samples(NamedTuple):
         """
         return self.bends[3:, 3:] * T**2 / 24, self.bends[:3, :3] * T**2 / 6
 
-    def between(self, integrating: bool) -> Float[Array, "3 3"]:
+    def rate_covariance(self, integrating: bool) -> Float[Array, "3 3"]:
         """Covariance of the rate at a sample's end, taken as the mean of the rows before and after.
 
         For a Brownian rate of density σ², means over a period T have second differences of variance

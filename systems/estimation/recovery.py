@@ -15,7 +15,7 @@ from . import error_state, measurement
 from .error_state import Navigation
 from .measurement import Innovation
 
-OBSERVED = {
+_OBSERVED = {
     "velocity": error_state.VELOCITY,
     "position": error_state.POSITION,
     "attitude": error_state.ROTATION,
@@ -86,7 +86,7 @@ def opened(
     x: Navigation,
     sensor: Sensor,
     found: Innovation,
-    torn: Bool[Array, ""],
+    conflict: Bool[Array, ""],
     follow: Bool[Array, ""],
     age: Float[Array, ""],
     gravity: float,
@@ -96,10 +96,10 @@ def opened(
     A sensor that is to be followed contradicts the filter since its last accepted reading, `age`
     (s) ago. The quantity then went wrong through its rate, which is as uncertain: a position
     through velocity, a velocity through gravity along a wrong vertical. Where two readings are
-    `torn`, one of them is an outlier.
+    in `conflict`, one of them is an outlier.
     """
-    part = OBSERVED[str(sensor.observes)]
-    square = jnp.where(follow | torn, found.residual**2, 0)
+    part = _OBSERVED[str(sensor.observes)]
+    square = jnp.where(follow | conflict, found.residual**2, 0)
     H = found.H[:, part]
     P = P.at[part, part].add(H.T @ (square[:, None] * H))
     rates = jnp.where(follow, square, 0) / age**2

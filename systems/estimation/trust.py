@@ -144,7 +144,7 @@ class Trust(NamedTuple):
     pulled: Float[Array, "n e"]
     """Error δ of the estimate without a sensor's readings relative to the one with them."""
     unconfirmed: Float[Array, "n"]
-    """1 where the estimate rests on a sensor's last accepted reading alone."""
+    """Variance with which a sensor's last accepted reading was predicted, if it decided alone."""
     imu_factor: Float[Array, ""]
     """Factor on the variances of the IMU's noises."""
 

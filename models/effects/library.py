@@ -106,12 +106,22 @@ def register(kind: type[Effect]) -> type[Effect]:
     return kind
 
 
+PART = "#"
+"""Ends the name of an effect that acts in a part of the data: `thruster_gain#2`, the second one."""
+
+
+def whole(name: str) -> str:
+    """The name of a cause, wherever in the data it acts."""
+    return name.partition(PART)[0]
+
+
 def kind(name: str) -> type[Effect]:
     """The class of a cause; `unknown` stands for unmodelled structure.
 
     Raises:
         UserError: there is no such cause.
     """
+    name = whole(name)
     if name == Unknown.name:
         return Unknown
     if name in COEFFICIENTS:

@@ -96,7 +96,7 @@ def _add_causes(page: Page, d: Diagnosis) -> None:
         [
             (
                 c.name.replace("_", " "),
-                c.where,
+                c.place,
                 cause_values(c),
                 ", ".join(c.indistinguishable_from) or "–",
             )
@@ -106,7 +106,7 @@ def _add_causes(page: Page, d: Diagnosis) -> None:
     )
     page.table(
         [
-            (f"{c.name} ({c.where})", f"{c.evidence.heldout_gain:.0f}",
+            (f"{c.name} ({c.place})", f"{c.evidence.heldout_gain:.0f}",
              probability(c.evidence.p_value), _rivals(c))
             for c in d.causes
         ],
@@ -221,7 +221,7 @@ def checks(d: Diagnosis) -> list[str]:
     found += [f"**Left:** {one}" for one in d.left]
     found += [f"**No name:** {c.structure.description}" for c in d.causes if c.structure]
     found += [
-        f"**Open:** {c.name.replace('_', ' ')} ({c.where}) or {', '.join(c.indistinguishable_from)}"
+        f"**Open:** {c.name.replace('_', ' ')} ({c.place}) or {', '.join(c.indistinguishable_from)}"
         for c in d.causes
         if c.indistinguishable_from
     ]
@@ -230,7 +230,7 @@ def checks(d: Diagnosis) -> list[str]:
 
 def flights(d: Diagnosis) -> list[str]:
     """The next experiment of each cause, then what these data do not determine."""
-    found = [f"**{c.name.replace('_', ' ')} ({c.where}):** {c.next_experiment}" for c in d.causes]
+    found = [f"**{c.name.replace('_', ' ')} ({c.place}):** {c.next_experiment}" for c in d.causes]
     return found + [f"**Not determined by these data:** {limit}" for limit in d.data.limits]
 
 

@@ -137,7 +137,7 @@ def _replace(rng: Rng, file: Any, name: str) -> None:
         case 5:
             file.create_dataset(name, (0,) * len(shape), "f8", maxshape=(None,) * len(shape))
         case _:
-            if values.dtype.kind == "f":
+            if values.dtype.kind == "f" and shape:  # else it is gone
                 file.create_dataset(name, data=values[..., : max(values.shape[-1] - 1, 0)])
     for i, label in enumerate(scales):
         new = file.get(name)

@@ -94,6 +94,10 @@ class Effect:
         """Steady thrust (8, B) for commanded thrust u (8, B) and battery `volts` (B,)."""
         return u
 
+    def distort_at(self, u: np.ndarray, volts: np.ndarray, t: float) -> np.ndarray:
+        """The same at a time of the runs."""
+        return self.distort(u, volts)
+
     def load(self, thrust: np.ndarray, axial: np.ndarray) -> np.ndarray:
         """Thrust (8, B) at inflow speeds `axial` (8, B): the thruster's own, along its axis."""
         return thrust

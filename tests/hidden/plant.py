@@ -38,9 +38,9 @@ class Plant:
             size += effect.states
         self.size = size
 
-    def steady_thrust(self, u: np.ndarray, volts: np.ndarray) -> np.ndarray:
+    def steady_thrust(self, u: np.ndarray, volts: np.ndarray, t: float = 0.0) -> np.ndarray:
         for effect in self.effects:
-            u = effect.distort(u, volts)
+            u = effect.distort_at(u, volts, t)
         return u
 
     def follow(self, before: np.ndarray, u: np.ndarray, h: float) -> np.ndarray:

@@ -155,7 +155,7 @@ def simulate(
         held[i] = current
         taken[i] = plant.follow(taken[i - 1], current, h)
         u = delayed(taken, i, plant.delay, h)
-        steady = plant.steady_thrust(u, setup.voltage)
+        steady = plant.steady_thrust(u, setup.voltage, t)
         latents = {k: e.advance(latents[k], h, own[k]) for k, e in enumerate(plant.effects)}
         y = plant.knock(y, h, own)
         dW = np.sqrt(h / 2) * white.standard_normal((2, 6, B))

@@ -15,6 +15,7 @@ from .candidates.unknowns import (
     described_structure,
     find_structure,
 )
+from .changes.accept import with_changes
 from .disturbance.found import best_law, passing
 from .disturbance.laws import Law
 from .filter.problem import DiagnosisProblem, Evaluation
@@ -56,6 +57,8 @@ def find_causes(
     structures: dict[Hypothesis, result.Structure] = {}
     search, part = search_for(state.problem, nuisance), within(progress, 0.1, 0.5)
     state, problem, seen = _first_causes(state, search, part)
+    if not seen:
+        state, problem = _with_changes(state, search, part)
     for number in range(_MOST_UNKNOWN):
         progress(0.52 + 0.1 * number, "unmodelled structure")
         if seen is None:
@@ -73,6 +76,16 @@ def find_causes(
         state, seen = search.run(state, progress=part), None
         problem = state.problem
     return state, nuisance, structures
+
+
+def _with_changes(
+    state: Selection, search: Search, progress: Progress
+) -> tuple[Selection, DiagnosisProblem]:
+    """With causes that act in a part of the data, and any further ones that then pass."""
+    changed = with_changes(state, search)
+    if changed is not state:
+        changed = search.run(changed, progress=progress)
+    return changed, changed.problem
 
 
 def _first_causes(

@@ -91,7 +91,7 @@ class ChangeSearch(Search):
             return replace(state, dropped=state.dropped | {h}, proposal=None)
         p = min(1.0, math.exp(-self.scores[h]) * len(fits))
         state = state.at(seen, accepted=(*state.accepted, replace(choice, p_value=p)))
-        return self._backward(state)
+        return self.without_redundant(state)
 
     def _holds_up(self, state: Selection, h: Hypothesis, fit: Fit) -> bool:
         """Whether a change lies in its range, is one of the cause itself, and is no short time."""

@@ -60,6 +60,9 @@ class Data:
             recorded. These are latent: `filter.reference` fills them with a simulation.
         specific_force: of the accelerometer (m/s²), where velocities are latent (N + 1, 3, R).
         climb: vertical velocity in W (m/s), where w follows from it and the latent ones (N + 1, R).
+        began: time of each piece's first sample since the start of its run (s) (1, R).
+        started: time of day at which each piece's run started (s), if it was recorded (R,).
+        labels: of the runs, by scenario.
     """
 
     X: Float[np.ndarray, "M 7 R"]
@@ -79,6 +82,9 @@ class Data:
     unmeasured: tuple[str, ...] = ()
     specific_force: Float[np.ndarray, "M 3 R"] | None = None
     climb: Float[np.ndarray, "M R"] | None = None
+    began: Float[np.ndarray, "1 R"] | None = None
+    started: Float[np.ndarray, " R"] | None = None
+    labels: tuple[str, ...] = ()
 
     @property
     def measured(self) -> Float[np.ndarray, "12"]:
@@ -227,13 +233,13 @@ def make_data(
     if kept.sum() == 1:
         segment = min(segment, max(int(lengths.max()) // _BLOCKS, _LEAST))
     pieces: list[dict[str, np.ndarray]] = []
-    scenario, run, mean = [], [], recording.dt
+    scenario, run = [], []
     for number, (j, k) in enumerate(np.argwhere(kept).tolist()):
         length = int(lengths[j, k])
         times, V = recording.elapsed(j, k), data["V_WB_B"].to_numpy()[j, k, :length].copy()
         V[:, latent] = 0.0
         X = dead_reckoned(times, data["X_WB"].to_numpy()[j, k, :length], V)
-        of_run = X, V, thrust[j, k, :length], volts[j, k, :length], np.diff(times)
+        of_run = X, V, thrust[j, k, :length], volts[j, k, :length], times
         first = min(behind, int(_OF_A_RUN * (length - 1))) if remembered else 0
         sensors = {name: values[j, k, :length] for name, values in extra.items()}
         pieces += _cut(*of_run, sensors, first, segment, behind)
@@ -244,10 +250,7 @@ def make_data(
     _refuse_units(recording, vehicle, thrust)
     arrays = {name: _stack([piece[name] for piece in pieces]) for name in pieces[0]}
     weight = _weight(np.array([len(piece["u"]) for piece in pieces]))
-    if recording.uneven:
-        mean = float((arrays["step"] * weight).sum() / weight.sum())
-    else:
-        arrays["step"] = np.full(weight.shape, mean)
+    mean, arrays["step"] = _steps(recording, arrays["step"], weight)
     return Data(
         **arrays,
         weight=weight,
@@ -258,6 +261,37 @@ def make_data(
         command=recording.thrust_from,
         has_voltage="voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any()),
         unmeasured=unmeasured,
+        started=_started(recording, kept, run),
+        labels=_labels(recording, kept),
+    )
+
+
+def _steps(
+    recording: Recording, step: np.ndarray, weight: np.ndarray
+) -> tuple[float, Float[np.ndarray, "N R"]]:
+    """Mean step (s), and steps; all equal but for rounding where samples are on a grid."""
+    if recording.uneven:
+        return float((step * weight).sum() / weight.sum()), step
+    return recording.dt, np.full(weight.shape, recording.dt)
+
+
+def _started(
+    recording: Recording, kept: np.ndarray, run: Sequence[int]
+) -> Float[np.ndarray, " R"] | None:
+    """When each piece's run started (s); None where that is not known."""
+    if "start_time" not in recording.dataset:
+        return None
+    start = recording.dataset["start_time"].to_numpy()[kept]
+    known = np.isfinite(start).all() and len(np.unique(start)) == len(start)
+    return start[list(run)] if known else None
+
+
+def _labels(recording: Recording, kept: np.ndarray) -> tuple[str, ...]:
+    """A name of each run that is kept: its scenario, with its number there if there are several."""
+    several = (recording.lengths > 0).sum(axis=1) > 1
+    return tuple(
+        f"{recording.scenarios[j]}, run {k + 1}" if several[j] else str(recording.scenarios[j])
+        for j, k in np.argwhere(kept)
     )
 
 
@@ -305,10 +339,11 @@ def _sensors_of_latent(recording: Recording, latent: Sequence[int]) -> dict[str,
 
 
 def _cut(
-    X: np.ndarray, V: np.ndarray, u: np.ndarray, volts: np.ndarray, held: np.ndarray,
+    X: np.ndarray, V: np.ndarray, u: np.ndarray, volts: np.ndarray, times: np.ndarray,
     sensors: dict[str, np.ndarray], first: int, segment: int, behind: int,
 ) -> Iterator[dict[str, np.ndarray]]:  # fmt: skip
     """Pieces of a run from sample `first` on, with the commands of `behind` steps before each."""
+    held = np.diff(times)
     last = len(held)
     count = -(-(last - first) // segment)
     edges = np.linspace(first, last, count + 1).round().astype(int)
@@ -317,6 +352,7 @@ def _cut(
         yield {
             "X": X[a : b + 1], "V": V[a : b + 1], "u": u[a:b], "past": u[before],
             "past_step": held[before], "voltage": volts[a:b], "step": held[a:b],
+            "began": times[a : a + 1],
             **{name: values[a : b + 1] for name, values in sensors.items()},
         }  # fmt: skip
 

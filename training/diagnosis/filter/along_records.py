@@ -7,6 +7,7 @@ record, and again at later ones (`restart`); it advances by recorded steps under
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
@@ -21,6 +22,7 @@ from ....models.effects.extended import Extended, Random
 from ....models.effects.inertia import Inertia
 from ....models.effects.recent import Recent
 from ..data.arrays import Data
+from .varying import Gated, at_sample
 
 Out = TypeVar("Out")
 SUBSTEPS, LONGEST = 2, 0.0125
@@ -91,15 +93,26 @@ class State(NamedTuple):
 
 
 class AlongRecords(eqx.Module):
-    """A model as it moves along records, in `substeps` of each recorded step."""
+    """A model as it moves along records, in `substeps` of each recorded step.
+
+    Attributes:
+        changes: of its effects in parts of the records, for `at`.
+    """
 
     model: Extended
     inertia: Inertia
     substeps: int = eqx.field(static=True)
+    changes: tuple[Gated, ...] = ()
 
     @classmethod
-    def of(cls, model: Extended, substeps: int) -> "AlongRecords":
-        return cls(model, model.inertia(), substeps)
+    def of(cls, model: Extended, substeps: int, changes: tuple[Gated, ...] = ()) -> "AlongRecords":
+        return cls(model, model.inertia(), substeps, changes)
+
+    def at(self, number: Int[Array, ""] | int) -> "AlongRecords":
+        """With the effects as they are at a sample."""
+        if not self.changes:
+            return self
+        return replace(self, model=at_sample(self.model, self.changes, number))
 
     def init(self, records: Records, lanes: int | None = None) -> State:
         """At the first record, with settled actuators and under constant acceleration.

@@ -17,6 +17,7 @@ from ..data.arrays import Data
 from .along_records import AlongRecords, Records, State, Step, scan, substeps
 from .latent import levels, specific_force_errors
 from .transition import Latent
+from .varying import Gated, changes_of
 
 
 class Predictions(NamedTuple):
@@ -55,14 +56,19 @@ def difference(
 
 @eqx.filter_jit
 def _predict(
-    model: Extended, effects: Any, records: Records, count: int, measured: Array | None = None
+    model: Extended,
+    effects: Any,
+    records: Records,
+    count: int,
+    measured: Array | None = None,
+    changes: tuple[Gated, ...] = (),
 ) -> Predictions:
-    along = AlongRecords.of(model.with_effects(effects), count)
+    every = AlongRecords.of(model.with_effects(effects), count, changes)
     plain = model.with_effects(())
     rest = plain.inertia()
 
     def predicted(state: State, given: Step) -> tuple[State, Predictions]:
-        V = given.V
+        along, V = every.at(given.number), given.V
         if measured is not None:
             V = jnp.where(measured[6:, None] > 0, V, along.observe(state)[1])
         start = along.restart(state, given.X, V)
@@ -74,10 +80,11 @@ def _predict(
         recent = end.recent.keeping(end.V, slope)
         end = end._replace(recent=recent)
         latest = Recent(recent.bends[:1], recent.step[:1], end.V, slope)
-        error = difference(*along.observe(end), given.X_next, given.V_next)
+        read = every.at(given.number + 1).observe(end)
+        error = difference(*read, given.X_next, given.V_next)
         return end, Predictions(error, end.X, end.V, jacobian, latest, (start.X, start.V))
 
-    start, V = along.init(records), records.V[0]
+    start, V = every.at(0).init(records), records.V[0]
     first = start.recent.keeping(V, jnp.zeros((6, *V.shape), V.dtype))
     found = scan(predicted, start._replace(recent=first), records)
     return found._replace(first=first)
@@ -133,9 +140,11 @@ def _times(A: Float[Array, "n n R"], B: Float[Array, "n n R"]) -> Float[Array, "
 
 def predict(model: Extended, library: Library, theta: np.ndarray, data: Data) -> Predictions:
     """Predictions of all samples with the effects' values `theta`: (p,), or (p, R) by piece."""
-    effects = library.filled(theta.reshape(len(theta), -1))
+    theta = theta.reshape(len(theta), -1)
+    effects, changes = library.filled(theta), changes_of(library, theta)
     measured = jnp.asarray(data.measured) if data.latent else None
-    found = _predict(model, effects, Records.of(data), substeps(data.longest), measured)
+    count = substeps(data.longest)
+    found = _predict(model, effects, Records.of(data), count, measured, changes)
     found = found._replace(late=sum((e.pose_delay() for e in effects), np.zeros(6)))
     if not data.unmeasured:
         return found

@@ -28,6 +28,7 @@ from .noise import Noise, estimate
 from .reference import with_latent
 from .sensitivities import whitened_sensitivities
 from .transition import Transition
+from .varying import Part, widened
 
 _HALVINGS = 4
 """Steps that may fail before a fit ends."""
@@ -35,6 +36,8 @@ WILD = 1e3
 """Errors (m, rad, m/s, rad/s) and Jacobian entries beyond which a one-step prediction diverged."""
 _WORSE = 20.0
 """Nats of one-step likelihood that a step may lose: the filtered fit weighs errors differently."""
+_CONVERGED = 1.0
+"""Nats that a step may promise at the end of a fit: errors by run are large while runs differ."""
 _LIGHTEST = 0.1
 """Least share of the believed mass matrix, along any direction, that a step may leave."""
 
@@ -118,7 +121,13 @@ class DiagnosisProblem:
 
     def with_effect(self, effect: Effect) -> "DiagnosisProblem":
         """The problem with one more effect, zero in θ, appended to the library."""
-        library = Library([*self.library.effects, effect])
+        return self._with(widened(self.library, [effect]))
+
+    def with_part(self, part: Part) -> "DiagnosisProblem":
+        """The problem with an effect that changes in a part of the data, by zero in θ."""
+        return self._with(widened(self.library, parts=[part]))
+
+    def _with(self, library: Library) -> "DiagnosisProblem":
         old = [library.index(*_key(e)) for e in self.library.entries]
         theta = np.zeros(library.size)
         theta[old] = self.believed
@@ -259,7 +268,7 @@ class DiagnosisProblem:
             done += 1
             step = seen.evidence.step(chosen, low - theta[chosen], high - theta[chosen])
             theta[chosen] = self._stepped(theta, chosen, step, low, high)
-            if np.all(np.abs(step) < 0.15 * fit.errors + 1e-12):
+            if np.all(np.abs(step) < 0.15 * fit.errors + 1e-12) and fit.gain < _CONVERGED:
                 break
         if best is None:
             seen = self.evaluate(back, chosen, kalman)

@@ -20,6 +20,7 @@ from ..data.arrays import Data
 from .along_records import Records, settle
 from .innovations import Predictions
 from .kalman import Filter
+from .varying import Gated, at_sample, changes_of
 
 LANES, FEW, INSTRUMENTS = 28, 8, 18
 """Probes that one call of the compiled program evaluates in parallel, besides the base."""
@@ -43,20 +44,21 @@ def _whitened(
     instead: tuple[Array, Array] | None,
     lanes: int,
     instruments: bool,
+    changes: tuple[Gated, ...] = (),
 ) -> Float[Array, "L N12 R"]:
     """Whitened innovations of lane 0 (the base) and changes of them in the other lanes."""
-    model = model.with_effects(effects)
+    every = model.with_effects(effects)
     if not instruments:
-        single = _single((model, predictions, records, filters, instead))
-        model, predictions, records, filters, instead = single
-    first = predictions.first
-    predictions = predictions._replace(first=None)
+        single = _single((every, predictions, records, filters, instead, changes))
+        every, predictions, records, filters, instead, changes = single
+    first, predictions = predictions.first, predictions._replace(first=None)
     (X, V, u, voltage, step, past, past_step), (keep, whiten, weight) = records, filters
-    inertia = model.inertia()
+    inertia = every.inertia()
 
     def body(carry: Any, given: Any) -> Any:
         memory, nu, carried, recent = carry
-        p, X0, V0, command, volts, h, gap, white, exists, before = given
+        p, X0, V0, command, volts, h, gap, white, exists, before, number = given
+        model = at_sample(every, changes, number)
         dt = h[None, None]
         kept = through(gap, nu) + carried
         if instruments:
@@ -65,7 +67,7 @@ def _whitened(
             away = jnp.sum(p.jacobian[:, :, None] * away[None], axis=1)
             x, v = se3.retract(p.X[:, None], away[:6]), p.V[:, None] + away[6:]
             recent = recent.after(p.latest)
-            direct = _apart(model.observe(x, v, _wide(recent)))
+            direct = _apart(at_sample(every, changes, number + 1).observe(x, v, _wide(recent)))
             if instead is not None:  # an accelerometer and its bias have these places
                 direct = direct * (1 - instead[0]).at[:3].set(0.0)[:, None, None]
             moved = kept
@@ -88,11 +90,10 @@ def _whitened(
         return (memory, nu, carried, recent), through(white, nu) * exists[None, None]
 
     zero = jnp.zeros((12, lanes, V.shape[2]), V.dtype)
-    memory = () if instruments else settle(model, past[:, :, None], past_step[:, None, None])
-    start = (memory, zero, zero, first)
-    before = None if instead is None else instead[1]
-    xs = (predictions, X[:-1], V[:-1], u, voltage, step, keep, whiten, weight, before)
-    z = jax.lax.scan(body, start, xs)[1].astype(jnp.float32)
+    memory = () if instruments else settle(every, past[:, :, None], past_step[:, None, None])
+    xs = (predictions, X[:-1], V[:-1], u, voltage, step, keep, whiten, weight)
+    xs += (None if instead is None else instead[1], jnp.arange(len(u)))
+    z = jax.lax.scan(body, (memory, zero, zero, first), xs)[1].astype(jnp.float32)
     return jnp.moveaxis(z, 2, 0).reshape(lanes, -1, z.shape[3])
 
 
@@ -163,10 +164,10 @@ def whitened_sensitivities(
             some = rows[first : first + size]
             chunk = np.zeros((size + 1, library.size))
             chunk[1 : 1 + len(some)] = probes[some]
-            lanes = library.filled((theta + chunk).T[:, :, None])
-            effects = _of_family(lanes, believed, instruments)
+            by_lane = (theta + chunk).T[:, :, None]
+            effects = _of_family(library.filled(by_lane), believed, instruments)
             arguments = predictions, records, filters, instead, size + 1, instruments
-            call = _threads().submit(run, model, effects, *arguments)
+            call = _threads().submit(run, model, effects, *arguments, changes_of(library, by_lane))
             running.append((some, call))
             if len(running) > AHEAD:
                 collect()

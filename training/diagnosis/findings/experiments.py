@@ -28,6 +28,7 @@ from ..filter.kalman import judging_filter
 from ..filter.problem import WILD, DiagnosisProblem, Evaluation
 from ..filter.sensitivities import whitened_sensitivities
 from ..filter.transition import Transition
+from ..filter.varying import acting
 from ..selection.hypotheses import Evidence
 from ..selection.model_selection import Choice, Hypothesis, parameters_of
 from .maneuver_library import MANEUVERS, simulate_maneuvers
@@ -129,7 +130,8 @@ def _products_of_maneuvers(
     products: dict[str, np.ndarray] = {}
     minutes: dict[str, float] = {}
     for names, data in simulate_maneuvers(problem, final.theta):
-        p = predict(problem.model, problem.library, final.theta, data)
+        library = acting(problem.library, data)
+        p = predict(problem.model, library, final.theta, data)
         tame = (np.abs(np.asarray(p.jacobian)) < WILD).all(axis=(0, 1, 2))
         jacobian = np.where(tame, np.asarray(p.jacobian), 0.0)
         data = replace(data, weight=data.weight * tame)
@@ -138,7 +140,7 @@ def _products_of_maneuvers(
         steps = Transition.along(jacobian, data.weight, p.late, p.latent)
         kalman = judging_filter(final.noise, steps, inverse, data.dt, data.step, jacobian, p.latent)
         z = whitened_sensitivities(
-            problem.model, problem.library, final.theta, design.probes, data, p, kalman
+            problem.model, library, final.theta, design.probes, data, p, kalman
         )
         seconds = (data.step * data.weight).sum(axis=0)
         for r, (name, G) in enumerate(zip(names, there.scaled(gram(z)), strict=True)):

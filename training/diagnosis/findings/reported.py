@@ -8,7 +8,7 @@ import scipy.stats
 from jaxtyping import Float
 
 from ....models.effects.base import Effect
-from ....models.effects.library import kind
+from ....models.effects.library import kind, whole
 from ....models.effects.noise import DisturbanceColour, DisturbanceImpacts
 from ....models.effects.thrust import ThrustScale
 from ....models.effects.unknown import Unknown
@@ -18,6 +18,7 @@ from ..data.repeats import repeating
 from ..disturbance.estimator import colour_size, unit_responses
 from ..disturbance.laws import Law, estimated, run_constants
 from ..filter.problem import DiagnosisProblem, Evaluation
+from ..filter.varying import parts_of
 from ..selection.hypotheses import Fit
 from ..selection.model_selection import Choice, parameters_of
 from ..selection.state import Selection
@@ -86,12 +87,14 @@ def cause(
     structure: result.Structure | None = None,
 ) -> result.Cause:
     """A named cause; `joint` is the fit of all accepted parameters together."""
-    name, where = choice.hypothesis
+    full, where = choice.hypothesis
+    name = whole(full)
+    when = next((p.when for p in parts_of(problem.library) if p.name == full), None)
     rivals = [result.Rival(h[0], h[1], float(g)) for h, g in choice.rivals]
     return result.Cause(
         name=name,
         where=where,
-        parameters=values_of(problem, evaluation.theta, problem.library.at(name, where), joint)
+        parameters=values_of(problem, evaluation.theta, problem.library.at(full, where), joint)
         | _assumed(problem, name, where),
         evidence=result.Support(choice.p_value, choice.fit.heldout_gain),
         rivals=rivals,
@@ -101,6 +104,7 @@ def cause(
         next_experiment=experiment.text,
         experiments=experiment.nats,
         structure=structure,
+        when=when,
     )
 
 

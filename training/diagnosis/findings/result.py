@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ....models.files.atomic import atomic_path
+from .data_summary import DataFinding, DataSummary
 from .schema import described, plain, schema_of
 
-__all__ = ["described"]
+__all__ = ["DataFinding", "DataSummary", "described"]
 
 Verdict = Literal["adequate", "explained", "partly_explained", "unexplained"]
 VERSION = 5
@@ -94,6 +95,28 @@ class Structure:
 
 
 @dataclass(frozen=True)
+class When:
+    """The part of the data in which a cause acts.
+
+    Attributes:
+        kind: `window` within a run, `onwards` from a time to the end of the data, or `drift` from
+            none at the start of the data to all of it at their end.
+        first_run: run in which it begins, by scenario.
+        start: time in that run (s).
+        last_run: run in which it ends.
+        end: time in that run (s).
+        text: the same in words.
+    """
+
+    kind: Literal["window", "onwards", "drift"]
+    first_run: str
+    start: float
+    last_run: str
+    end: float
+    text: str
+
+
+@dataclass(frozen=True)
 class Cause:
     """One named cause.
 
@@ -110,6 +133,8 @@ class Cause:
             logarithm by which the standard error of what the rival can't explain shrinks; empty
             where maneuvers don't matter.
         structure: what is known of the structure of an `unknown`; null for a named cause.
+        when: the part of the data in which it acts; null for all of it. Parameters are then the
+            changes there, and those of a drift the changes at its end.
     """
 
     name: str
@@ -121,6 +146,12 @@ class Cause:
     next_experiment: str
     experiments: dict[str, float] = field(default_factory=dict)
     structure: Structure | None = None
+    when: When | None = None
+
+    @property
+    def place(self) -> str:
+        """Where it acts, and when if not always."""
+        return self.where if self.when is None else f"{self.where}, {self.when.text}"
 
 
 @dataclass(frozen=True)
@@ -212,56 +243,6 @@ class Ratio:
     where: str
     believed: float
     found: Value
-
-
-@dataclass(frozen=True)
-class DataFinding:
-    """A finding of the checks that ran on the data before the diagnosis.
-
-    Attributes:
-        word: its kind, as in docs/checks.md.
-        severity: severe (accepted by name), cut (left out or set apart) or note.
-        place: file, stretch, seconds, column or parameter.
-        text: what it is.
-        remedy: what helps, if anything.
-    """
-
-    word: str
-    severity: Literal["severe", "cut", "note"]
-    place: str
-    text: str
-    remedy: str
-
-
-@dataclass(frozen=True)
-class DataSummary:
-    """The data that were used, their faults, and what is not identifiable from them.
-
-    Attributes:
-        scenarios: names.
-        runs: how many were used.
-        seconds: total time that is predicted (s).
-        step: mean time between samples (s).
-        command: kind of commands: thruster_force, pwm or F_Bo_B.
-        problems: faults of the data, a sentence each.
-        limits: what is not identifiable from these data, a sentence each.
-        noise: estimated levels: standard deviations of the records, mean over axes (`position_m`,
-            `attitude_rad`, `velocity_m_s` in m/s, `rate_rad_s` in rad/s), the slip of an
-            estimator's pose (`slip_position` in m/√s, `slip_attitude` in rad/√s) where it slips,
-            and the diffusion of the disturbance (`diffusion_surge`, sway, heave in N√s; roll,
-            pitch, yaw in N·m√s).
-        findings: of the checks that every command runs on its data.
-    """
-
-    scenarios: list[str]
-    runs: int
-    seconds: float
-    step: float
-    command: str
-    problems: list[str]
-    limits: list[str]
-    noise: dict[str, float]
-    findings: list[DataFinding] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ def sentence(
     more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
     parts = [f"The data have faults: {problems[0]}{more}."] if problems else []
     parts += [coefficients] if coefficients else []
-    named = ", ".join(f"{c.name} ({c.where})" for c in causes if c.name != Unknown.name)
+    named = ", ".join(f"{c.name} ({c.place})" for c in causes if c.name != Unknown.name)
     subject = "your model, its coefficients refitted," if refitted else "your model"
     parts += [f"The data differ from {subject} by: {named}."] if named else []
     parts += [

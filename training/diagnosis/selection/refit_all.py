@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from ....models.effects.library import COEFFICIENTS, Entry, kind
+from ....models.effects.library import COEFFICIENTS, PART, Entry, kind
 from ....models.effects.traits import Group
 from ...least_squares import Damping, LocalModel, minimise
 from ..filter.gram import least_within
@@ -46,6 +46,8 @@ class Coefficient:
 def is_coefficient(entry: Entry, group: Group) -> bool:
     """Whether a parameter belongs to a group: of effects with a place `all`, only there."""
     cls = kind(entry.cause)
+    if PART in entry.cause:
+        return False
     return group in cls.refits and (entry.where == "all" or "all" not in cls.places_with(1))
 
 

@@ -131,7 +131,7 @@ class Search:
         if doubtful and not self._holds(state, seen, h):
             return replace(state, dropped=state.dropped | {h}, done=True)
         state = state.at(seen, accepted=(*state.accepted, replace(choice, p_value=p)))
-        state = self._backward(state)
+        state = self.without_redundant(state)
         return replace(state, redundant=state.redundant + 1 if h in state.dropped else 0)
 
     def propose(self, state: Selection) -> Selection:
@@ -310,7 +310,7 @@ class Search:
         ties = tuple(h for h in choice.ties if h != top)
         return Choice(top, fits[top], ties, others), theta
 
-    def _backward(self, state: Selection) -> Selection:
+    def without_redundant(self, state: Selection) -> Selection:
         """Drop causes that later ones have made redundant, and refit the rest."""
         problem, current = state.problem, state.current
         library, chosen = problem.library, parameters_of(problem.library, state.hypotheses)

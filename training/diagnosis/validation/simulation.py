@@ -17,6 +17,7 @@ from ....models.effects.inertia import Inertia, times
 from ..filter.along_records import AlongRecords, Records, State, Step, scan
 from ..filter.innovations import difference
 from ..filter.problem import DiagnosisProblem
+from ..filter.varying import Gated, changes_of
 from .blackbox import BlackBox
 
 _LONGEST = 0.02
@@ -71,7 +72,8 @@ def simulate(
     """
     data = problem.data
     every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))
-    effects = problem.library.filled(contender.theta[:, None, pieces])
+    theta = contender.theta[:, None, pieces]
+    effects, changes = problem.library.filled(theta), changes_of(problem.library, theta, pieces)
     used = tuple(e for e in effects if any((e.name, where) in kinds for where in e.places))
     box = contender.black_box
     if box is not None:
@@ -80,7 +82,7 @@ def simulate(
         problem.model, used, contender.random_effects, Records.of(data, pieces), box,
         (jnp.asarray(levels[0]), jnp.asarray(levels[1]), jnp.asarray(levels[2])),
         jax.random.key(seed), every,
-        math.ceil(data.longest / _LONGEST - 1e-6),
+        math.ceil(data.longest / _LONGEST - 1e-6), changes,
     )  # fmt: skip
     return Simulated(np.asarray(e), pieces, every)
 
@@ -139,9 +141,10 @@ def _errors(
     key: Array,
     every: int,
     count: int,
+    changes: tuple[Gated, ...] = (),
 ) -> Float[Array, "N 12 S R"]:
     """Recorded less simulated: lane 0 without noise, the others with it and that of the records."""
-    along = AlongRecords.of(model.with_effects(effects), count)
+    whole = AlongRecords.of(model.with_effects(effects), count, changes)
     S, R, dtype = 1 + SAMPLES, records.V.shape[2], records.V.dtype
     on = (jnp.arange(S)[None, :, None] > 0).astype(dtype)
     laws = model.with_effects(random_effects)
@@ -152,7 +155,7 @@ def _errors(
 
     def simulated(state: State, given: Step) -> tuple[State, Float[Array, "12 S R"]]:
         w = jax.random.normal(jax.random.fold_in(key, given.number), (noise.size, S, R), dtype)
-        restarts, push = given.number % every == 0, None
+        along, restarts, push = whole.at(given.number), given.number % every == 0, None
         state = along.restart(state, *noise.read(given.X, given.V, w[:12]), restarts)
         if box is not None:
             commands = in_all(given.command), in_all(given.before)
@@ -167,11 +170,11 @@ def _errors(
         root = jnp.sqrt(given.length)
         V = noise.diffused(along.inertia, state.V, root * w[12:18])
         state = state._replace(X=noise.slipped(state.X, root * w[-6:]), V=V)
-        read = noise.read(*along.observe(state), w[18:30])
+        read = noise.read(*whole.at(given.number + 1).observe(state), w[18:30])
         e = difference(*read, given.X_next, given.V_next)
         return state, e.astype(jnp.float32)
 
     records = records.in_lanes()
-    start = along.init(records, S)
+    start = whole.at(0).init(records, S)
     random = laws.simulation_state(in_all(records.u[0]))[1]
     return scan(simulated, start._replace(random=random), records)

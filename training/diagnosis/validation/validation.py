@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ....models.effects.library import whole
 from ....models.effects.noise import DisturbanceImpacts, DisturbanceStateDependence
 from ....models.se3 import AXES
 from ...evaluation.metrics import BANDS, order_statistics
@@ -122,8 +123,8 @@ def judge(
         problem = replace(problem, data=replace(data, V=V))
     kept = _spread(data.fold, _PIECES)
     levels = record[:, kept], diffusion[:, kept] * contender.white_share[:, None], slip[:, kept]
-    kinds = {problem.library.entries[i][:2] for i in in_use}
-    kinds |= {problem.library.entries[i][:2] for i in np.flatnonzero(np.any(theta != 0, axis=1))}
+    used = {*in_use, *np.flatnonzero(np.any(theta != 0, axis=1)).tolist()}
+    kinds = {(whole(e.cause), e.where) for e in (problem.library.entries[i] for i in used)}
     simulated = simulate(problem, contender, levels, kept, horizon, seed, kinds)
     return _judged(simulated, density + contender.law_gain, data, horizon)
 

@@ -1,0 +1,205 @@
+"""Acceptance of causes that act in a part of the data."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from ....models.effects.library import PART, kind, whole
+from ....models.effects.unknown import Unknown
+from ..disturbance.found import best_law
+from ..filter.problem import DiagnosisProblem, Evaluation
+from ..filter.sensitivities import whitened_sensitivities
+from ..filter.varying import Part, parts_of
+from ..selection.hypotheses import Design, Fit, is_curved, known_within
+from ..selection.model_selection import (
+    Choice,
+    Hypothesis,
+    acts_unseen,
+    admissible,
+    is_itself,
+    margin,
+    parameters_of,
+)
+from ..selection.search import Search, asks_for_commands
+from ..selection.state import OF_ESTIMATES, Selection
+from .gates import Session, Span
+from .scan import Change, Scan
+
+_MOST = 3
+"""Most parts: what changes more often is a random disturbance, or another cause."""
+_MORE = 0.15
+"""Share of a constant cause's gain that its change must win in addition."""
+_ELSEWHERE = 0.3
+"""Share of its gain that other causes may win in parts once it is accounted for: what is misfitted
+in many parts is not local. So much may be left to a law of the disturbance, too."""
+_REPEATED = 0.5
+"""Share of its gain that values from every other block must win on the rest: a knock acts in one
+of them."""
+_ROUNDS = 5
+"""Most fits of a part while its edges move."""
+_UNDECIDED = 1.0
+"""Nats within which edges of a part count as equally good."""
+
+
+def with_changes(state: Selection, search: Search) -> Selection:
+    """The selection with causes that act in a part of the data, if there are any.
+
+    Such a cause must win more than noise in the best of all parts tried, clearly more than the same
+    cause in all of the data, the same values in every other block, and leave little to other
+    causes in parts or to a law of the disturbance. Constant causes that it makes redundant are
+    dropped.
+    """
+    session = Session.of(state.problem.data)
+    found = state
+    for number in range(_MOST + 1):
+        change = _best(found, search, session)
+        if change is None:
+            break
+        if number == _MOST:
+            return state
+        wider = _accepted(found, search, session, change)
+        if wider is None:
+            break
+        found = wider
+    if found is state:
+        return state
+    if not found.current.noise.estimated:
+        before, left = (best_law(s.problem, s.current) for s in (state, found))
+        if left > max(_ELSEWHERE * before, state.threshold):
+            return state
+    return search.without_redundant(found)
+
+
+def _best(state: Selection, search: Search, session: Session) -> Change | None:
+    """The best change, if it passes all tests of innovations."""
+    problem, scan = state.problem, _scan(state, search, session)
+    gains = {c.hypothesis: c.fit.heldout_gain for c in state.accepted}
+    least = max(state.threshold, state.left_undescribed, margin(sum(gains.values(), 0.0)))
+    if state.current.noise.estimated:
+        least = max(least, OF_ESTIMATES * problem.data.steps)
+    change = scan.best(least)
+    if change is None or change.repeated < _REPEATED * change.gain:
+        return None
+    alone = scan.constant_gain(change.hypothesis)
+    if change.gain < max(_MORE * gains.get(change.hypothesis, 0.0), (1 + _MORE) * alone):
+        return None
+    other = scan.with_change(change).best(least, without=[change.hypothesis])
+    return None if other is not None and other.gain > _ELSEWHERE * change.gain else change
+
+
+def _scan(state: Selection, search: Search, session: Session) -> Scan:
+    """The search for changes with the causes found so far, and the coefficients, free."""
+    problem, library, theta = state.problem, state.problem.library, state.current.theta
+    candidates = {h: library.at(*h) for h in _candidates(problem, search)}
+    free = [*search.nuisance, *parameters_of(library, state.hypotheses)]
+    rows = list(dict.fromkeys([*free, *(i for own in candidates.values() for i in own)]))
+    design = Design.of(library, theta, rows)
+    first = [int(np.flatnonzero(design.owner == i)[0]) for i in rows]
+    z = _sensitivities(problem, state.current, design.probes[first])
+    scale = np.concatenate([[1.0], 1 / design.size[first]])
+    column = {i: 1 + k for k, i in enumerate(rows)}
+    prior = [1 / known_within(library.entries[i].parameter) ** 2 for i in rows]
+    return Scan(
+        session.at_steps(z).reshape(len(z), -1) * scale[:, None].astype(z.dtype),
+        session,
+        {h: [column[i] for i in own] for h, own in candidates.items()},
+        [column[i] for i in free],
+        np.array([0.0, *prior]),
+    )
+
+
+def _sensitivities(
+    problem: DiagnosisProblem, seen: Evaluation, probes: Float[np.ndarray, "k p"]
+) -> Float[np.ndarray, "m N12 R"]:
+    """Whitened innovations, and how probes change them."""
+    return whitened_sensitivities(
+        problem.model, problem.library, seen.theta, probes, problem.data, seen.predictions,
+        seen.kalman,
+    )  # fmt: skip
+
+
+def _candidates(problem: DiagnosisProblem, search: Search) -> list[Hypothesis]:
+    """Causes whose values may change from step to step: without a memory, and no inertia."""
+    library, found = problem.library, []
+    for name, where in library.hypotheses():
+        cls = kind(name)
+        lasting = cls.random or cls.timing or cls.absorber or cls.refit_only or name == Unknown.name
+        remembers = any(cls.acts(hook) for hook in ("inertia", "actuate", "feel"))
+        curved = any(is_curved(library, i) for i in library.at(name, where))
+        unseen = acts_unseen(where, problem.data.unseen)
+        if not (lasting or remembers or curved or unseen) and not asks_for_commands(
+            (name, where), search.quiet
+        ):
+            found.append((name, where))
+    return found
+
+
+def _accepted(
+    state: Selection, search: Search, session: Session, change: Change
+) -> Selection | None:
+    """The selection with a change, fitted with exact predictions; None if it is not admissible."""
+    name, where = change.hypothesis
+    number = 1 + sum(whole(part.name) == name for part in parts_of(state.problem.library))
+    hypothesis, span = (f"{name}{PART}{number}", where), change.span
+    problem, theta, seen, joint = _fitted(state, search, session, hypothesis, span)
+    for _ in range(_ROUNDS):
+        moved = _refined(problem, seen, session, hypothesis, span)
+        if moved == span:
+            break
+        fitted = _fitted(state, search, session, hypothesis, moved)
+        if fitted[0].loss_of(fitted[2]) > problem.loss_of(seen) + _UNDECIDED:
+            break  # an instrument that changes within a run jumps, which gains by step do not tell
+        span, (problem, theta, seen, joint) = moved, fitted
+    library, own = problem.library, problem.library.at(*hypothesis)
+    errors = np.array([joint.errors[joint.parameters.index(i)] for i in own])
+    fit = Fit(tuple(own), theta[own], {}, errors, change.gain, np.array([change.gain]), 1.0)
+    named = library, np.zeros_like(theta), fit
+    if not (admissible(*named) and is_itself(*named)):
+        return None
+    choice = Choice(hypothesis, fit, (), (), state.chance.beyond(change.worth))
+    found = state.at(problem.evaluate(theta), accepted=(*state.accepted, choice))
+    return replace(found, problem=problem)
+
+
+def _fitted(
+    state: Selection, search: Search, session: Session, hypothesis: Hypothesis, span: Span
+) -> tuple[DiagnosisProblem, Float[np.ndarray, " p"], Evaluation, Fit]:
+    """The problem with a cause in a part of the session, and a fit with exact predictions."""
+    data, before = state.problem.data, state.problem.library
+    gate = session.at_samples(session.gate(span), data)
+    lasts = session.ordered and span.last == len(session.run)
+    part = Part(*hypothesis, gate, float(lasts), session.when(span))
+    problem = state.problem.with_part(part)
+    free = [*search.nuisance, *parameters_of(problem.library, state.hypotheses)]
+    start = problem.moved(state.current.theta, before)
+    return problem, *problem.polish(start, [*problem.library.at(*hypothesis), *free], rounds=8)
+
+
+def _refined(
+    problem: DiagnosisProblem, seen: Evaluation, session: Session, h: Hypothesis, span: Span
+) -> Span:
+    """The shortest part, with its edges moved by up to a block each, of those that win most."""
+    if span.kind == "drift":
+        return span
+    library, (name, where) = problem.library, h
+    whole_session = library.at(whole(name), where)
+    probe = np.zeros((1, library.size))
+    probe[0, whole_session] = seen.theta[library.at(name, where)]
+    z = session.at_steps(_sensitivities(problem, seen, probe)).astype(float)
+    own, moved = z
+    inside = session.gate(span)[:, None]
+    without, with_it = own - inside * moved, own + (1 - inside) * moved
+    won = ((without**2).sum(axis=1) - (with_it**2).sum(axis=1)) / 2
+    block = int(np.diff(session.edges).max())
+    run = np.flatnonzero(session.run == session.run[span.first])
+    first, last = span.first, span.last
+    low, high = max(first - block, run[0]), min(first + block, last - 2)
+    if high > low:  # what the part wins from each start on
+        gains = np.cumsum(won[low : high + 1][::-1])[::-1]
+        first = low + int(np.flatnonzero(gains >= gains.max() - _UNDECIDED)[-1])
+    if span.kind == "window" and last <= run[-1]:
+        low, high = max(last - block, first + 2), min(last + block, run[-1] + 1)
+        gains = np.concatenate([[0.0], np.cumsum(won[low:high])])
+        last = low + int(np.flatnonzero(gains >= gains.max() - _UNDECIDED)[0])
+    return Span(span.kind, int(first), int(last))

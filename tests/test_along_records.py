@@ -64,6 +64,7 @@ def test_a_forecast_of_a_whole_run_is_a_free_simulation(commanded):
         np.testing.assert_allclose(a, b[parts - 1 :: parts], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_forecasts_from_its_own_records_are_the_same_motion(commanded):
     """Instruments that are late and wrong are undone at each restart, without noise exactly."""
     X, V = forecast(MODEL, commanded, STEPS)

@@ -53,7 +53,8 @@ def found(tmp_path, *effects, ordered=False):
     return with_changes(search.run(state), search)
 
 
-def test_a_thruster_that_is_fouled_for_seconds_is_found_with_its_time(tmp_path):
+@pytest.mark.slow
+def test_a_diagnosis_says_when_a_thruster_was_fouled(tmp_path):
     fouled = Episode(ThrusterGain(3, 0.4), within(RUNS, 7, 3.1, 6.4))
     d = diagnose(recorded(tmp_path, fouled), VEHICLE, config=DiagnoseConfig(refit="none")).diagnosis
     assert [(c.name, c.where) for c in d.causes] == [("thruster_gain", "3")]
@@ -69,6 +70,19 @@ def test_a_thruster_that_is_fouled_for_seconds_is_found_with_its_time(tmp_path):
     assert d.verdict == "explained"
 
 
+def test_a_thruster_that_is_fouled_for_seconds_is_found_in_its_part(tmp_path):
+    fouled = Episode(ThrusterGain(3, 0.4), within(RUNS, 7, 3.1, 6.4))
+    state = found(tmp_path, fouled)
+    assert state.hypotheses == [("thruster_gain#1", "3")]
+    (part,) = parts_of(state.problem.library)
+    assert part.when.first_run == part.when.last_run
+    assert part.when.start == pytest.approx(3.1, abs=0.3)
+    assert part.when.end == pytest.approx(6.4, abs=0.3)
+    assert part.final == 0.0
+    assert not state.problem.library.used(state.current.theta)  # it has ended
+
+
+@pytest.mark.slow
 def test_a_slow_leak_is_a_drift_of_the_buoyancy_over_the_session(tmp_path):
     course = session(RUNS, APART, lambda s: s / (APART * (RUNS - 1) + 8.0))
     state = found(tmp_path, Episode(NetBuoyancy(force=-4.0), course), ordered=True)
@@ -83,6 +97,7 @@ def test_a_slow_leak_is_a_drift_of_the_buoyancy_over_the_session(tmp_path):
     assert float(np.asarray(last.values).min()) == pytest.approx(state.current.theta[row])
 
 
+@pytest.mark.slow
 def test_a_compass_that_turns_between_two_runs_is_found_from_there_on(tmp_path):
     course = session(RUNS, APART, lambda s: (s > 5.5 * APART) * 1.0)
     state = found(tmp_path, Episode(HeadingError(constant=0.1), course), ordered=True)

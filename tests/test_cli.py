@@ -195,6 +195,7 @@ def test_pieces_too_short_to_train_on_are_told_with_the_remedy(generated, tmp_pa
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_train_resume_and_evaluate(generated, tmp_path, capsys, monkeypatch):
     settings, out = tmp_path / "tiny.yaml", tmp_path / "run"
     settings.write_text(yaml.dump(TINY))

@@ -154,6 +154,7 @@ def test_what_a_name_wins_exactly_is_likelihood(tmp_path):
     assert exact.heldout_gain > fit.heldout_gain
 
 
+@pytest.mark.slow
 def test_water_is_drawn_for_every_piece(problem_of):
     """Scenarios of unequal numbers of runs: none of their pieces is left out."""
     problem, _ = problem_of("current_varying", 1.0)

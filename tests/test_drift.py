@@ -67,6 +67,7 @@ def diagonal(model):
     return np.diag(np.asarray(model.coefficients(jnp.zeros(6, jnp.float32)).mass.matrix()))
 
 
+@pytest.mark.slow
 def test_what_the_data_tell_is_found(truth, windows):
     before = start()
     after = fit_drift(CONFIG, before, windows, 2)

@@ -48,6 +48,7 @@ def finding(problem, base, final):
     )
 
 
+@pytest.mark.slow
 def test_one_noise_is_a_models_own_where_both_have_the_same(problem):
     evaluation = problem.evaluate(problem.believed, [])
     z = in_one_noise(finding(problem, evaluation, evaluation)).base.z

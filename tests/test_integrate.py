@@ -234,6 +234,7 @@ def test_gradient_of_a_rollout_matches_finite_differences():
         assert float(slope[i]) == pytest.approx(float(central), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_of_a_thousand_long_windows_fit_in_two_gigabytes():
     """4 s at 20 Hz times 1000 samples through the networks, from the compiler's own accounting."""
     model = Spinn.create(SpinnConfig(), vehicle(jnp.float32), jax.random.key(6), jnp.float32)

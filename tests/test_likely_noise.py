@@ -170,6 +170,7 @@ def test_a_filter_of_ones_own_is_that_of_the_mean_where_all_jacobians_are_equal(
         np.testing.assert_allclose(mine, np.broadcast_to(all_, mine.shape), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "hidden",
     [

@@ -108,6 +108,7 @@ def test_the_option_may_leave_its_port_out(words: str, where: str | None):
     assert command.scenario == "station_keeping_calm"
 
 
+@pytest.mark.slow
 def test_a_simulation_shows_its_log_in_real_time(monkeypatch: pytest.MonkeyPatch):
     with LivePage("0") as page:
         shown, show = [], page.show

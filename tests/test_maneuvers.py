@@ -157,6 +157,7 @@ def test_without_a_horizontal_aid_place_and_drift_do_not_matter():
     assert Driven(None).until(Phase.OPEN_LOOP, far) == pytest.approx(0.3)
 
 
+@pytest.mark.slow
 def test_planned_maneuvers_stay_within_their_bounds_by_the_vehicles_model():
     bounds = Bounds((0.3, 4.0), (4.0, 3.0), 1.2)
     config = Maneuvers(repeats=1, duration=8.0, bounds=bounds)

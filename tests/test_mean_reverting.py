@@ -78,6 +78,7 @@ def test_white_noise_of_the_same_strength_strays_as_far_over_long_times(model):
     assert model.whitened().brownian_size == 6
 
 
+@pytest.mark.slow
 def test_training_can_move_them(model):
     """Samples' spread grows with the pushes, and its gradient reaches strength and time."""
     W, T = 4, 6

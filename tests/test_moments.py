@@ -218,6 +218,7 @@ def test_training_on_groups_resumes_to_the_same_bits(windows, tmp_path):
     assert np.isfinite(whole.metrics["loss"]).all()
 
 
+@pytest.mark.slow
 def test_a_group_with_broken_data_is_named_and_left_out(windows):
     V = windows.V.copy()
     V[3, 0, 24:48] = np.nan

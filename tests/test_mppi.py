@@ -230,6 +230,7 @@ def test_the_attitude_is_held_by_part_of_the_plans_own_wrench():
     np.testing.assert_allclose(plan.X_WB[:4, -1], [1, 0, 0, 0], atol=0.05)
 
 
+@pytest.mark.slow
 def test_in_a_current_a_held_attitude_keeps_sampled_vehicles_on_course():
     """Munk's moment turns a hull that makes way against a current; 4 s of wrenches can't help."""
     vehicle = load_vehicle("bluerov2_heavy")
@@ -276,6 +277,7 @@ def test_the_same_key_gives_the_same_plan_bit_for_bit_and_another_key_another():
     assert not np.array_equal(plans[0].F_Bo_B, plans[2].F_Bo_B)
 
 
+@pytest.mark.slow
 def test_process_noise_makes_the_plan_keep_its_distance():
     """The chance constraint turns noise into room: the same problem with and without noise."""
 

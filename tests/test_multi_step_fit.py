@@ -51,6 +51,7 @@ def rows_of(problem, *names):
     return [i for name in names for i in problem.library.at(*name)]
 
 
+@pytest.mark.slow
 def test_gains_and_drag_come_back_from_forecasts():
     """Noise-free data, the integrator's step that of the truth: to the end of Gauss–Newton."""
     truth = (

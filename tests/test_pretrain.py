@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import pytest
 
 from spinndrift.models.euclidean import create_spinn
 from spinndrift.models.vehicles.vehicle import load_vehicle
@@ -11,6 +12,7 @@ from spinndrift.training.fitting.pretrain import _attitudes, _potential_error, f
 REFERENCE = load_vehicle("bluerov2_heavy").dynamics(dtype=jnp.float32)
 
 
+@pytest.mark.slow
 def test_a_potential_follows_its_target():
     config, key = TrainingConfig(), jax.random.key(0)
     first = create_spinn(config.model, REFERENCE, key, jnp.float32)

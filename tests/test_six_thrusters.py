@@ -113,6 +113,7 @@ FIVE = """
 """
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_cannot_sway_says_so(tmp_path, capsys):
     """Five thrusters, two of them ahead and three upright."""
     text = dump(VEHICLE)

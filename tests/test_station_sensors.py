@@ -95,6 +95,7 @@ def test_a_cheat_is_named_so_and_hardware_has_none(hardware):
     assert sum(name.endswith("_cheat") for name in outputs) == (0 if hardware else 4)
 
 
+@pytest.mark.slow
 def test_a_position_fix_from_outside_the_package_is_fused(text):
     """Of n fixes of σ: horizontal position, unknown to 0.5 m, is known to between σ/√n and σ."""
     station = loads(StationConfig, text)

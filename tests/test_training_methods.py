@@ -134,6 +134,7 @@ def test_distance_aware_objectives_need_their_diffusion(objective, windows):
         objective.build(model, windows)
 
 
+@pytest.mark.slow
 def test_matching_hears_correlations_of_the_noise(windows):
     """The score of samples is best at the true correlation of sway and yaw, not at none."""
     config = small("fdm-geodesic")

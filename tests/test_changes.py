@@ -16,8 +16,8 @@ from spinndrift.models.effects import KINDS, Library
 from spinndrift.models.recordings.csv import read_csv
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.diagnosis.changes.accept import with_changes
-from spinndrift.training.diagnosis.changes.gates import Session, Span
 from spinndrift.training.diagnosis.changes.scan import Scan
+from spinndrift.training.diagnosis.changes.session import Session, Span
 from spinndrift.training.diagnosis.filter.innovations import predict
 from spinndrift.training.diagnosis.filter.varying import Part, VaryingLibrary, parts_of
 from spinndrift.training.diagnosis.findings.result import When
@@ -107,7 +107,7 @@ def test_a_compass_that_turns_between_two_runs_is_found_from_there_on(tmp_path):
     assert part.when.start < 1.5
     started_at = state.problem.data.started
     assert started_at is not None
-    assert np.array_equal(part.gate[0] > 0, started_at > 5.5 * APART)
+    assert np.array_equal(part.envelope[0] > 0, started_at > 5.5 * APART)
     offset = state.problem.library.index("heading_error#1", "all", "offset")
     assert state.current.theta[offset] == pytest.approx(0.1, abs=0.01)
 
@@ -118,15 +118,16 @@ def test_what_does_not_change_is_not_found_in_parts(tmp_path, effects):
     assert state.hypotheses == [("thruster_gain", "3")] * len(effects)
 
 
-def test_a_gate_of_one_is_the_effect_itself_and_of_zero_none(tmp_path):
+def test_an_envelope_of_one_is_the_effect_itself_and_of_zero_none(tmp_path):
     problem = started(recorded(tmp_path)).problem
     data = problem.data
     M, R = data.weight.shape[0] + 1, data.weight.shape[1]
     for name, where, value in (("thruster_gain", "3", -0.4), ("dvl_scale", "all", 0.1)):
-        gates = np.ones((M, R)), np.zeros((M, R)), np.repeat(np.arange(R) % 2.0, M).reshape(R, M).T
+        every_other = np.broadcast_to(np.arange(R) % 2.0, (M, R))
+        envelopes = np.ones((M, R)), np.zeros((M, R)), every_other
         errors = []
-        for gate in gates:
-            own = problem.with_part(Part(f"{name}#1", where, gate, 0.0, WHEN))
+        for envelope in envelopes:
+            own = problem.with_part(Part(f"{name}#1", where, envelope, 0.0, WHEN))
             theta = own.believed.copy()
             theta[own.library.at(f"{name}#1", where)] = value
             errors.append(own.errors(theta))
@@ -143,9 +144,9 @@ def test_a_gate_of_one_is_the_effect_itself_and_of_zero_none(tmp_path):
 def test_sensitivities_to_a_part_are_those_of_differences(tmp_path):
     problem = started(recorded(tmp_path)).problem
     M, R = problem.data.weight.shape[0] + 1, problem.data.weight.shape[1]
-    gate = np.zeros((M, R))
-    gate[40:90, 2] = 1.0
-    problem = problem.with_part(Part("net_buoyancy#1", "all", gate, 0.0, WHEN))
+    envelope = np.zeros((M, R))
+    envelope[40:90, 2] = 1.0
+    problem = problem.with_part(Part("net_buoyancy#1", "all", envelope, 0.0, WHEN))
     (row,) = problem.library.at("net_buoyancy#1", "all")
     at = problem.evaluate(problem.believed, [row])
     moved = problem.believed.copy()
@@ -158,7 +159,7 @@ def test_sensitivities_to_a_part_are_those_of_differences(tmp_path):
     V = predict(problem.model, problem.library, moved, problem.data).V
     still = predict(problem.model, problem.library, problem.believed, problem.data).V
     changed = np.abs(np.asarray(V) - np.asarray(still)).max(axis=1) > 1e-9
-    assert np.array_equal(changed, gate[:-1] > 0)
+    assert np.array_equal(changed, envelope[:-1] > 0)
 
 
 def test_gains_of_parts_are_those_of_least_squares(tmp_path):
@@ -168,7 +169,7 @@ def test_gains_of_parts_are_those_of_least_squares(tmp_path):
     z = rng.standard_normal((6, 12 * len(steps.run)))
     scan = Scan(z, steps, {("a", "all"): [1, 2], ("b", "all"): [3]}, [4, 5], np.full(6, 1e-9))
     own = scan.of(("a", "all"))
-    gate = np.repeat(steps.gate(own.span), 12)
+    envelope = np.repeat(steps.envelope(own.span), 12)
 
     def loss(rows):
         J = np.stack(rows, axis=1)
@@ -176,14 +177,14 @@ def test_gains_of_parts_are_those_of_least_squares(tmp_path):
         return rest @ rest / 2
 
     free = [z[4], z[5]]
-    assert own.gain == pytest.approx(loss(free) - loss([*free, gate * z[1], gate * z[2]]), abs=1e-5)
+    with_own = [*free, envelope * z[1], envelope * z[2]]
+    assert own.gain == pytest.approx(loss(free) - loss(with_own), abs=1e-5)
     for a, b in ((0, 5), (3, 9)):  # no window of a run wins more
-        window = np.repeat(steps.gate(Span("window", *steps.edges[[a, b]].tolist())), 12)
+        window = np.repeat(steps.envelope(Span("window", *steps.edges[[a, b]].tolist())), 12)
         rows = [*free, window * z[1], window * z[2]]
         assert loss(free) - loss(rows) <= own.gain + 1e-6
     after = scan.with_change(own).of(("b", "all"))
-    inside = np.repeat(steps.gate(after.span), 12)
-    with_own = [*free, gate * z[1], gate * z[2]]
+    inside = np.repeat(steps.envelope(after.span), 12)
     gained = loss(with_own) - loss([*with_own, inside * z[3]])
     assert after.gain == pytest.approx(gained, abs=1e-5)
 
@@ -196,6 +197,10 @@ def test_a_session_has_the_order_of_its_times_and_its_parts_lie_within_runs_with
     unknown = Session.of(started(recorded(tmp_path / "b")).problem.data)
     assert not unknown.ordered
     assert len(unknown.labels) == RUNS
+    runs = Case(4, (), PLAN).logged()
+    runs = [change(r, t=r.columns["t"] + 0.01 * k) for k, r in enumerate(runs)]  # they overlap
+    write_folder(tmp_path / "c", runs, rate=PLAN.rate)
+    assert not Session.of(started(read_csv(tmp_path / "c")).problem.data).ordered
     edges = unknown.edges.tolist()
     for a, b in unknown.pairs:
         span = Span("window", edges[a], edges[b])

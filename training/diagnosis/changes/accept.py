@@ -23,8 +23,8 @@ from ..selection.model_selection import (
 )
 from ..selection.search import Search, asks_for_commands
 from ..selection.state import OF_ESTIMATES, Selection
-from .gates import Session, Span
 from .scan import Change, Scan
+from .session import Session, Span
 
 _MOST = 3
 """Most parts: what changes more often is a random disturbance, or another cause."""
@@ -101,7 +101,7 @@ def _scan(state: Selection, search: Search, session: Session) -> Scan:
     column = {i: 1 + k for k, i in enumerate(rows)}
     prior = [1 / known_within(library.entries[i].parameter) ** 2 for i in rows]
     return Scan(
-        session.at_steps(z).reshape(len(z), -1) * scale[:, None].astype(z.dtype),
+        session.at_steps(z * scale[:, None, None].astype(z.dtype)).reshape(len(z), -1),
         session,
         {h: [column[i] for i in own] for h, own in candidates.items()},
         [column[i] for i in free],
@@ -167,9 +167,9 @@ def _fitted(
 ) -> tuple[DiagnosisProblem, Float[np.ndarray, " p"], Evaluation, Fit]:
     """The problem with a cause in a part of the session, and a fit with exact predictions."""
     data, before = state.problem.data, state.problem.library
-    gate = session.at_samples(session.gate(span), data)
+    envelope = session.at_samples(session.envelope(span), data)
     lasts = session.ordered and span.last == len(session.run)
-    part = Part(*hypothesis, gate, float(lasts), session.when(span))
+    part = Part(*hypothesis, envelope, float(lasts), session.when(span))
     problem = state.problem.with_part(part)
     free = [*search.nuisance, *parameters_of(problem.library, state.hypotheses)]
     start = problem.moved(state.current.theta, before)
@@ -188,7 +188,7 @@ def _refined(
     probe[0, whole_session] = seen.theta[library.at(name, where)]
     z = session.at_steps(_sensitivities(problem, seen, probe)).astype(float)
     own, moved = z
-    inside = session.gate(span)[:, None]
+    inside = session.envelope(span)[:, None]
     without, with_it = own - inside * moved, own + (1 - inside) * moved
     won = ((without**2).sum(axis=1) - (with_it**2).sum(axis=1)) / 2
     block = int(np.diff(session.edges).max())

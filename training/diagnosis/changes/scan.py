@@ -1,7 +1,7 @@
 """Gains of causes in parts of a session, from inner products by block.
 
-With sensitivities J of the whitened innovations z to a cause, a change by θ in a part with gate g
-moves them by g J θ. All other free parameters (columns N) are profiled out: the gain is
+With sensitivities J of the whitened innovations z to a cause, a change by θ in a part with the
+envelope g moves them by g J θ. All other free parameters (columns N) are profiled out: the gain is
 
     ½ sᵀ S⁻¹ s,  s = Σ g Jᵀz - C H⁻¹ Nᵀz,  S = Σ g² JᵀJ - C H⁻¹ Cᵀ,  C = Σ g JᵀN,  H = NᵀN,
 
@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from ....models.effects.library import kind
 from ..selection.model_selection import Hypothesis, margin
-from .gates import Session, Span
+from .session import Session, Span
 
 _RIDGE = 1e-9
 """Share of a parameter's information that is added to it, so that inverses exist."""
@@ -101,8 +101,8 @@ class Scan:
     def with_change(self, change: Change) -> "Scan":
         """The scan with a change among the free parameters."""
         own, m = self.candidates[change.hypothesis], len(self.z)
-        gate = np.repeat(self.session.gate(change.span), _OF_A_STEP)
-        wider = np.concatenate([self.z, self.z[own] * gate.astype(self.z.dtype)])
+        envelope = np.repeat(self.session.envelope(change.span), _OF_A_STEP)
+        wider = np.concatenate([self.z, self.z[own] * envelope.astype(self.z.dtype)])
         prior = np.concatenate([self.prior, self.prior[own]])
         return replace(self, z=wider, free=[*self.free, *range(m, m + len(own))], prior=prior)
 
@@ -119,7 +119,7 @@ class Scan:
     def _by_block(self, span: Span) -> Float[np.ndarray, " K"]:
         """Mean factor of a change in each block."""
         edges = self.session.edges
-        return np.add.reduceat(self.session.gate(span), edges[:-1]) / np.diff(edges)
+        return np.add.reduceat(self.session.envelope(span), edges[:-1]) / np.diff(edges)
 
     def _spans(self, own: list[int]) -> tuple[list[Span], Float[np.ndarray, " W"]]:
         """Every part, and the gains there."""

@@ -278,12 +278,15 @@ def _steps(
 def _started(
     recording: Recording, kept: np.ndarray, run: Sequence[int]
 ) -> Float[np.ndarray, " R"] | None:
-    """When each piece's run started (s); None where that is not known."""
+    """When each piece's run started (s); None where that is not known, or runs overlap."""
     if "start_time" not in recording.dataset:
         return None
     start = recording.dataset["start_time"].to_numpy()[kept]
-    known = np.isfinite(start).all() and len(np.unique(start)) == len(start)
-    return start[list(run)] if known else None
+    at = np.argwhere(kept).tolist()
+    ends = [a + recording.elapsed(j, k)[-1] for a, (j, k) in zip(start, at, strict=True)]
+    order = np.argsort(start)
+    apart = np.all(np.array(ends)[order[:-1]] <= start[order[1:]])
+    return start[list(run)] if np.isfinite(start).all() and apart else None
 
 
 def _labels(recording: Recording, kept: np.ndarray) -> tuple[str, ...]:

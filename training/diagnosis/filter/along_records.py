@@ -22,7 +22,7 @@ from ....models.effects.extended import Extended, Random
 from ....models.effects.inertia import Inertia
 from ....models.effects.recent import Recent
 from ..data.arrays import Data
-from .varying import Gated, at_sample
+from .varying import Modulated, at_sample
 
 Out = TypeVar("Out")
 SUBSTEPS, LONGEST = 2, 0.0125
@@ -102,10 +102,12 @@ class AlongRecords(eqx.Module):
     model: Extended
     inertia: Inertia
     substeps: int = eqx.field(static=True)
-    changes: tuple[Gated, ...] = ()
+    changes: tuple[Modulated, ...] = ()
 
     @classmethod
-    def of(cls, model: Extended, substeps: int, changes: tuple[Gated, ...] = ()) -> "AlongRecords":
+    def of(
+        cls, model: Extended, substeps: int, changes: tuple[Modulated, ...] = ()
+    ) -> "AlongRecords":
         return cls(model, model.inertia(), substeps, changes)
 
     def at(self, number: Int[Array, ""] | int) -> "AlongRecords":

@@ -17,7 +17,7 @@ from ..data.arrays import Data
 from .along_records import AlongRecords, Records, State, Step, scan, substeps
 from .latent import levels, specific_force_errors
 from .transition import Latent
-from .varying import Gated, changes_of
+from .varying import Modulated, changes_of
 
 
 class Predictions(NamedTuple):
@@ -61,7 +61,7 @@ def _predict(
     records: Records,
     count: int,
     measured: Array | None = None,
-    changes: tuple[Gated, ...] = (),
+    changes: tuple[Modulated, ...] = (),
 ) -> Predictions:
     every = AlongRecords.of(model.with_effects(effects), count, changes)
     plain = model.with_effects(())

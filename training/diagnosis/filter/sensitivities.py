@@ -20,7 +20,7 @@ from ..data.arrays import Data
 from .along_records import Records, settle
 from .innovations import Predictions
 from .kalman import Filter
-from .varying import Gated, at_sample, changes_of
+from .varying import Modulated, at_sample, changes_of
 
 LANES, FEW, INSTRUMENTS = 28, 8, 18
 """Probes that one call of the compiled program evaluates in parallel, besides the base."""
@@ -44,7 +44,7 @@ def _whitened(
     instead: tuple[Array, Array] | None,
     lanes: int,
     instruments: bool,
-    changes: tuple[Gated, ...] = (),
+    changes: tuple[Modulated, ...] = (),
 ) -> Float[Array, "L N12 R"]:
     """Whitened innovations of lane 0 (the base) and changes of them in the other lanes."""
     every = model.with_effects(effects)

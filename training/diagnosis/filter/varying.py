@@ -1,4 +1,4 @@
-"""Effects that act in a part of the data: parameters that a gate multiplies at every sample."""
+"""Effects that act in a part of the data: an envelope multiplies their parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,27 +23,27 @@ class Part:
     Attributes:
         name: of the effect and the number of the part: `thruster_gain#1`.
         where: place of the effect.
-        gate: factor of the change at every sample, 0 to 1 (M, R).
+        envelope: factor of the change at every sample, 0 to 1 (M, R).
         final: the factor after the last sample of the session; 0 where the change has ended.
         when: the part of the data in words and numbers.
     """
 
     name: str
     where: str
-    gate: Float[np.ndarray, "M R"]
+    envelope: Float[np.ndarray, "M R"]
     final: float
     when: When
 
 
-class Gated(eqx.Module):
-    """Values of an effect that a gate multiplies and adds to its constant ones."""
+class Modulated(eqx.Module):
+    """Values of an effect that an envelope multiplies and adds to its constant ones."""
 
     effect: str = eqx.field(static=True)
     values: Float[Array, "p *b"]
-    gate: Float[Array, "M R"]
+    envelope: Float[Array, "M R"]
 
 
-def at_sample(model: Extended, changes: tuple[Gated, ...], number: Array | int) -> Extended:
+def at_sample(model: Extended, changes: tuple[Modulated, ...], number: Array | int) -> Extended:
     """The model with its effects as they are at sample `number` of all pieces."""
     if not changes:
         return model
@@ -52,8 +52,8 @@ def at_sample(model: Extended, changes: tuple[Gated, ...], number: Array | int) 
         values = e.values
         for change in changes:
             if change.effect == e.name:
-                gate = jnp.expand_dims(change.gate[number], tuple(range(values.ndim - 1)))
-                values = values + change.values * gate.astype(values.dtype)
+                envelope = jnp.expand_dims(change.envelope[number], tuple(range(values.ndim - 1)))
+                values = values + change.values * envelope.astype(values.dtype)
         effects.append(eqx.tree_at(lambda x: x.values, e, values))
     return replace(model, effects=tuple(effects))
 
@@ -83,7 +83,7 @@ class VaryingLibrary(Library):
 
     def changes(
         self, theta: Float[Array | np.ndarray, "p *b"], pieces: Int[np.ndarray, " K"] | slice
-    ) -> tuple[Gated, ...]:
+    ) -> tuple[Modulated, ...]:
         """What the parts add to the effects of `filled`, at every sample of some pieces."""
         found = []
         for part in self.parts:
@@ -93,7 +93,7 @@ class VaryingLibrary(Library):
             values = jnp.zeros((effect.values.shape[0], *theta.shape[1:]))
             rows = np.array(self.at(name, part.where)) - first
             values = values.at[rows].set(jnp.asarray(theta[self.at(part.name, part.where)]))
-            found.append(Gated(name, values, jnp.asarray(part.gate[:, pieces])))
+            found.append(Modulated(name, values, jnp.asarray(part.envelope[:, pieces])))
         return tuple(found)
 
     def used(self, theta: Float[np.ndarray, " p"]) -> tuple[Effect, ...]:
@@ -108,7 +108,7 @@ class VaryingLibrary(Library):
 
 def changes_of(
     library: Library, theta: Any, pieces: Int[np.ndarray, " K"] | slice = slice(None)
-) -> tuple[Gated, ...]:
+) -> tuple[Modulated, ...]:
     """What parts of a library add to its effects; none for a library without parts."""
     return library.changes(theta, pieces) if isinstance(library, VaryingLibrary) else ()
 
@@ -121,7 +121,7 @@ def parts_of(library: Library) -> tuple[Part, ...]:
 def acting(library: Library, data: Data) -> Library:
     """The library for other data, in all of which its parts act."""
     every = np.ones((data.weight.shape[0] + 1, data.weight.shape[1]))
-    parts = [replace(part, gate=every, final=1.0) for part in parts_of(library)]
+    parts = [replace(part, envelope=every, final=1.0) for part in parts_of(library)]
     return VaryingLibrary(library.effects, parts) if parts else library
 
 

@@ -17,7 +17,7 @@ from ....models.effects.inertia import Inertia, times
 from ..filter.along_records import AlongRecords, Records, State, Step, scan
 from ..filter.innovations import difference
 from ..filter.problem import DiagnosisProblem
-from ..filter.varying import Gated, changes_of
+from ..filter.varying import Modulated, changes_of
 from .blackbox import BlackBox
 
 _LONGEST = 0.02
@@ -141,7 +141,7 @@ def _errors(
     key: Array,
     every: int,
     count: int,
-    changes: tuple[Gated, ...] = (),
+    changes: tuple[Modulated, ...] = (),
 ) -> Float[Array, "N 12 S R"]:
     """Recorded less simulated: lane 0 without noise, the others with it and that of the records."""
     whole = AlongRecords.of(model.with_effects(effects), count, changes)

@@ -103,7 +103,7 @@ class Session:
             for b in range(a + least, end + 1)
         ]
 
-    def gate(self, span: Span) -> Float[np.ndarray, " T"]:
+    def envelope(self, span: Span) -> Float[np.ndarray, " T"]:
         """Factor of a change at each step."""
         if span.kind == "drift":
             return self.clock / max(self.clock[-1], 1e-9)
@@ -111,10 +111,10 @@ class Session:
         inside[span.first : span.last] = 1.0
         return inside
 
-    def at_samples(self, gate: Float[np.ndarray, " T"], data: Data) -> Float[np.ndarray, "M R"]:
+    def at_samples(self, envelope: Float[np.ndarray, " T"], data: Data) -> Float[np.ndarray, "M R"]:
         """A factor by step at every sample of the data, held after a piece's last step."""
         found = np.zeros((data.weight.shape[0] + 1, data.weight.shape[1]))
-        found[self.sample, self.piece] = gate
+        found[self.sample, self.piece] = envelope
         count = data.weight.sum(axis=0).astype(int)
         for r, n in enumerate(count):
             found[n:, r] = found[max(n - 1, 0), r]
@@ -123,7 +123,7 @@ class Session:
     def at_steps(self, z: Float[np.ndarray, "m N12 R"]) -> Float[np.ndarray, "m T 12"]:
         """Innovations or sensitivities in the order of the session."""
         by_step = z.reshape(len(z), -1, 12, z.shape[2])
-        return np.moveaxis(by_step[:, self.sample, :, self.piece], 0, 1)
+        return by_step.transpose(0, 1, 3, 2)[:, self.sample, self.piece]
 
     def when(self, span: Span) -> When:
         """Where a part begins and ends, in words too."""

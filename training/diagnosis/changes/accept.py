@@ -147,7 +147,7 @@ def _accepted(
         moved = _refined(problem, seen, session, hypothesis, span)
         if moved == span:
             break
-        fitted = _fitted(state, search, session, hypothesis, moved)
+        fitted = _fitted(state, search, session, hypothesis, moved, theta)
         if fitted[0].loss_of(fitted[2]) > problem.loss_of(seen) + _UNDECIDED:
             break  # an instrument that changes within a run jumps, which gains by step do not tell
         span, (problem, theta, seen, joint) = moved, fitted
@@ -163,16 +163,24 @@ def _accepted(
 
 
 def _fitted(
-    state: Selection, search: Search, session: Session, hypothesis: Hypothesis, span: Span
+    state: Selection,
+    search: Search,
+    session: Session,
+    hypothesis: Hypothesis,
+    span: Span,
+    start: Float[np.ndarray, " p"] | None = None,
 ) -> tuple[DiagnosisProblem, Float[np.ndarray, " p"], Evaluation, Fit]:
-    """The problem with a cause in a part of the session, and a fit with exact predictions."""
+    """The problem with a cause in a part of the session, and a fit with exact predictions.
+
+    It begins at `start`, the fit in another part, or where the selection is.
+    """
     data, before = state.problem.data, state.problem.library
     envelope = session.at_samples(session.envelope(span), data)
     lasts = session.ordered and span.last == len(session.run)
     part = Part(*hypothesis, envelope, float(lasts), session.when(span))
     problem = state.problem.with_part(part)
     free = [*search.nuisance, *parameters_of(problem.library, state.hypotheses)]
-    start = problem.moved(state.current.theta, before)
+    start = problem.moved(state.current.theta, before) if start is None else start
     return problem, *problem.polish(start, [*problem.library.at(*hypothesis), *free], rounds=8)
 
 

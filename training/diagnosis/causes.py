@@ -57,7 +57,7 @@ def find_causes(
     structures: dict[Hypothesis, result.Structure] = {}
     search, part = search_for(state.problem, nuisance), within(progress, 0.1, 0.5)
     state, problem, seen = _first_causes(state, search, part)
-    if not seen:
+    if seen is None:
         state, problem = _with_changes(state, search, part)
     for number in range(_MOST_UNKNOWN):
         progress(0.52 + 0.1 * number, "unmodelled structure")

@@ -61,7 +61,7 @@ class Data:
         specific_force: of the accelerometer (m/s²), where velocities are latent (N + 1, 3, R).
         climb: vertical velocity in W (m/s), where w follows from it and the latent ones (N + 1, R).
         began: time of each piece's first sample since the start of its run (s) (1, R).
-        started: time of day at which each piece's run started (s), if it was recorded (R,).
+        started: when each piece's run started, on the recorder's clock (s), if that is known (R,).
         labels: of the runs, by scenario.
     """
 

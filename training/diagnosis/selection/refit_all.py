@@ -45,9 +45,9 @@ class Coefficient:
 
 def is_coefficient(entry: Entry, group: Group) -> bool:
     """Whether a parameter belongs to a group: of effects with a place `all`, only there."""
-    cls = kind(entry.cause)
     if PART in entry.cause:
         return False
+    cls = kind(entry.cause)
     return group in cls.refits and (entry.where == "all" or "all" not in cls.places_with(1))
 
 

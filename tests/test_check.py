@@ -10,6 +10,7 @@ from hidden.blind import Blind, told
 from hidden.draw import draw
 from hidden.effects import CAUSES
 from hidden.effects_body import Proximity
+from hidden.episode import APART, PARTS, draw_episode
 from hidden.scenarios import Plan
 
 from spinndrift.models.config.errors import UserError
@@ -20,6 +21,7 @@ from spinndrift.sims.diagnosis_benchmark import run as running
 from spinndrift.sims.diagnosis_benchmark.cases import (
     Case,
     HiddenCause,
+    Part,
     Truth,
     find_cases,
     read_oracle,
@@ -159,6 +161,47 @@ def test_judgements_follow_the_rules():
     assert not compare(fault, diagnosis())["told"]
 
 
+def test_the_part_in_which_a_cause_acts_is_judged_by_run_and_times():
+    hidden = HiddenCause("thruster_gain", when=Part("window", "yaw, run 2", 3.1, 6.4))
+    truth = Truth("part", "explained", causes=(hidden,))
+
+    def said(kind, run, start, end):
+        when = result.When(kind, run, start, run, end, "")
+        return compare(truth, diagnosis(replace(cause("thruster_gain", "3"), when=when)))
+
+    assert said("window", "yaw, run 2", 3.4, 6.0)["when_right"]
+    assert not said("window", "yaw, run 2", 3.4, 5.8)["when_right"]
+    assert not said("window", "yaw, run 1", 3.1, 6.4)["when_right"]
+    assert not said("onwards", "yaw, run 2", 3.1, 6.4)["when_right"]
+    always = compare(truth, diagnosis(cause("thruster_gain", "3")))
+    assert (always["first_right"], always["when_right"]) == (True, False)
+    constant = Truth("single", "explained", causes=(replace(hidden, when=None),))
+    assert compare(constant, diagnosis(cause("thruster_gain", "3")))["when_right"]
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_cases_with_a_cause_in_a_part_of_a_session_say_which(folder, name):
+    rng = np.random.default_rng(3)
+    effect, when = draw_episode(name, PLAN, rng)
+    case = draw(7, "null", plan=PLAN)
+    blind = Blind(f"part-{name}-0", "part", replace(case, effects=(effect,)), when=when)
+    blind.write(folder / blind.name)
+    (found,) = find_cases(folder, [blind.name])
+    (hidden,) = found.truth.causes
+    recording, runs = found.read(), PLAN.scenarios * PLAN.runs
+    assert (found.truth.called, hidden.name) == (name, effect.cause)
+    assert hidden.when.kind == when.kind
+    assert hidden.when.run == recording.scenarios[when.run - 1]
+    assert np.allclose(np.diff([run.start for run in recording.trajectories()]), APART)
+
+    def strength(run, t):
+        return effect.strength(t)[run - 1]
+
+    assert strength(runs, PLAN.seconds) == pytest.approx(float(when.kind != "window"))
+    begins = [strength(when.run, when.start + t) for t in (-0.01, 0.01)]
+    assert when.kind == "drift" or begins == [0, 1]
+
+
 def test_intervals_are_those_of_clopper_and_pearson():
     """Closed forms at the ends; the published interval of 4 in 20."""
     low, high = interval(0, 20)
@@ -185,7 +228,7 @@ def test_cases_are_judged_once_and_the_page_keeps_its_own_words(tmp_path, monkey
         single = case.truth.kind == "single"
         return Judgement(
             case.name, case.truth.kind, case.truth.called, 1.0, "usual", "adequate", not single,
-            ["thruster_lag"] * single, [], not single, not single, None, 0, 0, seconds=2.0,
+            ["thruster_lag"] * single, [], not single, not single, None, True, 0, 0, seconds=2.0,
         ), Finding()  # fmt: skip
 
     monkeypatch.setattr(running, "judge", judge)

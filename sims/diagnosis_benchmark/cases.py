@@ -29,7 +29,23 @@ from ...training.diagnosis.findings.result import Verdict
 
 USUAL = "usual"
 """Data recorded like those of most cases."""
-Kind = Literal["null", "single", "pair", "triple", "unknown", "fault", "wrong"]
+Kind = Literal["null", "single", "part", "pair", "triple", "unknown", "fault", "wrong"]
+
+
+@dataclass(frozen=True)
+class Part:
+    """When a hidden cause acts.
+
+    Attributes:
+        kind: as `When.kind` of a diagnosis.
+        run: where it begins, as `When.first_run`.
+        start, end: times in that run (s); the end is that of a window.
+    """
+
+    kind: Literal["window", "onwards", "drift"]
+    run: str = ""
+    start: float = 0.0
+    end: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -43,6 +59,7 @@ class HiddenCause:
         tolerance: relative difference of a parameter due to different definitions, not an error.
         twins: names that are not distinguishable from it on such data for physical reasons.
         variables: of an unknown: inputs that it depends on.
+        when: it acts, if not always.
     """
 
     name: str
@@ -51,6 +68,7 @@ class HiddenCause:
     tolerance: float = 0.0
     twins: tuple[str, ...] = ()
     variables: tuple[str, ...] = ()
+    when: Part | None = None
 
     def __post_init__(self) -> None:
         if self.name != Unknown.name:

@@ -22,6 +22,8 @@ from .cases import Case, HiddenCause, Truth, read_oracle
 
 CLOSE = 3.0
 """Standard errors within which a parameter is right."""
+AT = 0.5
+"""Time (s) within which the begin and the end of a part are right."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,7 @@ class Judgement:
         first_right: the first reported cause is a hidden one, or a twin of one.
         declared: `first_right`, or a hidden cause is reported as indistinguishable from the first.
         place_right: the place of the first cause is right; None if it is not judged.
+        when_right: it acts in the part of the data that is reported, or always, as reported.
         recalled, spurious: numbers of hidden causes that were named and of wrong names.
         z: deviation of each judged parameter in standard errors, by cause and name.
         ratio: found over true value.
@@ -58,6 +61,7 @@ class Judgement:
     first_right: bool
     declared: bool
     place_right: bool | None
+    when_right: bool
     recalled: int
     spurious: int
     z: dict[str, float] = field(default_factory=dict)
@@ -80,6 +84,17 @@ def fits(hidden: HiddenCause, found: Cause) -> bool:
         seen = found.structure.variables if found.structure is not None else []
         return not hidden.variables or bool(set(hidden.variables) & set(seen))
     return found.name == hidden.name or found.name in hidden.twins
+
+
+def acts_when(hidden: HiddenCause, found: Cause) -> bool:
+    """Whether a cause acts in the part of the data in which the hidden one does."""
+    true, said = hidden.when, found.when
+    if true is None or said is None:
+        return true is None and said is None
+    if true.kind != said.kind or true.kind == "drift":
+        return true.kind == said.kind
+    near = abs(said.start - true.start) <= AT and said.first_run == true.run
+    return near and (true.kind == "onwards" or abs(said.end - true.end) <= AT)
 
 
 def compare(truth: Truth, d: Diagnosis) -> dict[str, Any]:
@@ -122,6 +137,7 @@ def compare(truth: Truth, d: Diagnosis) -> dict[str, Any]:
         "first_right": bool(matched) if truth.causes else not causes,
         "declared": bool(matched or indistinguishable) if truth.causes else not causes,
         "place_right": place,
+        "when_right": first is None or all(acts_when(h, first) for h in matched),
         "recalled": sum(any(fits(h, c) for c in causes) for h in truth.causes),
         "spurious": sum(not any(fits(h, c) for h in truth.causes) for c in causes),
         "z": z,

@@ -63,8 +63,9 @@ def share(hits: int, total: int) -> str:
 def tables(rows: Sequence[Row]) -> list[Table]:
     """All tables for which there are cases."""
     usual = [r for r in rows if r["data"] == USUAL]
-    found = [_summary(usual), _confusion(usual), _sizes(usual), _mixed(usual), _faults(usual)]
-    found += [_verdicts(rows), _varied(rows), _wrong(rows), _misses(rows), _rivals(usual)]
+    found = [_summary(usual), _confusion(usual), _sizes(usual), _parts(usual), _mixed(usual)]
+    found += [_faults(usual), _verdicts(rows), _varied(rows), _wrong(rows), _misses(rows)]
+    found.append(_rivals(usual))
     return [table for table in found if table.rows]
 
 
@@ -190,7 +191,7 @@ def _sizes(rows: Sequence[Row]) -> Table:
 
 def _verdicts(rows: Sequence[Row]) -> Table:
     """What is claimed, by kind of recording."""
-    chosen = _of(rows, "null", "single", "pair", "triple", "unknown", "wrong")
+    chosen = _of(rows, "null", "single", "part", "pair", "triple", "unknown", "wrong")
     lines = []
     for kind in _kinds(chosen):
         own = [r for r in chosen if r["data"] == kind]
@@ -293,6 +294,30 @@ def _rivals(rows: Sequence[Row]) -> Table:
         "brackets: number of terms of a sparse regression over all six axes, without constants."
     )
     return Table(caption, ("hidden", "reported by spinndrift", "its gain", *names), lines)
+
+
+def _parts(rows: Sequence[Row]) -> Table:
+    """Causes that act in a part of the data."""
+    chosen, lines = _of(rows, "part"), []
+    for label in dict.fromkeys(r["label"] for r in chosen):
+        own = [r for r in chosen if r["label"] == label]
+        z = [abs(v) for r in own for v in r["z"].values()]
+        lines.append(
+            (
+                label,
+                f"{sum(r['first_right'] for r in own)} of {len(own)}",
+                f"{sum(r['first_right'] and r['when_right'] for r in own)}",
+                "; ".join(dict.fromkeys(", ".join(r["named"]) or "adequate" for r in own)),
+                f"{max(z):.1f}" if z else "–",
+                f"{np.median([r['seconds'] for r in own]):.0f}",
+            )
+        )
+    header = ("hidden", "first cause right", "part right too", "reported", "largest z", "s")
+    caption = (
+        "Causes that act in a part of the session: begin and end are right within 0.5 s, in the "
+        "right run."
+    )
+    return Table(caption, header, lines)
 
 
 def _mixed(rows: Sequence[Row]) -> Table:

@@ -7,7 +7,7 @@ change of variables, nothing is said of a parameter, or a tolerance is given.
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,14 @@ from . import effects_measurement as measurement
 from .draw import TWINS, Case, draw
 from .effect import Effect
 from .effects import CAUSES, UNKNOWN
+from .episode import APART, PARTS, Episode, When, draw_episode
 from .faults import spoil
 from .oracle import predict
 from .scenarios import Plan
-from .simulator import Noise
+from .simulator import Noise, streams
 from .telemetry import Streams, write_tlog
 from .vehicle import AXES, Vehicle
-from .write import STATE, write_folder
+from .write import STATE, change, write_folder
 
 FRESH = 7_000_000
 """Added to a case's seed for the runs that the diagnosis never sees."""
@@ -95,6 +96,7 @@ class Blind:
     size: float = 1.0
     fault: str = ""
     data: str = "usual"
+    when: When | None = None
 
     def write(self, folder: Path) -> None:
         """Write data/, truth.yaml last, and, where means differ, fresh/ and oracle/."""
@@ -105,6 +107,8 @@ class Blind:
         if self.fault:
             runs, _ = spoil(runs, self.fault, case.seed)
             problems = [SAID[self.fault]]
+        if self.kind == "part":
+            runs = [change(r, t=r.columns["t"] + APART * k) for k, r in enumerate(runs)]
         if case.plan.idle:
             limits = [AXES[i] for i in case.plan.idle]
         if self.data in TLOG:
@@ -112,8 +116,8 @@ class Blind:
             write_tlog(folder / "data" / "dive.tlog", shown, sent, case.noise.rate_filter)
         else:
             write_folder(folder / "data", runs, rate=case.plan.rate)
-        measured = not case.plan.dead_reckoned  # the oracle starts from measured positions
-        if measured and case.plan.even and any(has_mean(e) for e in case.effects):
+        always = not case.plan.dead_reckoned and self.when is None  # as in the windows of an oracle
+        if always and case.plan.even and any(has_mean(e) for e in case.effects):
             fewer = replace(case, plan=replace(case.plan, runs=min(case.plan.runs, 2)))
             truth = fewer.simulate(case.seed + FRESH)
             write_folder(
@@ -124,10 +128,10 @@ class Blind:
         told_ = {
             "kind": self.kind,
             "verdict": answer["verdict"],
-            "label": self.fault or " + ".join(label(e) for e in case.effects) or self.kind,
+            "label": self.label(),
             "size": self.size,
             "data": self.data,
-            "causes": [told(e) for e in case.effects],
+            "causes": [told(e) | self.acting() for e in case.effects],
             "diffusion": [] if self.data in REAL else list(case.noise.diffusion),
             "every": every(case),
             "ratios": case.ratios() if case.wrong else {},
@@ -136,6 +140,21 @@ class Blind:
         }
         lines = [f"{key}: {json.dumps(value)}" for key, value in told_.items()]
         (folder / "truth.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+    def label(self) -> str:
+        """Of its group in the tables."""
+        if self.kind == "part":
+            return self.name.removeprefix("part-").rsplit("-", 1)[0]
+        return self.fault or " + ".join(label(e) for e in self.case.effects) or self.kind
+
+    def acting(self) -> dict[str, Any]:
+        """When the hidden cause acts, if not always."""
+        if self.when is None:
+            return {}
+        names, k = self.case.scenarios().names, self.when.run - 1
+        alone = names.count(names[k]) == 1
+        run = names[k] if alone else f"{names[k]}, run {names[: k + 1].count(names[k])}"
+        return {"when": asdict(self.when) | {"run": run}}
 
 
 SAID = {
@@ -186,6 +205,7 @@ def write_oracle(folder: Path, case: Case, truth: Any) -> None:
 
 def told(effect: Effect) -> dict[str, Any]:
     """Name, place, parameters in the published definitions, and what they may be confused with."""
+    effect = effect.inner if isinstance(effect, Episode) else effect
     found = {"name": effect.cause, "twins": list(TWINS.get(effect.cause, ()))}
     if effect.cause == "unknown":
         return found | {"variables": list(getattr(effect, "variables", ()))}
@@ -273,7 +293,8 @@ def table(
     mixed: int = 4,
     data: Sequence[str] = ("usual",),
 ) -> Iterator[Blind]:
-    """Singles of every cause at each size, effects without a name, nulls, mixtures, faulty data.
+    """Singles of every cause at each size, in parts of the data, effects without a name, nulls,
+    mixtures, faulty data.
 
     Other `data` than the usual are there for singles of realistic size and some nulls alone.
     """
@@ -301,6 +322,13 @@ def table(
             for i in range(seeds):
                 case = draw(1000 * (i + 1) + k, names=(name,), size=size, plan=plan)
                 yield Blind(f"{name}-{size:g}-{i}", "single", case, size)
+    for k, name in enumerate(PARTS):
+        for i in range(seeds):
+            seed = 90_000 + 10 * i + k
+            effect, when = draw_episode(name, plan, streams(seed, 6))
+            yield Blind(f"part-{name}-{i}", "part", Case(seed, (effect,), plan), when=when)
+    for i in range(nulls // 10):
+        yield Blind(f"part-nothing-{i}", "part", draw(91_000 + i, "null", plan=plan))
     for k, name in enumerate(UNKNOWN):
         for i in range(seeds):
             case = draw(70_000 + 10 * i + k, "unknown", names=(name,), plan=plan)

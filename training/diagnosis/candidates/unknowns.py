@@ -10,7 +10,6 @@ from ....models.effects.unknown import Unknown
 from ....models.se3 import AXES
 from ..disturbance.found import best_law
 from ..filter.problem import DiagnosisProblem, Evaluation
-from ..filter.sensitivities import whitened_sensitivities
 from ..findings import result
 from ..selection.hypotheses import Design, Fit
 from ..selection.model_selection import Choice, Hypothesis, admissible, parameters_of
@@ -40,19 +39,8 @@ def sensitivities_of(
     """Whitened sensitivities to parameters, one small probe each."""
     if not rows:
         return None
-    design = Design.of(problem.library, evaluation.theta, rows)
-    first = [int(np.flatnonzero(design.owner == i)[0]) for i in rows]
-    probes = design.probes[first]
-    z = whitened_sensitivities(
-        problem.model,
-        problem.library,
-        evaluation.theta,
-        probes,
-        problem.data,
-        evaluation.predictions,
-        evaluation.kalman,
-    )
-    return z[1:]
+    probes = Design.one_each(problem.library, evaluation.theta, rows).probes
+    return problem.whitened(evaluation, probes)[1:]
 
 
 def screened(

@@ -9,7 +9,6 @@ from ....models.effects.library import PART, kind, whole
 from ....models.effects.unknown import Unknown
 from ..disturbance.found import best_law
 from ..filter.problem import DiagnosisProblem, Evaluation
-from ..filter.sensitivities import whitened_sensitivities
 from ..filter.varying import Part, parts_of
 from ..selection.hypotheses import Design, Fit, is_curved, known_within
 from ..selection.model_selection import (
@@ -94,10 +93,9 @@ def _scan(state: Selection, search: Search, session: Session) -> Scan:
     candidates = {h: library.at(*h) for h in _candidates(problem, search)}
     free = [*search.nuisance, *parameters_of(library, state.hypotheses)]
     rows = list(dict.fromkeys([*free, *(i for own in candidates.values() for i in own)]))
-    design = Design.of(library, theta, rows)
-    first = [int(np.flatnonzero(design.owner == i)[0]) for i in rows]
-    z = _sensitivities(problem, state.current, design.probes[first])
-    scale = np.concatenate([[1.0], 1 / design.size[first]])
+    design = Design.one_each(library, theta, rows)
+    z = problem.whitened(state.current, design.probes)
+    scale = np.concatenate([[1.0], 1 / design.size])
     column = {i: 1 + k for k, i in enumerate(rows)}
     prior = [1 / known_within(library.entries[i].parameter) ** 2 for i in rows]
     return Scan(
@@ -107,16 +105,6 @@ def _scan(state: Selection, search: Search, session: Session) -> Scan:
         [column[i] for i in free],
         np.array([0.0, *prior]),
     )
-
-
-def _sensitivities(
-    problem: DiagnosisProblem, seen: Evaluation, probes: Float[np.ndarray, "k p"]
-) -> Float[np.ndarray, "m N12 R"]:
-    """Whitened innovations, and how probes change them."""
-    return whitened_sensitivities(
-        problem.model, problem.library, seen.theta, probes, problem.data, seen.predictions,
-        seen.kalman,
-    )  # fmt: skip
 
 
 def _candidates(problem: DiagnosisProblem, search: Search) -> list[Hypothesis]:
@@ -194,7 +182,7 @@ def _refined(
     whole_session = library.at(whole(name), where)
     probe = np.zeros((1, library.size))
     probe[0, whole_session] = seen.theta[library.at(name, where)]
-    z = session.at_steps(_sensitivities(problem, seen, probe)).astype(float)
+    z = session.at_steps(problem.whitened(seen, probe)).astype(float)
     own, moved = z
     inside = session.envelope(span)[:, None]
     without, with_it = own - inside * moved, own + (1 - inside) * moved

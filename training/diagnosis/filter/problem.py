@@ -234,6 +234,14 @@ class DiagnosisProblem:
             theta, p, noise, kalman, judged, plain, own_z, float(judged.total[0, 0]) / 2
         )
 
+    def whitened(
+        self, seen: Evaluation, probes: Float[np.ndarray, "k p"]
+    ) -> Float[np.ndarray, "m N12 R"]:
+        """Whitened innovations of an evaluation (row 0), and how probes change them."""
+        return whitened_sensitivities(
+            self.model, self.library, seen.theta, probes, self.data, seen.predictions, seen.kalman
+        )
+
     def polish(
         self,
         theta: Float[np.ndarray, " p"],

@@ -53,6 +53,15 @@ class Design:
         probes[np.arange(len(owner)), owner] = size
         return cls(probes, np.array(owner, int), np.array(size))
 
+    @classmethod
+    def one_each(
+        cls, library: Library, theta: Float[np.ndarray, " p"], chosen: Sequence[int]
+    ) -> "Design":
+        """The first probe of each of the parameters chosen, in their order."""
+        every = cls.of(library, theta, chosen)
+        first = [int(np.flatnonzero(every.owner == i)[0]) for i in chosen]
+        return cls(every.probes[first], every.owner[first], every.size[first])
+
 
 def is_curved(library: Library, i: int) -> bool:
     """Whether a parameter's response is probed at several sizes of one sign."""

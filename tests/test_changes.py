@@ -72,14 +72,15 @@ def test_a_diagnosis_says_when_a_thruster_was_fouled(tmp_path):
 
 def test_a_thruster_that_is_fouled_for_seconds_is_found_in_its_part(tmp_path):
     fouled = Episode(ThrusterGain(3, 0.4), within(RUNS, 7, 3.1, 6.4))
-    state = found(tmp_path, fouled)
-    assert state.hypotheses == [("thruster_gain#1", "3")]
+    state = found(tmp_path, ThrusterGain(5, 0.7), fouled)
+    assert state.hypotheses == [("thruster_gain", "5"), ("thruster_gain#1", "3")]
     (part,) = parts_of(state.problem.library)
     assert part.when.first_run == part.when.last_run
     assert part.when.start == pytest.approx(3.1, abs=0.3)
     assert part.when.end == pytest.approx(6.4, abs=0.3)
     assert part.final == 0.0
-    assert not state.problem.library.used(state.current.theta)  # it has ended
+    (left,) = state.problem.library.used(state.current.theta)  # it has ended, the other lasts
+    assert np.flatnonzero(np.asarray(left.values)).tolist() == [4]
 
 
 @pytest.mark.slow
@@ -112,7 +113,13 @@ def test_a_compass_that_turns_between_two_runs_is_found_from_there_on(tmp_path):
     assert state.current.theta[offset] == pytest.approx(0.1, abs=0.01)
 
 
-@pytest.mark.parametrize("effects", [(), (ThrusterGain(3, 0.7),)], ids=["nothing", "constant"])
+@pytest.mark.parametrize(
+    "effects",
+    [
+        pytest.param((), id="nothing"),
+        pytest.param((ThrusterGain(3, 0.7),), id="constant", marks=pytest.mark.slow),
+    ],
+)
 def test_what_does_not_change_is_not_found_in_parts(tmp_path, effects):
     state = found(tmp_path, *effects, ordered=True)
     assert state.hypotheses == [("thruster_gain", "3")] * len(effects)

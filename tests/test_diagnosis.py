@@ -186,7 +186,14 @@ def test_nulls_are_adequate(null):
 
 @pytest.mark.parametrize(
     "name",
-    ["thruster_dead_zone", "thruster_gain", "net_buoyancy", "current_steady", "dvl_misalignment"],
+    [
+        "current_steady",
+        "dvl_misalignment",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("thruster_dead_zone", "thruster_gain", "net_buoyancy")
+        ),
+    ],
 )
 def test_causes_are_named_first(tmp_path, name):
     case, recording = recorded(tmp_path, 11, names=(name,))

@@ -172,7 +172,7 @@ def test_water_is_drawn_for_every_piece(problem_of):
     )
 
 
-@pytest.mark.parametrize("loop", ["open", "closed"])
+@pytest.mark.parametrize("loop", ["open", pytest.param("closed", marks=pytest.mark.slow)])
 def test_swell_is_measured(problem_of, loop):
     """Frequency, direction and size of a wave, with a pilot who works against it and without."""
     problem, wave = problem_of("waves", 1.0, loop=loop)

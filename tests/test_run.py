@@ -59,6 +59,7 @@ def test_same_seed_same_log_bit_for_bit(crossing):
     assert again.outcome == crossing.outcome
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_run(crossing):
     other = simulate(crossing.scenario.with_changes(seed=crossing.scenario.seed + 1))
     for name in ("X_WB", "X_WB_estimate", "flow_W", "F_Bo_B", "sample_p_WB"):

@@ -60,7 +60,13 @@ def test_pylon_crossing_is_the_papers_task():
         assert min(gaps) < scenario.station.load_vehicle().size[1] / 2
 
 
-@pytest.mark.parametrize("name", scenario_names())
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=[pytest.mark.slow] * n.endswith(("tracking_calm", "keeping_harbour")))
+        for n in scenario_names()
+    ],
+)
 def test_every_scenario_flies(name):
     text = "{duration: 0.1}"
     if isinstance(load_scenario(name).controller, MppiImpedance):

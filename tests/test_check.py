@@ -190,6 +190,7 @@ def test_cases_with_a_cause_in_a_part_of_a_session_say_which(folder, name):
     (hidden,) = found.truth.causes
     recording, runs = found.read(), PLAN.scenarios * PLAN.runs
     assert (found.truth.called, hidden.name) == (name, effect.cause)
+    assert hidden.when is not None
     assert hidden.when.kind == when.kind
     assert hidden.when.run == recording.scenarios[when.run - 1]
     assert np.allclose(np.diff([run.start for run in recording.trajectories()]), APART)

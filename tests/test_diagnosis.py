@@ -501,12 +501,43 @@ def test_how_thrusters_follow_is_told_with_number_and_place(tmp_path, name, seed
     assert seen is not None
     effect = refined(seen[0], seen[1], rng)
     assert (effect.kind, effect.acts_on) == (kind, hidden["where"])
-    told = described(effect, np.ones(1), problem)
+    told = described(effect, np.ones(1), np.zeros(1), problem)
     assert told["variables"] == list(case.answer()["causes"][0]["variables"])
     if name != "exchange":
         (number,) = hidden["parameters"].values()
         assert effect.numbers[0] == pytest.approx(number["value"], rel=0.1)
     assert words in told["description"]
+
+
+def test_a_velocity_that_heading_turns_is_found_with_its_terms_alone(tmp_path):
+    """And thrusters of ten times the force are tried with steps and rates of ten times the size."""
+    from spinndrift.training.diagnosis.candidates.groups import described, groups, refined
+    from spinndrift.training.diagnosis.candidates.unknowns import screened
+
+    case, recording = recorded(tmp_path, 70017, "unknown", names=("course",))
+    hidden = case.answer()["causes"][0]
+    problem = Diagnoser(recording, VEHICLE).problem
+    evaluation, rng = problem.evaluate(problem.believed), np.random.default_rng(0)
+    seen = screened(problem, evaluation, [], 0.01, rng)
+    assert seen is not None
+    effect = refined(seen[0], seen[1], rng)
+    assert (effect.kind, effect.acts_on) == ("course", hidden["where"])
+    _, velocity = hidden["variables"]
+    k, turned = (p["value"] for p in hidden["parameters"].values())
+    own = [effect.terms.index(f"{turn} ψ·{velocity}") for turn in ("cos", "sin")]
+    weights, errors = np.zeros(12), np.full(12, 0.1)
+    weights[own] = k * np.cos(turned), k * np.sin(turned)
+    told = described(effect, weights, errors, problem)
+    assert told["variables"] == ["heading", velocity]
+    assert set(told["description"].split(" in ")[1].split(", ")) == {effect.terms[i] for i in own}
+
+    def numbers(data):
+        tried = groups(replace(problem, data=data), evaluation, of_commands=True)
+        return np.array([n for g in tried if g.labels and g.effect.kind != "exchange"
+                         for label in g.labels for n in label])  # fmt: skip
+
+    ten = replace(problem.data, u=10 * problem.data.u)
+    np.testing.assert_allclose(numbers(ten), 10 * numbers(problem.data))
 
 
 def test_what_runs_ahead_of_its_command_has_no_rate_limit(tmp_path, monkeypatch):
@@ -515,7 +546,9 @@ def test_what_runs_ahead_of_its_command_has_no_rate_limit(tmp_path, monkeypatch)
     from spinndrift.training.diagnosis.candidates.structures import Screen
 
     problem = Diagnoser(recorded(tmp_path, 3, "null")[1], VEHICLE).problem
-    group = _of_follower(problem, "slew", "thrusters", FOLLOWED["slew"])
+    largest = float(np.abs(problem.data.u).max())
+    numbers = [n * largest for n in FOLLOWED["slew"]]
+    group = _of_follower(problem, "slew", "thrusters", numbers)
 
     def won(lag):
         theta = problem.believed.copy()

@@ -29,6 +29,8 @@ MOTION: dict[str, Callable[[Array], Array]] = {
 """Terms of a wrench in the velocities (u, v, w, p, q, r)."""
 POSE = ("cos ψ", "sin ψ", "cos 2ψ", "sin 2ψ", "φ", "θ")
 """Terms in heading ψ, roll φ and pitch θ."""
+COURSE = tuple(f"{turn}·{n}" for turn in POSE[:2] for n in TWIST)
+"""Terms in the heading times a velocity."""
 POWERS = ("|f|f", "f²", "f³")
 """Terms in a thruster's force, in units of 10 N."""
 WORLD = ("east", "north", "up")
@@ -37,13 +39,14 @@ _SIZES = {
 }  # fmt: skip
 _FOLLOWED = 2.0
 """Memory duration (s) assumed for thrusters that follow their command (`FOLLOWERS`)."""
-_PUSHES = ("motion", "pose", "place", "depth", "damping")
+_PUSHES = ("motion", "pose", "course", "place", "depth", "damping")
 
 
 class Unknown(Effect):
     """Σ_k w_k φ_k on one axis, thruster or in W; φ by `kind`, with its constants in `numbers`.
 
-    `motion`: terms of `MOTION` by index, a wrench on an axis. `pose`: all of `POSE`, likewise.
+    `motion`: terms of `MOTION` by index, a wrench on an axis. `pose` and `course`: all of `POSE`
+    or of `COURSE`, likewise.
     `memory`: ξ, Re z and Im z with z' = (-1/T + 2πi f) z + ξ, ξ a velocity; numbers T (s), f (Hz)
     and its index, by default that of the axis. `thruster`: all of `POWERS` on one thruster.
     `place`: a force in W of bumps exp(-½ |p - c|² / s²) over the horizontal plane, east and north
@@ -80,8 +83,8 @@ class Unknown(Effect):
         if self.kind == "memory":
             own = TWIST[self.remembered]
             return own, f"Re z({own})", f"Im z({own})"
-        if self.kind == "pose":
-            return POSE
+        if self.kind in ("pose", "course"):
+            return POSE if self.kind == "pose" else COURSE
         if self.kind == "thruster":
             return POWERS
         if self.kind in FOLLOWERS or self.kind == "exchange":
@@ -132,6 +135,9 @@ class Unknown(Effect):
             return jnp.stack([MOTION[names[int(i)]](V_CB_B) for i in self.numbers])
         if self.kind == "pose":
             return _attitude(X_WB)
+        if self.kind == "course":
+            turn = _attitude(X_WB)[:2]
+            return (turn[:, None] * V_CB_B[None]).reshape(len(COURSE), *V_CB_B.shape[1:])
         if self.kind == "depth":
             c, s = self.numbers
             z = (X_WB[6] - c) / s

@@ -71,6 +71,7 @@ UNKNOWN: dict[str, type] = {
     "slew": unknown.Slew,
     "exchange": unknown.Exchange,
     "steps": unknown.Steps,
+    "course": unknown.Course,
 }
 
 

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from .effect import Effect, Latent, Moment, Parameters, around, one_axis, sign, value
-from .rotations import cross
+from .rotations import cross, heading
 from .vehicle import AXES
 
 
@@ -241,6 +241,40 @@ class Exchange(_Unknown):
     def drawn(cls, rng: Any, size: float) -> "Exchange":
         i, j = sorted(int(k) for k in rng.choice(8, 2, replace=False))
         return cls((i + 1, j + 1), min(size, 1.0))
+
+
+@dataclass(frozen=True)
+class Course(_Unknown):
+    """A wrench on one axis in a velocity that heading turns: k cos(ψ - ψ₀) ν_j."""
+
+    kind = "course"
+    axis: int = 5
+    of: int = 0
+    size: float = 0.0
+    turned: float = 0.0
+
+    @property
+    def variables(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return "heading", "uvwpqr"[self.of]
+
+    @property
+    def where(self) -> str:
+        return AXES[self.axis]
+
+    def parameters(self) -> Parameters:
+        return {"size": value(self.size, "N s"), "turned": value(self.turned, "rad")}
+
+    def neutral(self) -> bool:
+        return self.size == 0
+
+    def wrench(self, now: Moment, latent: Latent, state: np.ndarray) -> np.ndarray:
+        turn = np.cos(heading(now.q) - self.turned)
+        return one_axis(self.axis, self.size * turn * now.nu_r[self.of])
+
+    @classmethod
+    def drawn(cls, rng: Any, size: float) -> "Course":
+        axis, of = [(5, 0), (1, 0), (0, 1), (5, 1)][rng.integers(4)]
+        return cls(axis, of, around(rng, (4.0 if axis == 5 else 12.0) * size), rng.uniform(-3, 3))
 
 
 @dataclass(frozen=True)

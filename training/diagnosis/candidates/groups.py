@@ -26,11 +26,13 @@ NODES = {
 }
 """Time constants (s) of a memory, and frequencies (Hz) for each, densest where vehicles and loads
 that hang on them resonate."""
-FOLLOWED = {"play": (0.3, 0.6, 1.2, 2.4, 4.8), "slew": (8.0, 16.0, 32.0, 64.0, 128.0)}
-"""Backlash (±N) and rate limits (N/s) of thrusters that are tried."""
-STEPS = tuple(float(s) for s in np.geomspace(1.0, 16.0, 37))
-"""Steps (N) of the thrust that are tried, of all thrusters: what sends or executes the commands has
-a resolution. Nodes are close, as all multiples up to the largest force have to fit."""
+FOLLOWED = {"play": (0.0075, 0.015, 0.03, 0.06, 0.12), "slew": (0.2, 0.4, 0.8, 1.6, 3.2)}
+"""Backlash (±) and rate limits (1/s) that are tried, in shares of the largest force."""
+STEPS = tuple(float(s) for s in np.geomspace(0.025, 0.4, 37))
+"""Steps of the thrust, of all thrusters, likewise: what sends or executes the commands has a
+resolution. Nodes are close, as all multiples up to the largest force must fit."""
+_TOLD = 2.0
+"""Standard errors from which on a term of unmodelled structure is named."""
 _CORRELATED, _MOST_CORRELATED = 0.1, 2
 """Correlation of neighbouring innovations from which memories of other velocities are tried on an
 axis, and number of such axes at most."""
@@ -50,10 +52,11 @@ def groups(
     level = d.command != "F_Bo_B"
     if level:
         yield _of_exchange(problem)
+        largest = float(np.quantile(np.abs(d.u).max(axis=1)[d.weight > 0], 0.99))
         for where in ("thrusters", *(str(k + 1) for k in range(d.u.shape[1]))):
             for kind, numbers in FOLLOWED.items():
-                yield _of_follower(problem, kind, where, numbers)
-        yield _of_follower(problem, "steps", "thrusters", STEPS)
+                yield _of_follower(problem, kind, where, [n * largest for n in numbers])
+        yield _of_follower(problem, "steps", "thrusters", [n * largest for n in STEPS])
     if of_commands:
         return
     nodes = [(time, f) for time, frequencies in NODES.items() for f in frequencies]
@@ -66,7 +69,8 @@ def groups(
         axis = AXES[i]
         yield _memory(problem, i, i, nodes)
         yield _of_state(problem, Unknown.neutral(kind="motion", acts_on=axis, numbers=_ALL_MOTION))
-        yield _of_state(problem, Unknown.neutral(kind="pose", acts_on=axis))
+        for kind in ("pose", "course"):
+            yield _of_state(problem, Unknown.neutral(kind=kind, acts_on=axis))
     for k in range(d.u.shape[1] if level else 0):
         yield _of_thruster(problem, k)
     z = d.X[:-1, 6][d.weight > 0]
@@ -82,9 +86,10 @@ def groups(
 
 _ALL_MOTION = tuple(float(i) for i in range(len(MOTION)))
 _VARIABLES = {
-    "motion": TWIST, "pose": ("heading", "roll", "pitch"), "depth": ("z",), "place": ("x", "y"),
-    "flow": ("x", "y"), "damping": ("z",),
+    "motion": TWIST, "pose": ("heading", "roll", "pitch"), "course": ("heading", *TWIST),
+    "depth": ("z",), "place": ("x", "y"), "flow": ("x", "y"), "damping": ("z",),
 }  # fmt: skip
+_SYMBOLS = {"heading": "ψ", "roll": "φ", "pitch": "θ"}
 
 
 def _of_state(problem: DiagnosisProblem, effect: Unknown) -> Group:
@@ -271,9 +276,19 @@ def refined(screen: Screen, found: Matched, rng: np.random.Generator) -> Unknown
     return effect
 
 
-def described(effect: Unknown, weights: np.ndarray, problem: DiagnosisProblem) -> dict[str, Any]:
-    """Variables, one sentence, lag, frequency and region of what was matched."""
-    d = problem.data
+def described(
+    effect: Unknown,
+    weights: Float[np.ndarray, " k"],
+    errors: Float[np.ndarray, " k"],
+    problem: DiagnosisProblem,
+) -> dict[str, Any]:
+    """Variables, one sentence, lag, frequency and region of what was matched.
+
+    Terms are named whose weights differ from zero by their standard errors, the clearest first.
+    """
+    d, clear = problem.data, np.abs(weights) / np.maximum(errors, 1e-300)
+    order = [i for i in np.argsort(-clear) if clear[i] > _TOLD] or [int(np.argmax(clear))]
+    terms = [effect.terms[i] for i in order]
     lag = frequency = None
     where = effect.acts_on
     variables: Sequence[str] = _VARIABLES.get(effect.kind, ())
@@ -282,13 +297,12 @@ def described(effect: Unknown, weights: np.ndarray, problem: DiagnosisProblem) -
         variables = (effect.terms[0],)
         rings = f" and rings at {frequency:.2f} Hz" if frequency else ""
         description = f"a wrench on {where} that remembers {variables[0]} for {lag:.2g} s{rings}"
-    elif effect.kind == "motion":
-        order = np.argsort(-np.abs(weights))
-        description = f"a wrench on {where} in " + ", ".join(effect.terms[i] for i in order)
-        variables = [n for n in TWIST if any(n in effect.terms[i] for i in order)]
+    elif effect.kind in ("motion", "pose", "course"):
+        description = f"a wrench on {where} in " + ", ".join(terms)
+        variables = [n for n in variables if any(_SYMBOLS.get(n, n) in _factors(t) for t in terms)]
     elif effect.kind == "thruster":
         variables = (f"f{where}",)
-        description = f"the force of thruster {where} against its command"
+        description = f"the force of thruster {where} against its command, in {', '.join(terms)}"
     elif effect.kind == "exchange":
         i, j = (int(k) for k in effect.numbers)
         variables = (f"f{i}", f"f{j}")
@@ -305,13 +319,11 @@ def described(effect: Unknown, weights: np.ndarray, problem: DiagnosisProblem) -
             "steps": "in steps of {:.2g} N",
         }
         description = f"{who} commands {how[effect.kind].format(effect.numbers[0])}"
-    elif effect.kind == "pose":
-        description = f"a wrench on {where} that depends on heading, roll or pitch"
     elif effect.kind == "damping":
         variables = ("z", TWIST[AXES.index(where)])
-        description = f"damping of {where} that depends on depth"
+        description = f"damping of {where} that depends on depth, in {', '.join(terms)}"
     elif effect.kind == "depth":
-        description = "a force in W that depends on depth"
+        description = f"a force in W that depends on depth: {', '.join(terms)}"
     else:
         what = "moving water" if effect.kind == "flow" else "a force"
         count = len(weights) // 2
@@ -324,6 +336,11 @@ def described(effect: Unknown, weights: np.ndarray, problem: DiagnosisProblem) -
         "acts_on": where, "variables": list(variables), "description": description, "lag": lag,
         "frequency": frequency or None, "region": _region(variables, d),
     }  # fmt: skip
+
+
+def _factors(term: str) -> set[str]:
+    """The letters of a term: `|u|u` has u, `sin 2ψ·r` has ψ and r."""
+    return set(term.replace("sin", "").replace("cos", ""))
 
 
 def _region(variables: Sequence[str], d: Data) -> dict[str, tuple[float, float]]:

@@ -146,8 +146,9 @@ def described_structure(state: Selection, structure: FoundStructure) -> result.S
     """The structure added last, in words."""
     library, (name, where) = state.problem.library, state.hypotheses[-1]
     effect = next(e for e in library.effects if isinstance(e, Unknown) and e.places == (where,))
-    words = described(effect, state.current.theta[library.at(name, where)], state.problem)
-    best = max([structure.name_gain, *(gain for _, gain in state.accepted[-1].rivals)])
+    weights, choice = state.current.theta[library.at(name, where)], state.accepted[-1]
+    words = described(effect, weights, choice.fit.errors, state.problem)
+    best = max([structure.name_gain, *(gain for _, gain in choice.rivals)])
     return result.Structure(**words, heldout_gain=structure.gain, best_name_gain=best)
 
 

@@ -196,6 +196,24 @@ def test_gains_of_parts_are_those_of_least_squares(tmp_path):
     assert after.gain == pytest.approx(gained, abs=1e-5)
 
 
+def test_what_acts_in_most_of_a_session_is_repeated_beside_a_constant_that_is_free(tmp_path):
+    problem = started(recorded(tmp_path, ordered=True)).problem
+    steps = Session.of(problem.data)
+    rng = np.random.default_rng(2)
+    z = rng.standard_normal((2, 12 * len(steps.run)))
+    scan = Scan(z, steps, {("a", "all"): [1]}, [1], np.full(2, 1e-9))
+    acting = np.repeat(steps.envelope(Span("onwards", int(steps.edges[20]), len(steps.run))), 12)
+    moved = replace(scan, z=np.stack([z[0] + 0.2 * acting * z[1], z[1]]))
+    change = moved.of(("a", "all"))
+    assert change.span.kind == "onwards"
+    assert abs(change.span.first - steps.edges[20]) < 2 * np.diff(steps.edges).max()
+    assert change.repeated > 0.8 * change.gain > 40
+    knock = np.zeros_like(acting)
+    knock[12 * steps.edges[30] : 12 * steps.edges[31]] = 1.0
+    one = replace(scan, z=np.stack([z[0] + 2.0 * knock * z[1], z[1]])).of(("a", "all"))
+    assert one.repeated < 0.5 * one.gain
+
+
 def test_a_session_has_the_order_of_its_times_and_its_parts_lie_within_runs_without(tmp_path):
     known = Session.of(started(recorded(tmp_path / "a", ordered=True)).problem.data)
     assert known.ordered

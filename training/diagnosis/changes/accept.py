@@ -28,7 +28,7 @@ from .session import Session, Span
 _MOST = 3
 """Most parts: what changes more often is a random disturbance, or another cause."""
 _MORE = 0.15
-"""Share of a constant cause's gain that its change must win in addition."""
+"""Share of a constant cause's gain that its change must win in addition, unless it replaces it."""
 _ELSEWHERE = 0.3
 """Share of its gain that other causes may win in parts once it is accounted for: what is misfitted
 in many parts is not local. So much may be left to a law of the disturbance, too."""
@@ -45,9 +45,9 @@ def with_changes(state: Selection, search: Search) -> Selection:
     """The selection with causes that act in a part of the data, if there are any.
 
     Such a cause must win more than noise in the best of all parts tried, clearly more than the same
-    cause in all of the data, the same values in every other block, and leave little to other
-    causes in parts or to a law of the disturbance. Constant causes that it makes redundant are
-    dropped.
+    cause in all of the data or in its place, the same with values fitted to every other block, and
+    leave little to other causes in parts or to a law of the disturbance. Constant causes that it
+    makes redundant are dropped.
     """
     session = Session.of(state.problem.data)
     found = state
@@ -80,11 +80,22 @@ def _best(state: Selection, search: Search, session: Session) -> Change | None:
     change = scan.best(least)
     if change is None or change.repeated < _REPEATED * change.gain:
         return None
-    alone = scan.constant_gain(change.hypothesis)
-    if change.gain < max(_MORE * gains.get(change.hypothesis, 0.0), (1 + _MORE) * alone):
+    alone, constant = scan.constant_gain(change.hypothesis), gains.get(change.hypothesis, 0.0)
+    if change.gain < (1 + _MORE) * alone:
+        return None
+    if change.gain < _MORE * constant and not _replaces(change, scan, state, margin(constant)):
         return None
     other = scan.with_change(change).best(least, without=[change.hypothesis])
     return None if other is not None and other.gain > _ELSEWHERE * change.gain else change
+
+
+def _replaces(change: Change, scan: Scan, state: Selection, least: float) -> bool:
+    """Whether the constant cause wins less than `least` nats beside a change of the same kind."""
+    own, rows = scan.candidates[change.hypothesis], state.problem.library.at(*change.hypothesis)
+    z = scan.z.copy()
+    z[0] -= state.current.theta[rows].astype(z.dtype) @ z[own]  # as if it were not there
+    without = replace(scan, z=z, free=[i for i in scan.free if i not in own])
+    return without.with_change(change).constant_gain(change.hypothesis) < least
 
 
 def _scan(state: Selection, search: Search, session: Session) -> Scan:

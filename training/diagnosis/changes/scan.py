@@ -36,7 +36,7 @@ class Change:
         hypothesis: cause and place.
         span: the part.
         gain: nats, with all free parameters profiled out.
-        repeated: nats that values from every other block of the part win on the rest of it.
+        repeated: nats that values fitted to every other block of the session win on the rest.
         cost: nats that noise wins: the logarithm of the number of parts tried, and half of that of
             the number of steps for each parameter (Schwarz 1978).
     """
@@ -180,13 +180,38 @@ class Scan:
         return H, N @ self.z[0].astype(float), scale
 
     def _repeated(self, own: list[int], span: Span) -> float:
-        """What values from every other block of a part win on the rest."""
-        g, products = self._by_block(span), self._products(own)
-        number = np.cumsum(g > 0)
-        halves = [_weighted(products, g * (number % 2 == k)) for k in (0, 1)]
-        (s, S), (s2, S2) = (tuple(a[0] for a in self._profiled(own, half)) for half in halves)
-        at, at2 = -np.linalg.solve(S, s), -np.linalg.solve(S2, s2)
-        return -float(s @ at2 + at2 @ S @ at2 / 2 + s2 @ at + at @ S2 @ at / 2)
+        """What values fitted to every other block of the session win on the rest of it."""
+        envelope = np.repeat(self.session.envelope(span), _OF_A_STEP)
+        columns = np.concatenate([self.z[:1], self.z[own] * envelope, self.z[self.free]])
+        block = np.repeat(np.arange(len(self.session.edges) - 1), np.diff(self.session.edges))
+        odd = np.repeat(block % 2 == 1, _OF_A_STEP)
+        halves = [columns[:, odd].astype(float), columns[:, ~odd].astype(float)]
+        products = [half @ half.T for half in halves]
+        prior = np.concatenate([self.prior[own], self.prior[self.free]]) / 2
+        free = list(range(1 + len(own), len(columns)))
+        return sum(
+            _loss(there, free, _fitted(here, free, prior))
+            - _loss(there, every, _fitted(here, every, prior))
+            for every in [list(range(1, len(columns)))]
+            for here, there in (products, products[::-1])
+        )
+
+
+def _fitted(
+    G: Float[np.ndarray, "m m"], chosen: list[int], prior: Float[np.ndarray, " p"]
+) -> Float[np.ndarray, " k"]:
+    """Values of columns that are fitted together, from products with innovations in row 0."""
+    if not chosen:
+        return np.zeros(0)
+    H = G[np.ix_(chosen, chosen)] + np.diag(prior[np.array(chosen) - 1])
+    scale = np.sqrt(np.diag(H))
+    H = H / np.outer(scale, scale) + _RIDGE * np.eye(len(H))
+    return -np.linalg.solve(H, G[chosen, 0] / scale) / scale
+
+
+def _loss(G: Float[np.ndarray, "m m"], chosen: list[int], x: Float[np.ndarray, " k"]) -> float:
+    """Nats of values beyond those of none."""
+    return float(x @ G[chosen, 0] + x @ G[np.ix_(chosen, chosen)] @ x / 2)
 
 
 def _weighted(products: Sums, g: Float[np.ndarray, " K"]) -> Sums:

@@ -3,11 +3,13 @@
 import json
 import math
 import struct
+import threading
 import time
 
 import numpy as np
 import pytest
 
+from spinndrift.systems.dvl.config import NucleusDvl
 from spinndrift.systems.dvl.nucleus import Nucleus, checksum
 from spinndrift.systems.dvl.reading import DvlReading
 from spinndrift.systems.dvl.stream import DvlStream
@@ -140,10 +142,41 @@ def test_damaged_streams_raise_nothing_and_recover(kind):
     assert len(list(decoder.readings(b"\n" + make() * 60))) >= 10
 
 
+def hello(transport):
+    transport.write(b"hello\n")
+
+
+@pytest.mark.parametrize("asks", [True, False], ids=["password", "none"])
+def test_a_nucleus_is_logged_in_before_it_is_started(asks):
+    server = Connection.parse("tcpin:127.0.0.1:0").open()
+    heard: list[bytes] = []
+
+    def instrument():
+        words = b""
+        server.read(5.0)  # accepts
+        if asks:
+            server.write(b"Please enter password:\r\n")
+        while not words.endswith(b"START\r\n") and len(words) < 50:
+            words += server.read(1.0)
+            if asks and words == b"secret\r\n":
+                server.write(b"Welcome to Nortek Nucleus\r\n")
+        heard.append(words)
+        server.write(bottom_track())
+
+    thread = threading.Thread(target=instrument, daemon=True)
+    thread.start()
+    stream = NucleusDvl(f"tcp:127.0.0.1:{server.port}", "secret").open()
+    assert _until(lambda: stream.newest is not None)
+    thread.join(5.0)
+    assert heard == [b"secret\r\nSTART\r\n" if asks else b"START\r\n"]
+    stream.close()
+    server.close()
+
+
 def test_a_stream_gives_the_time_of_validity_and_connects_again():
     server = Connection.parse("tcpin:127.0.0.1:0").open()
     port = server.port
-    stream = DvlStream(Connection.parse(f"tcp:127.0.0.1:{port}"), WaterLinked(), b"hello\n")
+    stream = DvlStream(Connection.parse(f"tcp:127.0.0.1:{port}"), WaterLinked(), hello)
     assert stream.newest is None
     heard = b""
     end = time.monotonic() + 5

@@ -1,6 +1,7 @@
 """DVLs that are read directly, by kind."""
 
 from dataclasses import dataclass
+from functools import partial
 
 from ..mavlink.transport import Connection
 from . import nucleus, water_linked
@@ -36,9 +37,11 @@ class NucleusDvl:
 
     Attributes:
         connection: tcp:HOST:PORT of its stream.
+        password: that it asks for on TCP.
     """
 
     connection: str = f"tcp:192.168.2.201:{nucleus.PORT}"
+    password: str = nucleus.PASSWORD
 
     def __post_init__(self) -> None:
         """Check the connection."""
@@ -50,7 +53,9 @@ class NucleusDvl:
         Raises:
             UserError: it can't be reached.
         """
-        return DvlStream(Connection.parse(self.connection), nucleus.Nucleus(), nucleus.START)
+        connection, password = Connection.parse(self.connection), self.password
+        login = partial(nucleus.start, password=password)
+        return DvlStream(connection, nucleus.Nucleus(), login)
 
 
 DvlKind = WaterLinkedDvl | NucleusDvl

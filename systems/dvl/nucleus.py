@@ -7,15 +7,20 @@ modulo 2¹⁶; an odd last byte is the upper half of a word.
 """
 
 import struct
+import time
 from collections.abc import Iterable
 
 import numpy as np
 
+from ..mavlink.transport import Transport
 from .reading import DvlReading
 
 PORT = 9000
-START = b"START\r\n"
-"""The command that starts the measurement."""
+PASSWORD = "nortek"
+"""That of a new instrument."""
+_START = b"START\r\n"
+_PROMPT, _GREETING = b"password", b"Welcome"
+_PATIENCE, _WAIT = 2.0, 0.1  # s for the instrument's first words
 
 _SYNC, _FAMILY, _BOTTOM_TRACK = 0xA5, 0x20, 0xB4
 _HEADER = struct.Struct("<BBBBHHH")
@@ -24,6 +29,25 @@ _BEAMS = struct.Struct("<3f")
 _DISTANCE, _VELOCITY, _MERIT, _DELAY, _SIZE = 48, 96, 108, 124, 128
 _XYZ_VALID, _MERIT_VALID = 0b111 << 9, 0b111 << 12
 _LONGEST = 7000  # bytes of a packet
+
+
+def start(transport: Transport, password: str) -> None:
+    """Log in where the instrument asks for its password, and start the measurement.
+
+    On TCP the first line that it gets is the password. A serial line asks for none.
+
+    Raises:
+        Lost: the connection has ended.
+    """
+    words, end = b"", time.monotonic() + _PATIENCE
+    while time.monotonic() < end and _PROMPT not in words and _GREETING not in words:
+        words += transport.read(_WAIT)
+    if _PROMPT in words:
+        transport.write(password.encode() + b"\r\n")
+        end = time.monotonic() + _PATIENCE
+        while time.monotonic() < end and not transport.read(_WAIT):
+            pass
+    transport.write(_START)
 
 
 class Nucleus:

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -25,13 +26,18 @@ class Timed(NamedTuple):
 class DvlStream:
     """The newest reading of a DVL; connects again when the stream ends."""
 
-    def __init__(self, connection: Connection, decoder: Decoder, start: bytes = b""):
-        """Connect, send `start` and read from then on.
+    def __init__(
+        self,
+        connection: Connection,
+        decoder: Decoder,
+        login: Callable[[Transport], None] = lambda transport: None,
+    ):
+        """Connect, `login` on each connection, and read from then on.
 
         Raises:
             UserError: the DVL can't be reached.
         """
-        self.connection, self._decoder, self._start = connection, decoder, start
+        self.connection, self._decoder, self._login = connection, decoder, login
         self.reconnections = 0
         self._clock = VehicleClock()
         self._newest: Timed | None = None
@@ -65,8 +71,7 @@ class DvlStream:
     def _open(self) -> Transport:
         opened = self.connection.open()
         with suppress(Lost):
-            if self._start:
-                opened.write(self._start)
+            self._login(opened)
         return opened
 
     def _run(self) -> None:

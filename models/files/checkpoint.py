@@ -215,6 +215,8 @@ def _describe_extended(model: Extended) -> dict[str, Any]:
 
 def _neutral(name: str, options: dict[str, Any], thrusters: int) -> Effect:
     """An effect by name; its options must have the types of their defaults."""
+    if not isinstance(name, str):
+        raise ValueError("name of an effect")
     cls = kind(name)
     usual = {field.name: field.default for field in dataclasses.fields(cls)}
     if not isinstance(options, dict):

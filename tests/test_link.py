@@ -1,5 +1,6 @@
 """The link's thread against a peer on loopback that speaks MAVLink packets."""
 
+import io
 import threading
 import time
 from collections.abc import Callable
@@ -169,6 +170,41 @@ def test_without_a_vehicle_the_sentence_says_what_was_heard():
         link.find_vehicle(0.2)
     link.close()
     server.close()
+
+
+def test_clocks_of_others_and_times_of_fixes_are_no_boot(flying):
+    link, vehicle, _ = flying
+    link.find_vehicle(5.0)
+    other = Parser(1, 191)
+    for _ in range(20):
+        vehicle.send(mavlink.MAVLink_gps_raw_int_message(3_000_000, 1, 0, 0, 0, 0, 0, 0, 0, 0))
+        since_1970 = mavlink.MAVLink_timesync_message(time.time_ns(), time.monotonic_ns())
+        vehicle.transport.write(other.packed(since_1970))
+        vehicle.send(mavlink.MAVLink_timesync_message(5_000_000_000, 17))  # not asked for
+        time.sleep(0.03)
+    assert link.wait_for("GPS_RAW_INT", 5.0, since=0.0) is not None
+    assert link.statistics().reboots == 0
+    assert within(5.0, lambda: link.statistics().round_trip is not None)
+    local = link.clock.local(vehicle.boot)
+    assert local == pytest.approx(time.monotonic(), abs=0.1)
+
+
+def test_commands_go_on_where_the_record_cannot_be_written(flying):
+    link, vehicle, path = flying
+    link.find_vehicle(5.0)
+
+    class Full(io.BytesIO):
+        name = str(path)
+
+        def write(self, data):
+            raise OSError(28, "No space left on device")
+
+    link._record.close()
+    link._record = Full()
+    count = len(vehicle.heard)
+    assert link.send(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3))
+    assert within(5.0, lambda: len(vehicle.heard) > count + 3)  # its own heartbeats go on, too
+    assert any("No space left" in text for _, _, text in link.texts())
 
 
 def test_mutated_frames_raise_nothing():

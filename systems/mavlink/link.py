@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -31,6 +31,7 @@ _AIDS = ("VISION_POSITION_DELTA", "ODOMETRY", "DISTANCE_SENSOR")
 """What a companion computer sends to the autopilot about the motion, under any system id."""
 _STEERING = ("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE")
 _BOOT_CLOCKS = {"SERVO_OUTPUT_RAW": MICROSECONDS_32}  # others' time_usec has 64 bits
+_OF_A_FIX = ("GPS_RAW_INT", "GPS2_RAW")  # time of the last fix: it stands still under water
 
 
 class Received(NamedTuple):
@@ -106,6 +107,7 @@ class Link:
         self._boots = 0
         self._when_booted: list[Callable[[], object]] = []
         self._booted_calls = 0
+        self._asked: deque[int] = deque(maxlen=20)  # times of our TIMESYNC requests (ns)
         self._texts: deque[tuple[float, int, str]] = deque(maxlen=200)
         self._readers: list[Callable[[Received], None]] = []
         self._changed = threading.Condition()
@@ -284,7 +286,8 @@ class Link:
                 self.send(heartbeat.ours())
             if now >= due["timesync"]:
                 due["timesync"] = now + _TIMESYNC
-                self.send(mavlink.MAVLink_timesync_message(0, time.monotonic_ns()))
+                self._asked.append(time.monotonic_ns())
+                self.send(mavlink.MAVLink_timesync_message(0, self._asked[-1]))
             if self._booted_calls and now >= due["booted"]:
                 due["booted"], self._booted_calls = now + 1.0, self._booted_calls - 1
                 for act in self._when_booted:
@@ -334,7 +337,8 @@ class Link:
             self._keep(message.get_msgbuf())
         found = Received(message, arrival, boot_time(message, arrival, self.clock))
         if name == "TIMESYNC":
-            self._exchanged(message, arrival)
+            if peer == self.vehicle:
+                self._exchanged(message, arrival)
         elif found.boot is not None and peer == self.vehicle:  # others may have other clocks
             self.clock.arrived(found.boot, arrival)
         if self.clock.reboots != self._boots:  # its sequence began anew, and its requested rates
@@ -355,13 +359,21 @@ class Link:
             reader(found)
 
     def _exchanged(self, message: Message, arrival: float) -> None:
-        if message.tc1 > 0:  # an answer; requests of the vehicle are not answered
+        if message.tc1 > 0 and message.ts1 in self._asked:  # an answer to one of our requests
             self.clock.exchanged(message.ts1 * 1e-9, message.tc1 * 1e-9, arrival)
 
     def _keep(self, packet: bytes | bytearray) -> None:
         """Append a packet to the telemetry log: time in µs since 1970, then the packet."""
-        if self._record is not None:
+        if self._record is None:
+            return
+        try:
             self._record.write(struct.pack(">Q", time.time_ns() // 1000) + bytes(packet))
+        except OSError as error:  # commands and heartbeats go on without a record
+            text = f"{self._record.name} can't be written any more: {error.strerror}"
+            with suppress(OSError):
+                self._record.close()
+            self._record = None
+            self._texts.append((time.monotonic(), mavlink.MAV_SEVERITY_WARNING, text))
 
 
 def boot_time(message: Message, arrival: float, clock: VehicleClock) -> float | None:
@@ -371,7 +383,7 @@ def boot_time(message: Message, arrival: float, clock: VehicleClock) -> float | 
     """
     if (ms := getattr(message, "time_boot_ms", None)) is not None:
         return clock.continued(ms * 1e-3, MILLISECONDS_32, arrival)
-    us = getattr(message, "time_usec", None)
+    us = None if message.get_type() in _OF_A_FIX else getattr(message, "time_usec", None)
     if us is None or not 0 <= us < 1e15:
         return None
     span = _BOOT_CLOCKS.get(message.get_type())

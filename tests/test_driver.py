@@ -8,12 +8,14 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from served_vehicle import Served
 
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.sims.vehicle.telemetry import messages
 from spinndrift.systems.mavlink import commands, telemetry
 from spinndrift.systems.mavlink.config import Mavlink
 from spinndrift.systems.mavlink.driver import Acted, Driver
@@ -155,6 +157,64 @@ def test_a_guard_holds_depth_with_neutral_sticks(port: int):
         assert shown is not None
         np.testing.assert_allclose(shown.value[:2], 1500.0, atol=60)  # no more surge
     check_at_rest(port)
+
+
+@pytest.mark.parametrize("way", ["manual_control", "thruster_passthrough"])
+def test_directions_are_the_vehicles_and_outputs_are_told_with_the_scenarios(port: int, way):
+    thrusters, F = load_vehicle("bluerov2_heavy").thrusters(), WRENCHES[0]
+    with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
+        link.find_vehicle(15.0)
+        parameters = Parameters(link)
+        parameters.write("MOT_3_DIRECTION", -1.0)
+        parameters.write("JS_THR_GAIN", 0.8)
+    try:
+        with connect(port, actuation=way) as driver:
+            driver.prepare()
+            fly(driver, np.zeros(6), 1.0)
+            acted = fly(driver, F + WRENCHES[2] / 2, 0.7)
+            shown = driver.sense().outputs
+            assert shown is not None
+            np.testing.assert_allclose(shown.value, acted.expected, atol=4.0)
+            told, volts = driver.as_described(acted.expected), driver.sense().voltage
+        given = thrusters.wrench(thrusters.force(jnp.asarray(told), volts))
+        np.testing.assert_allclose(given, F + WRENCHES[2] / 2, atol=1.0)
+        mirrored = np.flatnonzero(told != acted.expected)
+        assert mirrored.tolist() == [2]
+        check_at_rest(port)
+    finally:
+        with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
+            link.find_vehicle(15.0)
+            parameters = Parameters(link)
+            parameters.write("MOT_3_DIRECTION", 1.0)
+            parameters.write("JS_THR_GAIN", 1.0)
+
+
+def test_a_pilot_s_station_is_obeyed_again_after_the_dive(served: Served, port: int):
+    values = served.simulation.vehicle.parameters
+    assert values["SYSID_MYGCS"] == 255
+    with connect(port, system=254) as driver:
+        assert until(lambda: all(found.passed for found in driver.preflight()), 30.0)
+        driver.prepare()
+        assert values["SYSID_MYGCS"] == 254
+        fly(driver, np.zeros(6), 1.0)
+        acted = fly(driver, WRENCHES[0], 0.7)
+        shown = driver.sense().outputs
+        assert shown is not None
+        np.testing.assert_allclose(shown.value, acted.expected, atol=4.0)
+        driver._ask(176, 1.0, 0.0)  # another station changes the mode
+        assert fly(driver, WRENCHES[0], 1.0).order == "yield"
+    assert values["SYSID_MYGCS"] == 255
+    assert values["FS_PILOT_TIMEOUT"] == 3.0
+
+
+def test_a_depth_sensor_that_fails_ends_the_dive(served: Served, port: int, monkeypatch):
+    with connect(port) as driver:
+        driver.prepare()
+        assert fly(driver, np.zeros(6), 0.5).order == "fly"
+        monkeypatch.setattr(messages, "_SENSORS_HEALTHY", messages._SENSORS_HEALTHY & ~8)
+        monkeypatch.setattr(messages, "_SENSORS_ALIGNED", messages._SENSORS_ALIGNED & ~8)
+        acted = fly(driver, np.zeros(6), 2.0)
+        assert "the depth sensor is not healthy" in acted.reason
 
 
 def test_a_pilot_who_changes_the_mode_is_left_alone(port: int):

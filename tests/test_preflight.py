@@ -4,7 +4,13 @@ import pytest
 
 from spinndrift.systems.mavlink.dialect import mavlink
 from spinndrift.systems.mavlink.link import Statistics
-from spinndrift.systems.mavlink.preflight import FAILSAFES, Facts, Requirements, preflight
+from spinndrift.systems.mavlink.preflight import (
+    FAILSAFES,
+    Facts,
+    Requirements,
+    for_dive,
+    preflight,
+)
 
 NEEDS = Requirements(8, rates={"ATTITUDE_QUATERNION": 50.0, "SCALED_PRESSURE2": 10.0})
 PARAMETERS = {
@@ -14,6 +20,7 @@ PARAMETERS = {
     "MOT_PWM_MAX": 1900.0,
     **{f"SERVO{n}_FUNCTION": 32.0 + n for n in range(1, 9)},
     **{f"RC{n}_TRIM": 1500.0 for n in range(1, 9)},
+    "RC3_TRIM": 1100.0,
     **FAILSAFES,
 }
 FINE = Facts(
@@ -24,7 +31,9 @@ FINE = Facts(
     armed=False,
     mode="MANUAL",
     voltage=16.1,
-    health=mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL,
+    health=mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    | mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE,
     estimator=mavlink.ESTIMATOR_ATTITUDE,
     leak=False,
     rivals=0,
@@ -66,6 +75,9 @@ def test_a_vehicle_in_order_passes():
         (FINE._replace(given_back=False), "outputs", "former run"),
         (with_parameter("MOT_PWM_MAX", 1800.0), "MOT_PWM_MAX", "1800"),
         (with_parameter("RC5_TRIM", 1480.0), "RC channels", "RC5_TRIM 1480"),
+        (with_parameter("RC3_TRIM", 1500.0), "RC channels", "RC3_TRIM 1500"),
+        (with_parameter("RC2_REVERSED", 1.0), "RC channels", "RC2_REVERSED"),
+        (FINE._replace(health=3), "depth sensor", "not healthy"),
         (with_parameter("SYSID_MYGCS", 250.0), "ground station id", "system 250"),
         (with_parameter("FS_PILOT_INPUT", 0.0), "FS_PILOT_INPUT", "is 0: set 2"),
         (with_parameter("FS_PILOT_INPUT", 1.0), "FS_PILOT_INPUT", "is 1: set 2"),
@@ -82,7 +94,8 @@ def test_a_vehicle_in_order_passes():
 def test_each_fault_is_found_and_nothing_else(facts: Facts, name: str, words: str):
     found = failed(facts)
     assert words in found[name]
-    assert set(found) <= {name, "ATTITUDE_QUATERNION", "SCALED_PRESSURE2"}
+    beside = {"inertial sensors": {"depth sensor"}}
+    assert set(found) <= {name, "ATTITUDE_QUATERNION", "SCALED_PRESSURE2", *beside.get(name, ())}
 
 
 def test_a_failsafe_that_is_set_for_the_dive_is_told_with_its_present_value():
@@ -92,3 +105,34 @@ def test_a_failsafe_that_is_set_for_the_dive_is_told_with_its_present_value():
     words = {found.name: found.words for found in preflight(needs, facts)}
     assert words["FS_PILOT_INPUT"] == "is 0: is set to 2 for the dive"
     assert "FS_GCS_ENABLE" in failed(with_parameter("FS_GCS_ENABLE", None), needs)
+
+
+def test_what_is_stricter_than_a_dive_needs_stays_as_it_is():
+    assert for_dive(PARAMETERS, 255) == {}
+    strict = PARAMETERS | {"FS_LEAK_ENABLE": 2.0, "FS_PILOT_TIMEOUT": 0.5, "RC_OVERRIDE_TIME": 1.0}
+    assert for_dive(strict, 255) == {}
+    for name, value in (
+        ("FS_LEAK_ENABLE", 0.0),
+        ("FS_PILOT_TIMEOUT", 3.0),
+        ("RC_OVERRIDE_TIME", -1.0),
+        ("FS_GCS_ENABLE", 4.0),
+        ("FS_PILOT_INPUT", 1.0),
+    ):
+        assert for_dive(PARAMETERS | {name: value}, 255) == {name: FAILSAFES[name]}
+
+
+@pytest.mark.parametrize("name", ["SYSID_MYGCS", "MAV_GCS_SYSID"])
+def test_the_vehicle_obeys_us_for_the_dive_alone_if_we_have_an_id_of_our_own(name):
+    parameters = {key: v for key, v in PARAMETERS.items() if key != "SYSID_MYGCS"} | {name: 255.0}
+    sets = for_dive(parameters, 254)
+    assert sets == {name: 254.0}
+    needs = Requirements(8, rates=NEEDS.rates, system=254, sets=sets, dry=True)
+    found = {f.name: f for f in preflight(needs, FINE._replace(parameters=parameters))}
+    assert found["ground station id"].passed
+    assert f"{name} would be set" in found["ground station id"].words
+
+
+def test_thruster_by_thruster_needs_no_frame_that_is_known():
+    facts = with_parameter("FRAME_CONFIG", 7.0)
+    assert "frame" in failed(facts)
+    assert failed(facts, Requirements(8, passthrough=True, rates=NEEDS.rates)) == {}

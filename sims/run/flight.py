@@ -95,6 +95,11 @@ def fly(
             held.enter_context(short_turns())
             outcome = cockpit.fly(progress, keep, live)
         statistics = driver.link.statistics()
+        try:
+            driver.stop()
+        except UserError as error:  # what was flown is kept all the same
+            say(str(error))
+            outcome = outcome._replace(sentence=f"{outcome.sentence} Then {error}.")
     return cockpit.flight(outcome, checks, statistics)
 
 
@@ -180,6 +185,9 @@ class Cockpit:
         self, progress: Progress, keep: Keep | None = None, live: LivePage | None = None
     ) -> Outcome:
         """Run from the present place on until monitor, guard, clock or user end the flight."""
+        assert self.scenario.vehicle_link is not None
+        # it may have turned since the loop was built
+        self.anchor = _anchor(self.driver, self.scenario.station, self.scenario.vehicle_link)
         self.interface.commanding = True
         self.interface.on_act = self.journal.act
         try:

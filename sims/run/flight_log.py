@@ -62,9 +62,10 @@ class Journal:
         driver, now = self._driver, time.monotonic()
         outputs = telemetry.outputs(driver.link, driver.thrusters)
         shown = np.full(acted.expected.size, np.nan) if outputs is None else outputs.value
+        sent, shown = driver.as_described(acted.expected), driver.as_described(shown)
         order, volts = ORDERS.index(acted.order), telemetry.battery(driver.link)
         silence = driver.link.silence
-        entry = Entry(t, order, acted.F_Bo_B, acted.expected, shown, volts, silence, acted.ages)
+        entry = Entry(t, order, acted.F_Bo_B, sent, shown, volts, silence, acted.ages)
         self.entries.append(entry)
         self.reason, self.tripped = acted.reason, acted.tripped
         if self.epoch is not None:

@@ -14,6 +14,7 @@ import abc
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -102,11 +103,20 @@ class _ByAxes(Actuation):
 class ManualControl(_ByAxes):
     """MANUAL_CONTROL in the mode MANUAL; roll and pitch are not scaled by the pilot gain."""
 
+    def __init__(self, thrusters: Thrusters, parameters: Mapping[str, float]):
+        """As `_ByAxes`; heave is scaled by JS_THR_GAIN too."""
+        super().__init__(thrusters, parameters)
+        self._lift = parameters.get("JS_THR_GAIN", 1.0)
+        if self._lift <= 0:
+            raise UserError("JS_THR_GAIN is not positive: MANUAL has no heave; set 1")
+
     def command(
         self, vehicle: Peer, F_Bo_B: Float[np.ndarray, "6"], voltage: float, gain: float
     ) -> Command:
         """As `Actuation.command`."""
-        demand, pwm, given = self._demand(F_Bo_B, voltage, gain * min(1.0, self._yaw))
+        limit = gain * min(1.0, self._yaw, self._lift)
+        demand, pwm, given = self._demand(F_Bo_B, voltage, limit)
+        demand[2] /= self._lift
         return Command(_manual(vehicle, manual_control_fields(*demand, gain=gain)), pwm, given)
 
     def neutral(self, vehicle: Peer) -> Message:
@@ -182,6 +192,20 @@ def make_actuation(way: Way, thrusters: Thrusters, parameters: Mapping[str, floa
     if way == "thruster_passthrough":
         return ThrusterPassthrough(thrusters)
     return (ManualControl if way == "manual_control" else RcOverride)(thrusters, parameters)
+
+
+def as_wired(
+    thrusters: Thrusters, parameters: Mapping[str, float]
+) -> tuple[Thrusters, Float[np.ndarray, " n"]]:
+    """Thrusters with the vehicle's MOT_n_DIRECTION, and -1 where that differs from theirs, else 1.
+
+    A direction that the vehicle does not tell is theirs.
+    """
+    own = np.asarray(thrusters.motor_directions, float)
+    told = [parameters.get(f"MOT_{n}_DIRECTION", s) for n, s in enumerate(own.tolist(), 1)]
+    mirrored = np.where(np.array(told) < 0, -1.0, 1.0) * own
+    signs = jnp.asarray(mirrored * own, thrusters.motor_directions.dtype)
+    return eqx.tree_at(lambda t: t.motor_directions, thrusters, signs), mirrored
 
 
 def _manual(vehicle: Peer, fields: Mapping[str, int]) -> Message:

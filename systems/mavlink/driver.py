@@ -19,15 +19,16 @@ from jaxtyping import Float
 from ...models.config.errors import UserError
 from ...models.thrusters import Thrusters
 from . import commands, telemetry
-from .actuation import Command, make_actuation
+from .actuation import Command, as_wired, make_actuation
+from .codec import NEUTRAL_US
 from .config import Mavlink
 from .dialect import mavlink
 from .guard_process import Guard, stop_thrusters
 from .link import Link
 from .parameters import Borrowed, Parameters, borrowed_file
-from .preflight import FAILSAFES, Facts, Finding, Requirements, preflight
+from .preflight import Facts, Finding, Requirements, for_dive, is_depth_healthy, preflight
 from .safety import Snapshot, State, Supervisor
-from .telemetry import Reading
+from .telemetry import Sensed, sensed
 from .transport import Connection
 
 _SETTLE = 2.5  # s over which rates are counted before the pre-flight check
@@ -35,7 +36,6 @@ _STREAMS = {
     "HEARTBEAT": 5.0,
     "ATTITUDE_QUATERNION": 50.0,
     "SCALED_PRESSURE2": 25.0,  # above the sensor's own rate: a change tells when it measured
-    "SCALED_PRESSURE": 10.0,
     "SERVO_OUTPUT_RAW": 20.0,
     "LOCAL_POSITION_NED": 10.0,
     "BATTERY_STATUS": 2.0,
@@ -47,18 +47,6 @@ _ALIKE = 12.0  # µs by which outputs may differ from commanded ones: whole numb
 _DELAY = 0.5  # s: the longest time in which a command shows in SERVO_OUTPUT_RAW
 _HOLD = "ALT_HOLD"
 _FLY = "MANUAL"
-
-
-class Sensed(NamedTuple):
-    """The newest readings; None before the first of a kind."""
-
-    imu: Reading | None
-    heading: Reading | None
-    depth: Reading | None
-    attitude: Reading | None
-    position: Reading | None
-    outputs: Reading | None
-    voltage: float
 
 
 class Acted(NamedTuple):
@@ -160,7 +148,8 @@ class Driver:
             rates,
             self.config.system,
             self.config.safety.min_voltage,
-            {} if self._dry else FAILSAFES,
+            for_dive(self.parameters, self.config.system),
+            self._dry,
         )
 
     def preflight(self) -> list[Finding]:
@@ -192,7 +181,12 @@ class Driver:
 
     def _read_vehicle(self) -> None:
         self._boots, self.parameters = self.link.clock.reboots, self._parameters.read_all()
-        self._actuation = make_actuation(self.config.actuation, self._thrusters, self.parameters)
+        actual, self._mirrored = as_wired(self._thrusters, self.parameters)
+        self._actuation = make_actuation(self.config.actuation, actual, self.parameters)
+
+    def as_described(self, pwm: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Outputs (µs) with the signs of the scenario's vehicle, not of MOT_n_DIRECTION."""
+        return NEUTRAL_US + self._mirrored * (pwm - NEUTRAL_US)
 
     def restore(self) -> dict[str, float]:
         """Give back parameters that a former run left changed; what was restored.
@@ -218,16 +212,21 @@ class Driver:
         if self._dry:
             return
         changed = {
-            name: value
-            for name, value in {**FAILSAFES, **self._actuation.borrowed}.items()
-            if self.parameters.get(name) != value
+            **for_dive(self.parameters, self.config.system),
+            **{
+                name: value
+                for name, value in self._actuation.borrowed.items()
+                if self.parameters.get(name) != value
+            },
         }
         try:
             commands.set_mode(self.link, _FLY)
             self._guard = Guard(self.link.connection, self.config.system, self._borrowed.path)
             self._guard.busy()
+            # overrides of old may be at work: before pass-through follows them, and before arming
+            self._neutral(0.2)
             self._borrowed.borrow(changed)
-            self._neutral(0.2)  # before arming: an old override may be at work
+            self._neutral(0.2)
             commands.arm(self.link)
         except BaseException:
             self.stop()
@@ -237,16 +236,7 @@ class Driver:
 
     def sense(self) -> Sensed:
         """The newest readings; does not wait."""
-        link = self.link
-        return Sensed(
-            telemetry.imu(link),
-            telemetry.heading(link),
-            telemetry.depth(link, self.parameters, self._density),
-            telemetry.attitude(link),
-            telemetry.position(link),
-            telemetry.outputs(link, self.thrusters),
-            telemetry.battery(link),
-        )
+        return sensed(self.link, self.parameters, self._density, self.thrusters)
 
     def act(
         self,
@@ -333,10 +323,13 @@ class Driver:
     ) -> Snapshot:
         link, now = self.link, time.monotonic()
         status = telemetry.status(link, now)
-        depth = min(link.age(name) for name in ("SCALED_PRESSURE2", "SCALED_PRESSURE"))
+        depth = link.age(telemetry.depth_message(link))
         attitude = min(link.age(name) for name in ("ATTITUDE_QUATERNION", "ATTITUDE"))
         seen = {"vehicle": link.silence, "attitude": attitude, "depth": depth, **ages}
-        leak = "a leak is reported" if status is not None and status.leak else ""
+        failsafe = "a leak is reported" if status is not None and status.leak else ""
+        told = link.latest("SYS_STATUS")
+        if told is not None and not is_depth_healthy(told.message.onboard_control_sensors_health):
+            failsafe = failsafe or "the depth sensor is not healthy"
         # in a dry run the vehicle stays as it is
         armed = self._dry or (status is not None and status.armed)
         mode = _FLY if self._dry or status is None else status.mode
@@ -349,7 +342,7 @@ class Driver:
             armed,
             mode,
             telemetry.battery(link),
-            leak,
+            failsafe,
             len(link.others(2.0)),
             self._unlike(now),
         )

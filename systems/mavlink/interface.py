@@ -203,7 +203,9 @@ class VehicleInterface(LeafSystem):
         ages["loop"] = max(0.0, time.monotonic() - self._epoch - t)
         aids = [n for n, each in self._sensors.items() if each.observes in ("velocity", "position")]
         aids = [n for n in aids if not isinstance(self._sensors[n], DepthSensor)]
-        if aids:
+        if self._estimated:
+            ages["aid"] = driver.link.age("LOCAL_POSITION_NED")
+        elif aids:
             ages["aid"] = min(self.age(name) for name in aids)
         else:
             health = None  # without them the position is soon lost; controllers are told
@@ -218,7 +220,7 @@ class VehicleInterface(LeafSystem):
             self._pushed = math.inf
         elif math.isinf(self._pushed):
             self._pushed = time.monotonic()
-        set_groups(state, [self._pwm], [acted.expected])
+        set_groups(state, [self._pwm], [driver.as_described(acted.expected)])
         self.on_act(t, acted)
 
     # ----------------------------------------------------------------------------------- readings

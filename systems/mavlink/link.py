@@ -107,7 +107,7 @@ class Link:
         self._boots = 0
         self._when_booted: list[Callable[[], object]] = []
         self._booted_calls = 0
-        self._asked: deque[int] = deque(maxlen=20)  # times of our TIMESYNC requests (ns)
+        self._asked: deque[int] = deque(maxlen=20)  # times of TIMESYNC requests (ns)
         self._texts: deque[tuple[float, int, str]] = deque(maxlen=200)
         self._readers: list[Callable[[Received], None]] = []
         self._changed = threading.Condition()
@@ -336,9 +336,8 @@ class Link:
         with self._sending:
             self._keep(message.get_msgbuf())
         found = Received(message, arrival, boot_time(message, arrival, self.clock))
-        if name == "TIMESYNC":
-            if peer == self.vehicle:
-                self._exchanged(message, arrival)
+        if name == "TIMESYNC" and peer == self.vehicle:
+            self._exchanged(message, arrival)
         elif found.boot is not None and peer == self.vehicle:  # others may have other clocks
             self.clock.arrived(found.boot, arrival)
         if self.clock.reboots != self._boots:  # its sequence began anew, and its requested rates

@@ -32,6 +32,11 @@ class Parameters:
     def __init__(self, link: Link):
         self._link = link
 
+    @property
+    def silent(self) -> bool:
+        """Whether the vehicle has not been heard for longer than a request takes."""
+        return self._link.silence > _PATIENCE
+
     def read(self, name: str) -> float | None:
         """One parameter's value, None if the vehicle has none of that name."""
         packed = name.encode()
@@ -204,7 +209,8 @@ class Borrowed:
         """Write the former values, check them, remove the file; what was restored.
 
         Raises:
-            VehicleRefused: a value can't be restored; the file stays, and the rest is restored.
+            VehicleRefused: a value can't be restored; the file stays, and the rest is restored,
+                unless the vehicle is silent.
         """
         if not self.left_over:
             return {}
@@ -214,6 +220,8 @@ class Borrowed:
                 self._parameters.write(name, value)
             except VehicleRefused as error:
                 refused.append(str(error))
+                if self._parameters.silent:
+                    break
         if refused:
             raise VehicleRefused(f"{'; '.join(refused)}; {self.path} keeps the former values")
         self.path.unlink()

@@ -23,12 +23,18 @@ FAILSAFES: Mapping[str, float] = {
 }
 """Parameters that make the autopilot stop the thrusters by itself, with their values for a dive.
 
-Measured on ArduSub 4.5.6: with FS_PILOT_INPUT 0 the last command is held for ever.
+Measured on ArduSub 4.5.6: with FS_PILOT_INPUT 0 the last command is held for ever. A value that is
+stricter stays: a shorter time, the surface on a leak.
 """
+_TIMES = ("FS_PILOT_TIMEOUT", "RC_OVERRIDE_TIME")
+_AT_LEAST = ("FS_LEAK_ENABLE",)
+_OBEYED = ("SYSID_MYGCS", "MAV_GCS_SYSID")
+"""The system id whose commands ArduSub follows, until 4.6 and since."""
 
 _MOTOR_1 = MOTOR_FUNCTIONS[0]
 _PULSES = {"MIN": 1100.0, "TRIM": 1500.0, "MAX": 1900.0}
 _LOSS, _DAMAGED = 0.05, 0.01  # shares of packets that may be lost, and damaged
+_DEPTH = mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE  # ArduSub's own word on its depth sensor
 _SENSORS_HEALTHY = mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
 _ATTITUDE_GOOD = mavlink.ESTIMATOR_ATTITUDE
 
@@ -44,6 +50,7 @@ class Requirements:
         system: our system id.
         min_voltage: least battery voltage (V); 0 does not check it.
         sets: parameters that are set before arming, with their values for the dive.
+        dry: whether nothing is set or armed.
     """
 
     thrusters: int
@@ -52,6 +59,7 @@ class Requirements:
     system: int = GROUND_STATION
     min_voltage: float = 13.2
     sets: Mapping[str, float] = field(default_factory=dict)
+    dry: bool = False
 
 
 class Facts(NamedTuple):
@@ -89,6 +97,28 @@ class Finding(NamedTuple):
 def preflight(needs: Requirements, facts: Facts) -> list[Finding]:
     """All checks, in the order in which a person would go through them."""
     return [Finding(*found) for check in _CHECKS for found in check(needs, facts)]
+
+
+def is_depth_healthy(health: int) -> bool:
+    """Whether ArduSub takes its depth sensor for healthy, by SYS_STATUS."""
+    return bool(health & _DEPTH)
+
+
+def for_dive(parameters: Mapping[str, float], system: int) -> dict[str, float]:
+    """Parameters that a dive needs with other values, and these.
+
+    They are failsafes that are weaker than `FAILSAFES`, and the id that the vehicle obeys. Those
+    that it does not have are left out: the pre-flight check names them.
+    """
+    found = {}
+    for name, wanted in FAILSAFES.items():
+        value = parameters.get(name, wanted)
+        longer = name in _TIMES and not 0 < value <= wanted
+        weaker = name in _AT_LEAST and value < wanted
+        if longer or weaker or (name not in (*_TIMES, *_AT_LEAST) and value != wanted):
+            found[name] = wanted
+    obeyed = {name: float(system) for name in _OBEYED if name in parameters}
+    return found | {name: own for name, own in obeyed.items() if parameters[name] != own}
 
 
 Found = Iterator[tuple[str, bool, str]]
@@ -135,7 +165,7 @@ def _rates(needs: Requirements, facts: Facts) -> Found:
 
 def _frame(needs: Requirements, facts: Facts) -> Found:
     number = int(facts.parameters.get("FRAME_CONFIG", -1))
-    fits = FRAME_THRUSTERS.get(number) == needs.thrusters
+    fits = needs.passthrough or FRAME_THRUSTERS.get(number) == needs.thrusters
     words = f"FRAME_CONFIG {number} ({FRAMES.get(number, 'unknown')})"
     remedy = f": the scenario's vehicle has {needs.thrusters} thrusters; name the one connected"
     yield "frame", fits, words + ("" if fits else remedy)
@@ -165,35 +195,31 @@ def _outputs(needs: Requirements, facts: Facts) -> Found:
             f"RC{n}_{word} {found:g}"
             for n in range(1, 7)
             for word, value in _PULSES.items()
-            if (found := facts.parameters.get(f"RC{n}_{word}", value)) != value
-            and (n, word) != (3, "TRIM")  # 1100 on ArduSub 4.5, whose neutral is 1500
+            # the trim of the throttle is its lower end: with 1500 there, 1500 is full down
+            for right in [_PULSES["MIN"] if (n, word) == (3, "TRIM") else value]
+            if (found := facts.parameters.get(f"RC{n}_{word}", right)) != right
         ]
-        yield (
-            "RC channels",
-            not odd,
-            ", ".join(odd) + " (1100, 1500, 1900 assumed)" if odd else "ok",
-        )
+        odd += [f"RC{n}_REVERSED" for n in range(1, 7) if facts.parameters.get(f"RC{n}_REVERSED")]
+        assumed = " (1100, 1500, 1900, RC3_TRIM 1100 and not reversed are assumed)"
+        yield "RC channels", not odd, ", ".join(odd) + assumed if odd else "ok"
 
 
 def _failsafes(needs: Requirements, facts: Facts) -> Found:
     p = facts.parameters
-    mine = int(p.get("SYSID_MYGCS", p.get("MAV_GCS_SYSID", 255)))
-    yield (
-        "ground station id",
-        mine == needs.system,
-        f"the vehicle obeys system {mine}, and we are {needs.system}",
-    )
+    verb = "would be" if needs.dry else "is"
+    name = next((n for n in _OBEYED if n in p), _OBEYED[0])
+    mine = int(p.get(name, GROUND_STATION))
+    words = f"the vehicle obeys system {mine}, and we are {needs.system}"
+    told = f"; {name} {verb} set for the dive" if name in needs.sets else ""
+    yield "ground station id", mine == needs.system or bool(told), words + told
     for name, wanted in FAILSAFES.items():
-        found = p.get(name)
-        if name in ("FS_PILOT_TIMEOUT", "RC_OVERRIDE_TIME"):
-            fine = found is not None and 0 < found <= 3.0
+        found, weak = p.get(name), name in for_dive(p, needs.system)
+        if found is None:
+            yield name, False, f"is not among its parameters: set {wanted:g}"
+        elif name in needs.sets:
+            yield name, True, f"is {found:g}: {verb} set to {needs.sets[name]:g} for the dive"
         else:
-            fine = found is not None and found >= wanted
-        state = "is not among its parameters" if found is None else f"is {found:g}"
-        if found is not None and name in needs.sets and found != needs.sets[name]:
-            yield name, True, f"{state}: is set to {needs.sets[name]:g} for the dive"
-        else:
-            yield name, fine, state + ("" if fine else f": set {wanted:g}")
+            yield name, not weak, f"is {found:g}" + (f": set {wanted:g}" if weak else "")
 
 
 def _state(needs: Requirements, facts: Facts) -> Found:
@@ -207,6 +233,9 @@ def _state(needs: Requirements, facts: Facts) -> Found:
     yield "leak", not facts.leak, "water in the hull" if facts.leak else "dry"
     healthy = facts.health is not None and facts.health & _SENSORS_HEALTHY == _SENSORS_HEALTHY
     yield "inertial sensors", healthy, "healthy" if healthy else "not healthy in SYS_STATUS"
+    deep = facts.health is not None and is_depth_healthy(facts.health)
+    remedy = "not healthy in SYS_STATUS; check the depth sensor (BARO_PROBE_EXT) and its cable"
+    yield "depth sensor", deep, "healthy" if deep else remedy
     level = facts.estimator is not None and bool(facts.estimator & _ATTITUDE_GOOD)
     yield "attitude", level, "estimated" if level else "no attitude in EKF_STATUS_REPORT; wait"
     yield "disarmed", not facts.armed, "armed by someone else" if facts.armed else "yes"

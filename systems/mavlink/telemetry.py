@@ -18,7 +18,8 @@ from .link import Link, Received
 LEAK = "leak"
 _LEAK_SPOKEN = 10.0  # s: the vehicle repeats the warning while it is wet
 _CRITICAL = 5  # MAV_STATE: some failsafe is on, or there has been no pilot input
-_PRESSURES = ("SCALED_PRESSURE2", "SCALED_PRESSURE3", "SCALED_PRESSURE")
+_PRESSURES = ("SCALED_PRESSURE2", "SCALED_PRESSURE3")
+"""Of sensors in the water; SCALED_PRESSURE is that of the air in the hull."""
 _DOWN = mavlink.MAV_SENSOR_ROTATION_PITCH_270
 _BODY_FRAMES = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_LOCAL_FRD)
 _LATE, _APART = 1.0, 0.05  # s between a time on the vehicle's clock and the arrival
@@ -132,18 +133,24 @@ def depth(link: Link, parameters: Mapping[str, float], density: float) -> Readin
     """Depth of the pressure sensor (m), positive down, in water of `density` (kg/m³).
 
     The pressure at the surface is the one that the autopilot measured on the ground
-    (BAROn_GND_PRESS). A sensor in the hull (SCALED_PRESSURE) is used if there is no other.
+    (BAROn_GND_PRESS, GND_ABS_PRESSn until ArduSub 4.0).
     """
-    for name in _PRESSURES:
-        found = link.latest(name)
-        if found is not None:
-            number = name.removeprefix("SCALED_PRESSURE") or "1"
-            ground = parameters.get(f"BARO{number}_GND_PRESS", 0.0) / 100
-            surface = ground if ground > 0 else codec.SURFACE_PRESSURE_HPA
-            gradient = codec.pascal_per_metre(density=density)
-            value = codec.depth_from_pressure(found.message.press_abs, surface, gradient)
-            return _reading(link, found, np.array([float(value)]))
-    return None
+    name = depth_message(link)
+    found = link.latest(name)
+    if found is None:
+        return None
+    number = name.removeprefix("SCALED_PRESSURE")
+    before = parameters.get(f"GND_ABS_PRESS{number}", 0.0)
+    ground = parameters.get(f"BARO{number}_GND_PRESS", before) / 100
+    surface = ground if ground > 0 else codec.SURFACE_PRESSURE_HPA
+    gradient = codec.pascal_per_metre(density=density)
+    value = codec.depth_from_pressure(found.message.press_abs, surface, gradient)
+    return _reading(link, found, np.array([float(value)]))
+
+
+def depth_message(link: Link) -> str:
+    """The message that `depth` reads."""
+    return next((name for name in _PRESSURES if link.latest(name) is not None), _PRESSURES[0])
 
 
 def position(link: Link) -> Reading | None:
@@ -182,6 +189,31 @@ def pilot_gain(link: Link, parameters: Mapping[str, float]) -> float:
     if found is not None and found.message.value > 0:
         return float(found.message.value)
     return float(parameters.get("JS_GAIN_DEFAULT", 0.5))
+
+
+class Sensed(NamedTuple):
+    """The newest readings; None before the first of a kind."""
+
+    imu: Reading | None
+    heading: Reading | None
+    depth: Reading | None
+    attitude: Reading | None
+    position: Reading | None
+    outputs: Reading | None
+    voltage: float
+
+
+def sensed(link: Link, parameters: Mapping[str, float], density: float, thrusters: int) -> Sensed:
+    """The newest readings of a vehicle with that many thrusters; does not wait."""
+    return Sensed(
+        imu(link),
+        heading(link),
+        depth(link, parameters, density),
+        attitude(link),
+        position(link),
+        outputs(link, thrusters),
+        battery(link),
+    )
 
 
 class Status(NamedTuple):

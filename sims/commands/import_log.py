@@ -21,7 +21,7 @@ class Import:
     """Convert a log to a Recording, the input of the other commands.
 
     Reads ArduPilot DataFlash logs (.BIN), MAVLink telemetry logs (.tlog), both also as .gz or .xz,
-    ROS bags (.bag, .db3, .mcap or their folder; the extra `ros`) and folders of CSV files
+    ROS bags (.bag, .db3, .mcap or their folder; needs the extra `ros`) and folders of CSV files
     (docs/recording.md). Clocks are aligned, everything is resampled to one
     rate, and the summary says what the log lacks and what can therefore not be learned from it.
     """

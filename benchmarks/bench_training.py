@@ -2,7 +2,7 @@
 
 `make bench ONLY=training` times every case; `python benchmarks/bench_training.py` prints the table
 of docs/numerics.md: medians of interleaved rounds, so that other load on the machine falls on all
-alike. torchsde comes with `pip install spinndrift[peers]`; without it the rest is timed.
+alike. torchsde comes with `pip install -e '.[peers]'`; without it the rest is timed.
 """
 
 import functools

@@ -3,8 +3,11 @@
 Run it: `python examples/own_controller.py`. It holds a pose in a current of a harbour and prints
 how far it strayed. In a scenario file the same controller is
 
+    name: my_run
     controller: !Own {system: examples/own_controller.py:PidController, parameters: {yaw: 0.5}}
     success: !ReachGoal {goal: [1.0, 0.0, -1.5]}
+
+A scenario needs these three; all else has defaults.
 """
 
 import jax

@@ -3,9 +3,12 @@
 Run it: `python examples/own_task.py`. The vehicle comes from outside; where in the circle it
 stays is free. In a scenario file it is
 
+    name: my_run
     controller: !MppiImpedance
       task: !OwnTask {system: examples/own_task.py:WatchCircle, parameters: {radius: 0.5}}
     success: !ReachGoal {goal: [0.0, 0.0, -1.5]}
+
+A scenario needs these three; all else has defaults.
 """
 
 import jax

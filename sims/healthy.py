@@ -6,14 +6,18 @@ from typing import Any
 
 from ..models.config.errors import UserError
 from ..models.files.checkpoint import load_model
+from ..models.files.owned import MARKER
+from ..models.recordings.csv_columns import METADATA as CSV_FOLDER
 from ..models.recordings.store import Recording
+from ..systems.logs.bags.bag import METADATA as BAG_FOLDER
+from ..systems.logs.bags.bag import bag_kind
 from ..training.diagnosis.against.pipeline import Healthy
 
 RESULT, MODEL = "diagnosis.json", Path("extended") / "model.spinn"
 SOURCE, OPTIONS = "source", "read_with"
 """Metadata of an extended model: its data, and the options by which they were read."""
 
-_FILES = (".nc", ".nc4", ".h5", ".tlog", ".bin", ".xz", ".bag", ".mcap", ".db3")
+_FILES = (".nc", ".nc4", ".h5", ".tlog", ".bin", ".xz", ".gz", ".bag", ".mcap", ".db3")
 
 Read = Callable[[Path, dict[str, Any]], Recording]
 """Reads and checks data; options of the command may be replaced."""
@@ -33,8 +37,8 @@ def check_healthy(path: Path, beliefs: Sequence[str] = ()) -> None:
         beliefs: options that were given and name a model to believe.
 
     Raises:
-        UserError: there is no such file, a diagnosis lacks its model or its data, or is given
-            together with another belief.
+        UserError: there is no such file, recordings in a folder would be left out, a diagnosis
+            lacks its model or its data, or is given together with another belief.
     """
     if not path.exists():
         raise UserError(
@@ -50,7 +54,9 @@ def check_healthy(path: Path, beliefs: Sequence[str] = ()) -> None:
             f"{beliefs[0]}: the diagnosis {folder} has a model of its own, which is the belief; "
             "leave one out"
         )
-    if folder is not None:
+    if folder is None:
+        _check_sessions(path)
+    else:
         _source(folder, load_model(folder / MODEL, dtype=float)[1])
 
 
@@ -66,23 +72,46 @@ def healthy_of_diagnosis(folder: Path, read: Read) -> Healthy:
 
 
 def recordings_in(path: Path, one: Callable[[Path], Recording]) -> Recording:
-    """The recording at a path, or all recordings in a folder joined.
+    """The recording at a path, or all recordings in a folder joined: files, CSV folders, bags.
 
-    Scenarios of several files are apart, for each file is another session.
+    Scenarios of several recordings are apart, for each is another session.
 
     Raises:
         UserError: they differ in rate, vehicle or commands.
     """
-    files = sorted(p for p in path.iterdir() if p.suffix.lower() in _FILES) if path.is_dir() else []
-    if not files or (path / "recording.yaml").exists() or (path / "metadata.yaml").exists():
+    found = _sessions(path)
+    if not found:
         return one(path)
-    parts = [one(file) for file in files]
-    return Recording.concat([_of_file(r, f.stem) for r, f in zip(parts, files, strict=True)])
+    return Recording.concat([_of_session(one(p), p.stem if p.is_file() else p.name) for p in found])
 
 
-def _of_file(recording: Recording, stem: str) -> Recording:
-    """The recording with its file's name before those of its scenarios."""
-    names = [f"{stem}: {name}" for name in recording.scenarios]
+def _sessions(path: Path) -> list[Path]:
+    """The recordings in a folder; none of a file, or of a folder that is one recording."""
+    if not path.is_dir() or any((path / name).exists() for name in (CSV_FOLDER, BAG_FOLDER)):
+        return []
+    return sorted(p for p in path.iterdir() if p.suffix.lower() in _FILES or _is_recording(p))
+
+
+def _is_recording(path: Path) -> bool:
+    """Whether a path is a folder with CSV runs or a ROS 2 bag."""
+    return path.is_dir() and ((path / CSV_FOLDER).exists() or bag_kind(path) is not None)
+
+
+def _check_sessions(path: Path) -> None:
+    """Refuse a folder whose recordings are partly in folders deeper than those that are read."""
+    if not path.is_dir() or (path / MARKER).exists():  # dives of a collection are in its recording
+        return
+    for inner in sorted(set(path.iterdir()) - set(_sessions(path))):
+        if inner.is_dir() and _sessions(inner):
+            raise UserError(
+                f"--against {path}: the recordings in its folder {inner.name} would be left out; "
+                f"move them into {path.name}"
+            )
+
+
+def _of_session(recording: Recording, session: str) -> Recording:
+    """The recording with the name of its file or folder before those of its scenarios."""
+    names = [f"{session}: {name}" for name in recording.scenarios]
     return Recording(recording.dataset.assign_coords(scenario=names))
 
 

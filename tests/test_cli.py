@@ -16,6 +16,7 @@ from spinndrift.models.effects.library import kind
 from spinndrift.models.files.checkpoint import load_model, save_model
 from spinndrift.models.files.owned import MARKER
 from spinndrift.models.integrate import cast
+from spinndrift.models.recordings.csv import write_csv
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.spinn import Spinn, SpinnConfig
 from spinndrift.models.vehicles.vehicle import load_vehicle
@@ -165,6 +166,24 @@ def test_import_writes_a_recording(tmp_path, capsys):
     assert recording.dt == pytest.approx(0.1)
     assert recording.commands == ("pwm",)
     assert "Thruster outputs" in capsys.readouterr().err
+
+
+def test_import_keeps_the_rate_of_data_that_are_no_log(tmp_path):
+    """20 Hz are for logs; CSV files have the rate of their recording.yaml, else their own."""
+    source, folder, out = tmp_path / "source.nc", tmp_path / "runs", tmp_path / "again.nc"
+    assert called("generate", "--out", source, *GENERATED, "--rate", "40") is None
+    write_csv(Recording.load(source), folder)
+    meta = (folder / "recording.yaml").read_text()
+    for line, more, rate in (
+        ("rate: 10", (), 10.0),
+        ("rate: 10", ("--rate", "25"), 25.0),
+        ("", (), 40.0),
+    ):
+        (folder / "recording.yaml").write_text(re.sub(r"^rate: .*", line, meta, flags=re.M))
+        assert called("import", folder, "--out", out, *more) is None
+        assert 1 / Recording.load(out).dt == pytest.approx(rate)
+    assert called("import", source, "--out", out) is None
+    assert Recording.load(out).dt == pytest.approx(1 / 40)
 
 
 def test_generate_writes_what_was_asked_for(generated):

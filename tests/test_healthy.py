@@ -7,10 +7,13 @@ import pytest
 from test_cli import called
 from test_diagnose_command import Told, ToldPage, recorded
 
+from spinndrift.models.config.errors import UserError
 from spinndrift.models.files.checkpoint import load_model, save_model
+from spinndrift.models.files.owned import MARKER
+from spinndrift.models.recordings.csv import write_csv
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.vehicles.vehicle import load_vehicle
-from spinndrift.sims.healthy import MODEL, OPTIONS, SOURCE
+from spinndrift.sims.healthy import MODEL, OPTIONS, SOURCE, check_healthy, recordings_in
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 
@@ -61,6 +64,34 @@ def test_several_recordings_in_a_folder_are_sessions_apart(tmp_path, compared):
     assert compared.healthy[0].recording.scenarios == ("monday: still", "tuesday: still")
 
 
+def test_recordings_of_every_form_in_a_folder_are_read(tmp_path):
+    """Files, compressed logs, CSV folders and bags; notes and figures are none."""
+    write_csv(Recording.load(recorded(tmp_path / "a.nc", "bluerov2_heavy")), tmp_path / "runs.1")
+    for name in ("b.tlog.gz", "c.BIN", "d.mcap", "notes.txt"):
+        (tmp_path / name).touch()
+    for bag, inside in (("bag", "metadata.yaml"), ("open_bag", "bag_0.db3"), ("figures", "a.png")):
+        (tmp_path / bag).mkdir()
+        (tmp_path / bag / inside).touch()
+    still, seen = Recording.load(tmp_path / "a.nc"), []
+    joined = recordings_in(tmp_path, lambda path: (seen.append(path.name), still)[1])
+    assert seen == ["a.nc", "b.tlog.gz", "bag", "c.BIN", "d.mcap", "open_bag", "runs.1"]
+    assert joined.scenarios[-1] == "runs.1: still"
+    for alone in ("a.nc", "runs.1", "bag", "figures"):
+        seen.clear()
+        recordings_in(tmp_path / alone, lambda path: (seen.append(path.name), still)[1])
+        assert seen == [alone]
+
+
+def test_the_dives_of_a_collection_are_not_recordings_beside_its_own(tmp_path):
+    recorded(tmp_path / "recording.nc", "bluerov2_heavy")
+    (tmp_path / "dive-1").mkdir()
+    recorded(tmp_path / "dive-1" / "log.nc", "bluerov2_heavy")
+    with pytest.raises(UserError, match="dive-1 would be left out"):
+        check_healthy(tmp_path)
+    (tmp_path / MARKER).touch()
+    check_healthy(tmp_path)
+
+
 def test_a_diagnosis_is_compared_with_by_its_model_and_its_data(tmp_path, compared):
     old = recorded(tmp_path / "old.nc", "bluerov2_heavy")
     base = tmp_path / "base"
@@ -90,8 +121,12 @@ def test_what_can_not_be_compared_with_is_refused_at_once(tmp_path, compared, ca
     (half / "diagnosis.json").write_text("{}")
     model = tmp_path / "own.spinn"
     save_model(model, VEHICLE.dynamics(), {"vehicle": "bluerov2_heavy"})
+    days = tmp_path / "days"
+    (days / "monday").mkdir(parents=True)
+    recorded(days / "monday" / "dive.nc", "bluerov2_heavy")
     for more, words in (
         ((tmp_path / "none",), "no such file or folder"),
+        ((days,), "folder monday would be left out"),
         ((lone,), "gone.nc) are gone"),
         ((half,), "model.spinn is missing"),
         ((lone, "--model", model), "--model: the diagnosis"),

@@ -1,11 +1,13 @@
 """Scenarios load, merge with what is laid over them, and fly."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from helpers import ROOT
 from spinndrift.models.config import typed_yaml
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects.effect_config import EffectConfig, check_distinct
@@ -41,6 +43,20 @@ def test_shipped_scenarios_are_whole(name):
     assert scenario.description
     assert typed_yaml.loads(Scenario, typed_yaml.dump(scenario)) == scenario
     assert scenario.vehicle_link or scenario.station.disturbance_set in name
+
+
+def test_scenarios_of_the_pages_load():
+    """Those of the README are whole; the options of the field page turn a link on and off."""
+    blocks = re.findall(r"```yaml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    names = [typed_yaml.loads(Scenario, block).name for block in blocks]
+    assert names == ["my_run", "my_watch"]
+    page = (ROOT / "docs" / "field.md").read_text()
+    texts = set(re.findall(r"'(vehicle_link: [^']+)'", page))
+    links = {text: load_scenario("pylon_crossing_vehicle", text).vehicle_link for text in texts}
+    assert links.pop("vehicle_link: null") is None
+    [link] = links.values()
+    assert link is not None
+    assert link.safety.max_wrench == (20, 20, 20, 2, 2, 4)
 
 
 def test_pylon_crossing_is_the_papers_task():

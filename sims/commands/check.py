@@ -19,8 +19,8 @@ from .check_outputs import check_page, held_outputs, refuse_given_up
 class CheckDiagnosis:
     """Diagnose cases of hidden effects, compare with the hidden answers, report the result.
 
-    A case is a folder with CSV data and the answer; docs/blind-cases.md describes the format. Each
-    is judged once: the same command resumes an interrupted check.
+    A case is a folder with data (CSV runs or one log) and the answer; docs/blind-cases.md describes
+    the format. Each is judged once: the same command resumes an interrupted check.
     """
 
     cases: Path = Path("runs/blind")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from ...models.config.checks import RATE_OF_ALARMS, WATER_DENSITY, Vector6, Within
 from ...models.config.errors import UserError
@@ -39,7 +39,7 @@ class Diagnose:
         "spinndrift diagnose harbour.nc --against tank.nc --out runs/changed",
     )
 
-    data: Positional[Path]
+    data: Annotated[Positional[Path], arg(metavar="DATA")]
     """Recording (.nc), CSV folder, log (.tlog, .BIN) or ROS bag."""
     vehicle: str | None = None
     """Preset name or YAML file; by default what the data name, else the model's, else that of a

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from ...models.config.checks import SECONDS
 from ...models.config.errors import UserError
@@ -26,9 +26,9 @@ class Evaluate:
         "spinndrift evaluate runs/tank/model.spinn harbour.nc --length 2 --out errors.csv",
     )
 
-    model: Positional[Path]
+    model: Annotated[Positional[Path], arg(metavar="MODEL")]
     """Model file (.spinn)."""
-    data: Positional[Path]
+    data: Annotated[Positional[Path], arg(metavar="DATA")]
     """Recording (.nc), log (.tlog, .BIN), ROS bag or CSV folder."""
     out: Path | None = None
     """File for the results: .csv (tidy), .json (overall) or .nc."""

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from ...models.config.errors import UserError
 from ...models.files.interrupts import interrupts_held
@@ -26,7 +26,7 @@ class Export:
     """Write a run or a recording as an MCAP file, which Foxglove and PlotJuggler open.
 
     The file has frames, poses, the path, plans with the sampled paths, the scene and a log in
-    Foxglove's well-known messages, and everything else as numbers to plot (docs/recording.md).
+    Foxglove's well-known messages, and everything else as numbers to plot (docs/export.md).
     """
 
     EXAMPLES: ClassVar = (
@@ -34,9 +34,9 @@ class Export:
         "spinndrift export dive.nc dive.mcap --layout layout.json",
     )
 
-    data: Positional[Path]
+    data: Annotated[Positional[Path], arg(metavar="DATA")]
     """Folder of a run, recording (.nc), log (.tlog, .BIN), ROS bag or CSV folder."""
-    out: Positional[Path]
+    out: Annotated[Positional[Path], arg(metavar="OUT")]
     """File to write (.mcap)."""
     layout: Path | None = None
     """Also write Foxglove's layout for these files there (.json)."""

@@ -21,7 +21,7 @@ class Import:
     """Convert a log to a Recording, the input of the other commands.
 
     Reads ArduPilot DataFlash logs (.BIN), MAVLink telemetry logs (.tlog), both also as .gz or .xz,
-    ROS bags (.bag, .db3, .mcap or their folder; install spinndrift[ros]) and folders of CSV files
+    ROS bags (.bag, .db3, .mcap or their folder; needs the extra `ros`) and folders of CSV files
     (docs/recording.md). Clocks are aligned, everything is resampled to one
     rate, and the summary says what the log lacks and what can therefore not be learned from it.
     """
@@ -35,8 +35,9 @@ class Import:
     """The log file, ROS bag or CSV folder."""
     out: Path | None = None
     """File to write (.nc); by default the log's name in the current folder."""
-    rate: Annotated[float, Within(1, 400)] = 20.0
-    """Samples per second."""
+    rate: Annotated[float | None, Within(1, 400)] = None
+    """Samples per second; by default 20 for a log or a bag, for CSV files that of their
+    recording.yaml, else their own, and that of a recording."""
     vehicle: str | None = None
     """Preset name or YAML file of the vehicle; by default what the data name, or for a log bluerov2
     if its frame has six thrusters, else bluerov2_heavy."""

@@ -29,8 +29,8 @@ class Run:
     docs/field.md is the checklist. Ctrl-C stops and disarms the vehicle. The folder then holds
     telemetry.tlog as well, all that the vehicle said.
 
-    A scenario with !Own, !OwnTask or !OwnFilter runs the Python code that it names, which is
-    printed before: review that code first if the file is not your own.
+    A scenario with !Own, !OwnTask, !OwnFilter or !OwnSensor runs the Python code that it names,
+    which is printed before: review that code first if the file is not your own.
     """
 
     EXAMPLES: ClassVar = (
@@ -51,7 +51,7 @@ class Run:
     engine: Literal["auto", "drake", "compiled"] = "auto"
     """Engine that steps the diagram: Drake, or one compiled loop, which is faster but needs systems
     with pure functions (no user-defined system without `pure`). `auto` takes the loop for runs of
-    10 s and more, unless the planner uses several threads, which only Drake's stepping has."""
+    10 s and more if every system has `pure`; in it the planner's rollouts run in one thread."""
     arm: Annotated[bool, FlagCreatePairsOff] = False
     """Arm the vehicle of the scenario's vehicle_link and fly."""
     dry_run: Annotated[bool, FlagCreatePairsOff] = False

@@ -324,7 +324,8 @@ class Diagnosis:
         sentence: the verdict in words.
         causes: those found, first found first.
         refitted: coefficients fitted before any cause was named.
-        ratios: coefficients over inertia from such a fit; with `--refit all` only.
+        ratios: coefficients over inertia from such a fit; with `--refit all`, or where `auto` took
+            that fit.
         residual: left by the causes, by channel: x, y, z, roll, pitch, yaw, u, v, w, p, q, r.
         gain: of base (the believed model), refitted (its coefficients fitted, no cause named),
             extended (with the causes, if any) and black_box (the base with a learned correction).

@@ -214,7 +214,7 @@ def test_a_depth_sensor_that_fails_ends_the_dive(served: Served, port: int, monk
         monkeypatch.setattr(messages, "_SENSORS_HEALTHY", messages._SENSORS_HEALTHY & ~8)
         monkeypatch.setattr(messages, "_SENSORS_ALIGNED", messages._SENSORS_ALIGNED & ~8)
         acted = fly(driver, np.zeros(6), 2.0)
-        assert "the depth sensor is not healthy" in acted.reason
+        assert "depth sensor is not healthy" in acted.reason
 
 
 def test_a_pilot_who_changes_the_mode_is_left_alone(port: int):

@@ -37,6 +37,7 @@ FAULTS = {
     "silence": {"ages": {"vehicle": 1.1}},
     "attitude": {"ages": {"attitude": float("inf")}},
     "depth": {"ages": {"depth": 0.6}},
+    "depth_sensor": {"deep": False},
     "aid": {"ages": {"aid": 2.1}},
     "loop": {"ages": {"loop": 0.6}},
     "estimate": {"health": 2},
@@ -48,7 +49,7 @@ FAULTS = {
     "wrench": {"F_Bo_B": np.array([np.nan, 0, 0, 0, 0, 0])},
 }
 ENDS = {"pilot": "yield", "disarmed": "yield", "silence": "disarm", "depth": "disarm"}
-ENDS |= {"depth_limits": "disarm"}
+ENDS |= {"depth_limits": "disarm", "depth_sensor": "disarm"}
 
 
 def dive(supervisor: Supervisor, seconds: float = 4.0, at: float = 1.0, **fault) -> list:

@@ -84,7 +84,8 @@ class Train:
         if self.method is not None:
             config = method_config(self.method, self.config)
         else:
-            config = TrainingConfig() if self.config is None else load(TrainingConfig, self.config)
+            usual = TrainingConfig()
+            config = usual if self.config is None else load(TrainingConfig, self.config, usual)
         changes = {"steps": self.steps, "seed": self.seed}
         config = replace(config, **{k: v for k, v in changes.items() if v is not None})
         if (self.out / "checkpoint.npz").exists() and not self.resume:

@@ -326,10 +326,9 @@ class Driver:
         depth = link.age(telemetry.depth_message(link))
         attitude = min(link.age(name) for name in ("ATTITUDE_QUATERNION", "ATTITUDE"))
         seen = {"vehicle": link.silence, "attitude": attitude, "depth": depth, **ages}
-        failsafe = "a leak is reported" if status is not None and status.leak else ""
+        leak = "a leak is reported" if status is not None and status.leak else ""
         told = link.latest("SYS_STATUS")
-        if told is not None and not is_depth_healthy(told.message.onboard_control_sensors_health):
-            failsafe = failsafe or "the depth sensor is not healthy"
+        health = None if told is None else told.message.onboard_control_sensors_health
         # in a dry run the vehicle stays as it is
         armed = self._dry or (status is not None and status.armed)
         mode = _FLY if self._dry or status is None else status.mode
@@ -342,9 +341,10 @@ class Driver:
             armed,
             mode,
             telemetry.battery(link),
-            failsafe,
+            leak,
             len(link.others(2.0)),
             self._unlike(now),
+            health is None or is_depth_healthy(health),
         )
 
     def _unlike(self, now: float) -> float:

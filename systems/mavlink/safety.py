@@ -100,6 +100,8 @@ class Snapshot(NamedTuple):
     """Other ground stations with our system id."""
     outputs: float = 0.0
     """Time for which the vehicle's outputs have not been those that are commanded (s)."""
+    deep: bool = True
+    """Whether the vehicle takes its depth sensor for healthy."""
 
 
 class State(NamedTuple):
@@ -186,6 +188,11 @@ def _failsafe(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
     return f"the vehicle's failsafe is on: {snapshot.failsafe}" if snapshot.failsafe else ""
 
 
+def _depth_sensor(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
+    del config, state
+    return "" if snapshot.deep else "the vehicle's depth sensor is not healthy"
+
+
 def _rival(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
     del config, state
     return "another ground station uses our system id" if snapshot.rivals else ""
@@ -229,6 +236,7 @@ GUARDS: dict[str, Guard] = {
     "silence": _stale(*AGED["silence"]),
     "attitude": _stale(*AGED["attitude"]),
     "depth": _stale(*AGED["depth"]),
+    "depth_sensor": _depth_sensor,
     "aid": _stale(*AGED["aid"]),
     "loop": _stale(*AGED["loop"]),
     "estimate": _estimate,
@@ -287,7 +295,7 @@ class Supervisor:
             return "yield" if t - state.since >= _NEUTRAL_FOR else "neutral"
         if t - state.since < _NEUTRAL_FOR:
             return "neutral"
-        blind = state.tripped in ("depth", "depth_limits", "silence")
+        blind = state.tripped in ("depth", "depth_sensor", "depth_limits", "silence")
         if blind or t - state.since > self.config.hold:
             return "disarm"
         return self.config.end

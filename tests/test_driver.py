@@ -180,13 +180,13 @@ def test_directions_are_the_vehicles_and_outputs_are_told_with_the_scenarios(por
         np.testing.assert_allclose(given, F + WRENCHES[2] / 2, atol=1.0)
         mirrored = np.flatnonzero(told != acted.expected)
         assert mirrored.tolist() == [2]
-        check_at_rest(port)
     finally:
         with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
             link.find_vehicle(15.0)
             parameters = Parameters(link)
             parameters.write("MOT_3_DIRECTION", 1.0)
             parameters.write("JS_THR_GAIN", 1.0)
+    check_at_rest(port)
 
 
 def test_a_pilot_s_station_is_obeyed_again_after_the_dive(served: Served, port: int):

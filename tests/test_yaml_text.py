@@ -108,3 +108,9 @@ def test_what_is_written_is_read_back(value):
 def test_not_finite_is_not_written():
     with pytest.raises(ValueError, match="finite"):
         emit({"a": [math.nan]})
+
+
+@pytest.mark.parametrize("text", ['name: "a\\0b"', '"a\\0b": 1', 'files: [one.csv, "\\x00"]'])
+def test_a_null_character_is_refused_where_it_stands(text):
+    with pytest.raises(UserError, match=r"my\.yaml:1: a text holds a null character"):
+        parse(text, "my.yaml")

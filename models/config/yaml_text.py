@@ -61,6 +61,15 @@ class _Loader(yaml.SafeLoader):
             lines[key] = line
         return super().construct_mapping(node, deep=deep)
 
+    def construct_scalar(self, node: yaml.ScalarNode | yaml.MappingNode) -> Any:
+        """The text of a node; one with a null character is no name, and no path can hold it."""
+        found = super().construct_scalar(node)
+        if isinstance(found, str) and "\0" in found:
+            raise yaml.constructor.ConstructorError(
+                None, None, "a text holds a null character; remove it", node.start_mark
+            )
+        return found
+
     def _int(self, node: yaml.ScalarNode) -> int:
         text = self.construct_scalar(node)
         if len(text) > _DIGITS:

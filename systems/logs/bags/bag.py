@@ -153,6 +153,8 @@ class Bag:
         total, done = max(sum(c.msgcount for c in chosen), 1), 0
         for group in (g for g in groups if g):
             for connection, received, raw in self._messages(group):
+                if connection.topic not in rows:
+                    continue  # the index of a damaged file tells other topics than its data
                 into = rows[connection.topic]
                 if most is not None and len(into.x) + into.broken >= most:
                     break

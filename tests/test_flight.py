@@ -38,8 +38,9 @@ from spinndrift.systems.mavlink.transport import Connection
 PATIENT = "late: 20, lost: 20, silence: 5, stale: 5, stale_aid: 20, outputs: 20, plan_age: 20"
 
 
-@pytest.fixture(scope="module")
-def port() -> Iterator[int]:
+@contextmanager
+def vehicle() -> Iterator[tuple[int, subprocess.Popen]]:
+    """A served vehicle: its port, and its process."""
     command = ["-m", "spinndrift", "vehicle", "station_keeping_calm"]
     served = subprocess.Popen(
         [sys.executable, *command, "--connection", "tcpin:127.0.0.1:0"],
@@ -49,10 +50,16 @@ def port() -> Iterator[int]:
     assert served.stderr is not None
     found = re.search(r"tcpin:127.0.0.1:(\d+)", served.stderr.readline())
     assert found is not None
-    yield int(found[1])
+    yield int(found[1]), served
     served.terminate()  # a shell in the background has its children ignore SIGINT
     served.wait(30.0)
     served.stderr.close()
+
+
+@pytest.fixture(scope="module")
+def port() -> Iterator[int]:
+    with vehicle() as (port, _):
+        yield port
 
 
 @pytest.fixture(autouse=True)
@@ -135,6 +142,27 @@ def test_a_guard_ends_a_collection_and_voids_the_trajectory_it_was_in(
 def test_nothing_is_armed_without_being_asked(port: int):
     with pytest.raises(UserError, match="add --arm to fly, or --dry-run"):
         fly(scenario(port, 1.0))
+
+
+@pytest.mark.slow
+def test_a_vehicle_that_is_gone_for_good_leaves_a_log_that_says_so(tmp_path: Path):
+    with vehicle() as (port, served):
+        base = scenario(port, 20.0)
+        assert base.vehicle_link is not None
+        safety = replace(base.vehicle_link.safety, silence=1.0, hold=2.0)
+        wanted = replace(base, vehicle_link=replace(base.vehicle_link, safety=safety))
+
+        def leave(fraction: float, words: str) -> None:
+            if words.startswith("2 s"):
+                served.kill()
+
+        run = fly(wanted, arm=True, record=tmp_path / "telemetry.tlog", progress=leave)
+    assert run.outcome.reason == "guard"
+    assert "the vehicle was not heard" in run.outcome.sentence
+    assert "could not be stopped in order" in run.outcome.sentence
+    values = write_files(run, tmp_path, report=True)
+    assert values["link"]["received"] > 100
+    assert len(run.log.time) > 2 / run.log.dt
 
 
 @pytest.mark.slow

@@ -376,12 +376,12 @@ class Driver:
             with suppress(UserError):  # it is gone: stop all the same
                 self._guard.busy()
             failed = stop_thrusters(self.link, self._borrowed.path, self._ended == "yield")
-            if not failed:
-                self._guard.release()
-            self._guard = None
         if self.dvl is not None:
             self.dvl.close()
         self.link.close()
+        if self._guard is not None:
+            (self._guard.leave if failed else self._guard.release)()
+            self._guard = None
         if failed:
             raise UserError(f"the vehicle could not be stopped in order: {'; '.join(failed)}")
 

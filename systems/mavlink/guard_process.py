@@ -5,6 +5,9 @@ stop anything. The guard reads a beat from its standard input. When the pipe clo
 of release, or no beat comes in time, it ends the commanding process, connects to the vehicle,
 sends neutral, disarms, and gives borrowed parameters back.
 
+So does one that is told to, by a process that could not stop the thrusters and has other things to
+write.
+
 It is started before arming and imports neither JAX nor Drake, so that it acts at once.
 """
 
@@ -25,13 +28,16 @@ from .link import Link, Peer
 from .parameters import Borrowed, Parameters
 from .transport import Connection
 
-_BEAT, _BUSY, _RELEASE = b".", b"w", b"!"
+_BEAT, _BUSY, _RELEASE, _LEAVE = b".", b"w", b"!", b"?"
 _PATIENCE = {_BEAT: 1.0, _BUSY: 30.0}  # s without a word, after the last one
 _NEUTRAL_FOR, _PERIOD = 1.0, 0.05  # s of neutral messages, s between them
 _READY_IN = 30.0  # s: a loaded machine starts an interpreter slowly
 _READY = b"ready\n"
 _TRIES = 20  # of connecting, a second apart: the former client's port has to become free
 _CHANNELS = 8
+_UNABLE = "could not stop them"
+_AT_WORK: list[subprocess.Popen] = []
+"""Guards to which a vehicle was left."""
 
 
 class Guard:
@@ -84,6 +90,15 @@ class Guard:
             self._process.stdin.flush()
         except OSError as error:
             raise UserError("the guard process has ended; the dive can't go on") from error
+
+    def leave(self) -> None:
+        """Leave the vehicle to the guard, which stops it if it can be reached, and ends.
+
+        The commanding process goes on; it must have closed its link.
+        """
+        with suppress(UserError):
+            self._say(_LEAVE)
+        _AT_WORK.append(self._process)
 
     def release(self) -> None:
         """Say that the thrusters are stopped; the guard ends."""
@@ -139,6 +154,8 @@ def _watch() -> str:
         read = os.read(sys.stdin.fileno(), 4096)
         if _RELEASE in read:
             return ""
+        if _LEAVE in read:
+            return _UNABLE
         if not read:
             return "died"
         last = read[-1:]
@@ -159,7 +176,7 @@ def main(arguments: list[str]) -> int:
     ended = _watch()
     if not ended:
         return 0
-    if os.getppid() == int(parent):  # it hangs, and holds the connection
+    if ended != _UNABLE and os.getppid() == int(parent):  # it hangs, and holds the connection
         os.kill(int(parent), signal.SIGKILL)
     for _ in range(_TRIES):
         try:

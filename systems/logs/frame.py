@@ -30,6 +30,7 @@ _KINDS = {
 _MAKERS = {12: "PX4"}
 _SUBMARINE, _ARDUPILOT = 12, 3
 _FIRMWARE = re.compile(r"(Ardu(?:Copter|Plane|Rover)|APM:(?:Copter|Plane|Rover)|PX4|Rover|Blimp)\b")
+_OURS = ("ArduSub", "APM:Sub")
 _SAID = re.compile(r"Frame: *(\w+)")
 _MOVES_US = 20.0
 
@@ -46,8 +47,17 @@ def kind_findings(kind: int, maker: int) -> list[Finding]:
     return [_not_a_submarine("HEARTBEAT", said)] if said else []
 
 
-def firmware_findings(place: str, texts: Iterable[str]) -> list[Finding]:
-    """What the autopilot's messages say of its firmware."""
+def firmware_findings(place: str, texts: Iterable[str], maker: int = -1) -> list[Finding]:
+    """What the autopilot's messages say of its firmware; `maker` as in `kind_findings`.
+
+    A message of ArduPilot's may begin with PX4: up to 3.5 it names the board's drivers in this way
+    ("PX4: 8d505a02 NuttX: 1a99ba58"). With a heartbeat of ArduPilot it does not tell the firmware.
+    """
+    texts = list(texts)
+    if any(text.strip().startswith(_OURS) for text in texts):
+        return []
+    if maker == _ARDUPILOT:
+        texts = [text for text in texts if not text.strip().startswith(tuple(_MAKERS.values()))]
     for text in texts:
         found = _FIRMWARE.match(text.strip())
         if found is not None:

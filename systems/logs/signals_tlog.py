@@ -76,7 +76,7 @@ def signals_from_tlog(
     spans = {"wiring": wired.spans, **_states(tables), **aiding, **no_aid}
     voltage = _voltage(tables)
     batteries = [name for name in ("BATTERY_STATUS", "SYS_STATUS") if name in tables]
-    findings = kind_findings(*log.kind) or firmware_findings("STATUSTEXT", texts)
+    findings = kind_findings(*log.kind) or firmware_findings("STATUSTEXT", texts, log.kind[1])
     findings += [*frame, *stops, *missing_states(spans, voltage, batteries)]
     has = [f"Horizontal aid: {', '.join(aids)}."] if aids else []
     return Signals(

@@ -117,9 +117,7 @@ def frame_findings(
                 "correct FRAME_CONFIG and start the autopilot anew before the next dive",
             )
         ]
-    extra = [
-        c for c, motor in sorted(motors.items()) if motor > count and _moves(outputs_us[c - 1])
-    ]
+    extra = [c for c, motor in sorted(motors.items()) if motor > count and moves(outputs_us[c - 1])]
     if extra:
         which = ", ".join(str(c) for c in extra)
         return [
@@ -142,7 +140,8 @@ def frame_findings(
     return []
 
 
-def _moves(pulses: np.ndarray) -> bool:
+def moves(pulses: np.ndarray) -> bool:
+    """Whether an output is driven: its pulses are not always the same."""
     known = pulses[pulses > 0]
     return known.size > 0 and bool(np.ptp(known) > _MOVES_US)
 

@@ -79,8 +79,9 @@ def signals_from_bin(
     )
     known = {p.name: p.value for p in parameters}
     texts = [] if "MSG" not in tables else [m.decode("ascii", "replace") for m in _messages(tables)]
-    wired = wiring(parameters, first, last, vehicle, frame_said(texts))
-    outputs, notes, frame = _outputs(tables, wired, vehicle is not None)
+    channels = _channels(tables)
+    wired = wiring(parameters, first, last, vehicle, frame_said(texts), channels)
+    outputs, notes, frame = _outputs(tables["RCOU"], channels, wired, vehicle is not None)
     position, velocity = _motion(tables, core, known, density)
     rates, rate_notes = _rates(tables, core)
     force = _imu(tables, core, "ACC", ("AccX", "AccY", "AccZ"), "specific force")
@@ -264,9 +265,8 @@ def _states(tables: Mapping[str, Table], first: float, last: float) -> dict[str,
     return spans
 
 
-def _outputs(
-    tables: Mapping[str, Table], wired: Wiring, named: bool
-) -> tuple[Series, list[str], list[Finding]]:
+def _channels(tables: Mapping[str, Table]) -> np.ndarray:
+    """Pulses (µs) of all output channels (32, n)."""
     if "RCOU" not in tables:
         raise UserError(
             "no RCOU in this log, so nothing tells what the thrusters did; "
@@ -277,12 +277,13 @@ def _outputs(
     for n in range(1, 15):
         if f"C{n}" in table:
             channels[n - 1] = table[f"C{n}"]
-    outputs, notes = thruster_outputs(
-        table["t"],
-        channels,
-        wired,
-        "RCOU",
-    )
+    return channels
+
+
+def _outputs(
+    table: Table, channels: np.ndarray, wired: Wiring, named: bool
+) -> tuple[Series, list[str], list[Finding]]:
+    outputs, notes = thruster_outputs(table["t"], channels, wired, "RCOU")
     if outputs is None:
         raise UserError("RCOU: a single record is no record of the thrusters")
     return outputs, notes, wired.frame_findings(channels, named)

@@ -63,7 +63,7 @@ def signals_from_tlog(
     columns = None if table is None else (table[c] for c in ("t", "param_id", "param_value"))
     parameters, strange = ([], []) if columns is None else parameters_of(*columns)
     texts = [] if "STATUSTEXT" not in tables else _texts(tables["STATUSTEXT"]["text"])
-    wired = wiring(parameters, first, last, vehicle, frame_said(texts))
+    wired = wiring(parameters, first, last, vehicle, frame_said(texts), _pulses(outputs_table))
     known = {p.name: p.value for p in parameters}
     outputs, notes, frame = _outputs(outputs_table, wired, vehicle is not None)
     aiding = _aiding(tables)
@@ -247,6 +247,16 @@ def _outputs(table: Table, wired: Wiring, named: bool) -> tuple[Series, list[str
     if outputs is None:
         raise UserError("SERVO_OUTPUT_RAW: a single message is no record of the thrusters")
     return outputs, notes, wired.frame_findings(channels, named)
+
+
+def _pulses(table: Table) -> np.ndarray | None:
+    """Pulses (µs) of the first eight outputs of the first port that has any."""
+    for port in (0, 1):
+        rows = table.rows(table["port"] == port)
+        pulses = np.stack([rows[f"servo{n}_raw"] for n in range(1, 9)]).astype(float)
+        if pulses.any():
+            return pulses
+    return None
 
 
 def _silent(rows: Table, wanted: set[int]) -> bool:

@@ -33,7 +33,6 @@ from .propose import listed, propose
 from .quantities import Quantities, derivative, turning
 from .topics import Topic, TopicMap, beside, load_map
 
-_MOVES_US = 20.0
 _HOW = "name one in a topic map (`spinndrift import BAG --topics`)"
 
 
@@ -199,12 +198,14 @@ def _outputs(
         return _there(series(t, x, one.topic, "thrust"), one), "thruster_force", wired, []
     bare = taken.columns[one.topic].type.startswith("std_msgs")
     named = vehicle
-    if vehicle is None and not any(p.name == "FRAME_CONFIG" for p in parameters):
-        named = _by_count(one, x.shape[0] if bare or one.channels else _moving(x))
-    wired = wiring([*parameters, *_directions(one, span[0])], *span, named)
+    counted = bare or bool(one.channels)
+    if vehicle is None and counted and not any(p.name == "FRAME_CONFIG" for p in parameters):
+        named = _by_count(one, x.shape[0])
     channels = np.zeros((32, t.size))
     rows = min(x.shape[0], 32)
     channels[:rows] = np.nan_to_num(x[:rows])
+    directed = [*parameters, *_directions(one, span[0])]
+    wired = wiring(directed, *span, named, pulses=channels)
     outputs, notes = thruster_outputs(t, channels, wired, one.topic)
     return _there(outputs, one), "pwm", wired, [*wired.notes, *notes]
 
@@ -220,12 +221,6 @@ def _there(found: Series | None, topic: Topic) -> Series:
 
 def _directions(topic: Topic, t: float) -> list[Parameter]:
     return [Parameter(t, f"MOT_{n}_DIRECTION", float(d)) for n, d in enumerate(topic.directions, 1)]
-
-
-def _moving(pwm: np.ndarray) -> int:
-    """Thrusters that outputs drive: six if 7 and 8 stand still while the others move."""
-    moves = [bool(np.ptp(x[x > 0]) > _MOVES_US) if (x > 0).any() else False for x in pwm[:8]]
-    return 6 if all(moves[:6]) and len(moves) >= 6 and not any(moves[6:]) else 8
 
 
 def _by_count(topic: Topic, count: int) -> str:

@@ -25,8 +25,7 @@ from ...models.recordings.resample import (
 )
 from .segments import Segment, segments
 from .signals import Series, Signals
-from .signals_tlog import UNAIDED
-from .streams import DEAD_RECKONING
+from .streams import DEAD_RECKONING, UNAIDED
 
 _FAST_HZ, _MEAN_S = 200.0, 0.01
 _LONGEST_S = 300.0

@@ -12,6 +12,7 @@ from ..mavlink import codec
 from .dataflash import BinLog
 from .depth import in_water
 from .frame import firmware_findings, frame_said
+from .pressure import followed
 from .signals import (
     Series,
     Signals,
@@ -22,8 +23,7 @@ from .signals import (
     series,
     undelayed,
 )
-from .signals_tlog import UNAIDED
-from .streams import aid_spans, missing_states
+from .streams import UNAIDED, aid_spans, missing_states
 from .table import Table, whole
 from .wiring import DIRECTION_CHANGED, Wiring, direction_findings, thruster_outputs, wiring
 
@@ -34,6 +34,8 @@ WANTED = (
     "ACC",
     "ARM",
     "ATT",
+    "BAR2",
+    "BAR3",
     "BARO",
     "BAT",
     "EV",
@@ -56,6 +58,7 @@ WANTED = (
 _HORIZ_VEL, _HORIZ_POS, _CONST_POS = 1 << 1, 1 << 3 | 1 << 4, 1 << 7
 _ARMED_EVENT, _DISARMED_EVENT = 10, 11
 _AIDS = ("VISO", "VISP", "VISV")
+_BAROMETERS = {"BARO": 0, "BAR2": 1, "BAR3": 2}
 _LATEST_S = 1e9  # of a clock that counts from the boot
 
 
@@ -83,6 +86,7 @@ def signals_from_bin(
     wired = wiring(parameters, first, last, vehicle, frame_said(texts), channels)
     outputs, notes, frame = _outputs(tables["RCOU"], channels, wired, vehicle is not None)
     position, velocity = _motion(tables, core, known, density)
+    depth = followed(_pressure_depth(tables, known, density), position)
     rates, rate_notes = _rates(tables, core)
     force = _imu(tables, core, "ACC", ("AccX", "AccY", "AccZ"), "specific force")
     if not rates.source.startswith("GYR"):  # GYR and ACC are the sensors before the filters
@@ -106,14 +110,14 @@ def signals_from_bin(
         position=position,
         velocity=velocity,
         specific_force=force,
-        pressure_depth=_pressure_depth(tables, known, density),
+        pressure_depth=depth.depth,
         voltage=voltage,
         rc=_rc(tables),
         spans={**spans, **no_aid},
         cuts=tuple((t, DIRECTION_CHANGED) for t in wired.changes),
         has=(f"Horizontal aid: {', '.join(aids)}.",) if aids else (),
         lacks=() if aids else ("No DVL, odometry or vision record in the log.",),
-        notes=(*log.notes, *strange, *wired.notes, *notes, *rate_notes),
+        notes=(*log.notes, *strange, *wired.notes, *notes, *rate_notes, *depth.told),
         findings=tuple(findings),
         turned=wired.turned,
     )
@@ -292,15 +296,20 @@ def _outputs(
 def _pressure_depth(
     tables: Mapping[str, Table], known: Mapping[str, float], density: float | None
 ) -> Series | None:
-    if "BARO" not in tables:
+    """Depth by the second barometer, which is outside the hull, or else by the first there is.
+
+    Up to ArduSub 4.0 each has records of its own name, later those of one name have an instance.
+    """
+    found = next((n for n in ("BAR2", "BARO", "BAR3") if n in tables), None)
+    if found is None:
         return None
     gradient = codec.pascal_per_metre(known.get("BARO_SPEC_GRAV", 1.0), density)
-    baro = _of(tables["BARO"], "I", 1)
-    instance = int(whole(baro["I"])[0]) if "I" in baro else 0
+    baro = _of(tables[found], "I", 1)
+    instance = int(whole(baro["I"])[0]) if "I" in baro else _BAROMETERS[found]
     surface = known.get(f"BARO{instance + 1}_GND_PRESS", 0.0) / 100
     surface = surface if 800 < surface < 1200 else codec.SURFACE_PRESSURE_HPA
     depth = codec.depth_from_pressure(baro["Press"] / 100.0, surface, gradient)
-    return series(baro["t"], depth, "BARO", "depth")
+    return series(baro["t"], depth, found, "depth")
 
 
 def _voltage(tables: Mapping[str, Table]) -> Series | None:

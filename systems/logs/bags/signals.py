@@ -12,6 +12,7 @@ from ....models.vehicles.vehicle import load_vehicle
 from ...mavlink import codec
 from ..depth import in_water
 from ..log_bytes import Progress, no_progress
+from ..pressure import Followed, followed
 from ..signals import (
     Parameter,
     Series,
@@ -22,14 +23,13 @@ from ..signals import (
     series,
     undelayed,
 )
-from ..signals_tlog import UNAIDED
-from ..streams import missing_states
+from ..streams import UNAIDED, missing_states
 from ..wiring import PRESETS, Wiring, direction_findings, thruster_outputs, wiring
 from .axes import axes_findings, velocity_axes
 from .bag import Bag, Column, open_bag
 from .clocks import Clock
 from .messages import COMMANDS, PRESSURE, SAMPLED, Quantity
-from .propose import listed, propose
+from .propose import FIRST_BAROMETER, listed, propose
 from .quantities import Quantities, derivative, turning
 from .topics import Topic, TopicMap, beside, load_map
 
@@ -87,7 +87,7 @@ def _signals(
     outputs, command, wired, wire_notes = _outputs(bag, taken, parameters, (first, last), vehicle)
     if proposed:
         taken = _by_motion(taken, attitude)
-    position, velocity, motion_notes = _motion(taken, attitude)
+    position, velocity, motion_notes = _motion(taken, attitude, proposed)
     rates = taken.rates(attitude)
     if rates is None:
         rates = turning(attitude)
@@ -95,6 +95,7 @@ def _signals(
     rates, force, delays = _undelayed(taken, rates, known)
     if _same(taken.topic("parameters"), taken.topic("position")):
         position, velocity = in_water(position, velocity, known, density)
+    depth = _followed(taken, _pressure_depth(taken, known, density), position, proposed)
     spans = {"wiring": wired.spans, **_states(taken), **_aiding(taken, velocity)}
     voltage = _voltage(taken)
     batteries = [one.topic for one in (taken.topic("voltage"),) if one is not None]
@@ -110,11 +111,11 @@ def _signals(
         position=position,
         velocity=velocity,
         specific_force=force,
-        pressure_depth=_pressure_depth(taken, known, density),
+        pressure_depth=depth.depth,
         voltage=voltage,
         rc=_rc(taken),
         spans=spans,
-        notes=(*taken.notes, *strange, *wire_notes, *motion_notes, *delays),
+        notes=(*taken.notes, *strange, *wire_notes, *motion_notes, *delays, *depth.told),
         findings=(*findings, *direction_findings(wired)),
         turned=wired.turned,
     )
@@ -237,7 +238,9 @@ def _by_count(topic: Topic, count: int) -> str:
     return PRESETS[count]
 
 
-def _motion(taken: Quantities, attitude: Series) -> tuple[Series | None, Series | None, list[str]]:
+def _motion(
+    taken: Quantities, attitude: Series, proposed: bool
+) -> tuple[Series | None, Series | None, list[str]]:
     """Position and velocity in W; what one of them lacks is derived from the other topics."""
     position, velocity = taken.position(), taken.velocity(attitude)
     if position is not None and velocity is not None:
@@ -246,7 +249,7 @@ def _motion(taken: Quantities, attitude: Series) -> tuple[Series | None, Series 
         said = f"{position.source}: velocities are differences of the positions."
         return position, derivative(position), [said]
     z = taken.scalar("height", "position")
-    if z is None:
+    if z is None and not (proposed and _may_be_the_hulls(taken)):
         depth = _pressure_depth(taken, {}, None)
         z = None if depth is None else replace(depth, x=-depth.x)
     if velocity is not None:
@@ -315,6 +318,26 @@ def _pressure_depth(
     gradient = codec.pascal_per_metre(known.get("BARO_SPEC_GRAV", 1.0), density)
     depth = codec.depth_from_pressure(hPa, surface, gradient)
     return series(t, depth, topic.topic, "depth")
+
+
+def _may_be_the_hulls(taken: Quantities) -> bool:
+    """Whether the depth is of mavros' SCALED_PRESSURE, the autopilot's first barometer."""
+    topic = taken.topic("depth")
+    return topic is not None and topic.topic.endswith(FIRST_BAROMETER)
+
+
+def _followed(
+    taken: Quantities, depth: Series | None, position: Series | None, proposed: bool
+) -> Followed:
+    """The depth, unless it does not follow the height, or nothing tells that it is the water's."""
+    found = followed(depth, position)
+    if found.depth is None or found.sure or not (proposed and _may_be_the_hulls(taken)):
+        return found
+    said = (
+        f"{found.depth.source} may be of the barometer in the hull, and no height tells: it was "
+        "left out; name it in a topic map (`--topics`) if it is the water's."
+    )
+    return Followed(None, (said,))
 
 
 def _voltage(taken: Quantities) -> Series | None:

@@ -97,6 +97,7 @@ def test_a_depth_is_compared_with_the_height_where_it_moves():
     assert "hull changes by 0 %" in found.told[0]
     slow = followed(Series(t, 0.02 * t, "slow"), position(-0.02 * t))
     assert slow.sure
-    for unknown in (None, position(0.05 * z), position(np.full(t.size, np.nan))):
+    idle = position(0.12 * np.random.default_rng(2).standard_normal(t.size))
+    for unknown in (None, idle, position(0.05 * z), position(np.full(t.size, np.nan))):
         found = followed(hull, unknown)
         assert (found.depth, found.sure) == (hull, False)

@@ -150,21 +150,23 @@ def settled(recording: Recording, turned: Collection[int]) -> tuple[Recording, l
     """Decide by the motion whether outputs with SERVOn_REVERSED are mirrored.
 
     `turned` are the thrusters (from 1) whose PWM was mirrored for it. ArduSub's mixer writes
-    pulses that the parameter does not touch, pass-through and other firmware do: where the
-    mirrored output contradicts the motion, the recorded one is restored.
+    pulses that the parameter does not touch, pass-through and other firmware do. Where the
+    mirrored outputs together contradict the motion and the recorded ones do not, these are
+    restored; else each of which the motion says so.
     """
     if not turned:
         return recording, []
-    against = {
-        int(f.place.rsplit("pwm", 1)[1])
-        for f in command_findings(recording, load_vehicle(recording.vehicle))
-        if f.word == "thruster-reversed"
-    }
+    against = set(turned)
+    severe = _severe(recording)
+    if not severe or _severe(_unmirrored(recording, turned)):
+        reversed_ = [f.place for f in severe if f.word == "thruster-reversed"]
+        against &= {int(place.rsplit("pwm", 1)[1]) for place in reversed_}
     found = []
     for k in sorted(turned):
-        kept = k in against
         told = (
-            "but the motion says that it is not" if kept else "and its PWM is mirrored about 1500"
+            "but the motion says that it is not"
+            if k in against
+            else "and its PWM is mirrored about 1500"
         )
         found.append(
             Finding(
@@ -173,9 +175,19 @@ def settled(recording: Recording, turned: Collection[int]) -> tuple[Recording, l
                 f"the output of thruster {k} is set to be reversed, {told}",
             )
         )
-    back = [k - 1 for k in turned if k in against]
+    return _unmirrored(recording, against), found
+
+
+def _severe(recording: Recording) -> list[Finding]:
+    """What in the commands would stop a command."""
+    found = command_findings(recording, load_vehicle(recording.vehicle))
+    return [f for f in found if f.severity == "severe"]
+
+
+def _unmirrored(recording: Recording, thrusters: Collection[int]) -> Recording:
+    """The recording with the PWM of some thrusters (from 1) mirrored back."""
+    columns = [k - 1 for k in thrusters]
     pwm = recording.dataset["pwm"]
     values = pwm.to_numpy().copy()
-    values[..., back] = 2 * NEUTRAL_US - values[..., back]
-    dataset = recording.dataset.assign(pwm=(pwm.dims, values, pwm.attrs))
-    return Recording(dataset), found
+    values[..., columns] = 2 * NEUTRAL_US - values[..., columns]
+    return Recording(recording.dataset.assign(pwm=(pwm.dims, values, pwm.attrs)))

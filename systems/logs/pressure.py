@@ -10,8 +10,9 @@ import numpy as np
 from .signals import Series
 
 _LAGS_S = (2.0, 8.0, 32.0, 128.0)
-_MOVED_M, _LEAST = 0.3, 20
-"""Change of height (m) that is more than a barometer's noise, and how many must be seen."""
+_MOVED_M, _LEAST, _SHARE = 0.3, 20, 0.1
+"""Change of height (m) that is more than its usual noise; how many must be seen, and which share of
+all changes: of a vehicle at rest a few are as large, as with the noise of a GPS (0.1 m)."""
 _RATIO = 2.0
 """Factor by which the changes of a depth and of the height may differ: salt and a wrong
 specific gravity make a few percent, a hull's barometer nearly all of it."""
@@ -40,8 +41,8 @@ def followed(depth: Series | None, position: Series | None) -> Followed:
     if 1 / _RATIO < ratio < _RATIO:
         return Followed(depth, sure=True)
     said = (
-        f"{depth.source} changes by {100 * ratio:.0f} % of the estimated height's change: it is "
-        "not the water's pressure, as of a barometer in the hull, and was left out."
+        f"{depth.source} changes by {100 * ratio:.0f} % of the estimated height's change, as a "
+        "barometer in the hull does: it was left out."
     )
     return Followed(None, (said,), sure=True)
 
@@ -62,6 +63,6 @@ def _ratio(depth: Series, position: Series) -> float | None:
         moved = np.interp(before, t, z) - np.interp(before + lag, t, z)
         deeper = np.interp(before + lag, depth.t, depth.x) - np.interp(before, depth.t, depth.x)
         clear = np.abs(moved) > _MOVED_M
-        if np.count_nonzero(clear) >= _LEAST:
+        if np.count_nonzero(clear) >= max(_LEAST, _SHARE * clear.size):
             return float(np.median(deeper[clear] / moved[clear]))
     return None

@@ -5,6 +5,7 @@ import pytest
 from bag_writers import EPOCH_NS, Messages
 from log_writers import outputs, truth
 
+from spinndrift.models.config.errors import UserError
 from spinndrift.systems.logs.load import LogOptions, import_log
 
 START, DURATION = 100.0, 24.0
@@ -111,3 +112,17 @@ def test_another_pressure_is_taken_before_a_first_barometer(tmp_path):
     _, run, X, report = imported(tmp_path, messages, rows)
     np.testing.assert_allclose(run.X_WB[:, 6], X[6], atol=2e-3)
     assert "Height and climb from /depth/pressure" in str(report)
+
+
+def test_frames_that_contradict_the_outputs_are_refused(tmp_path):
+    """As in telemetry."""
+    messages = Messages("ros1")
+    parameters = {f"SERVO{n}_FUNCTION": 32.0 + n for n in range(1, 9)} | {"FRAME_CONFIG": 0.0}
+    rows = rows_of(messages)
+    for name, value in parameters.items():
+        kept = messages.make("mavros_msgs/msg/ParamValue", real=value)
+        head = {"header": (ns(START), ""), "param_id": name}
+        param = messages.make("mavros_msgs/msg/Param", **head, value=kept)
+        rows.append((ns(START), "/mavros/param/param_value", param))
+    with pytest.raises(UserError, match="BLUEROV1 has 6 thrusters, and outputs 7, 8 drive more"):
+        imported(tmp_path, messages, rows)

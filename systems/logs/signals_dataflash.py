@@ -27,9 +27,12 @@ from .streams import UNAIDED, aid_spans, missing_states
 from .table import Table, whole
 from .wiring import DIRECTION_CHANGED, Wiring, direction_findings, thruster_outputs, wiring
 
-EKF2_NAMES = {"NKF1": "XKF1", "NKF4": "XKF4", "NKQ": "XKQ", "NKQ1": "XKQ", "XKQ1": "XKQ"}
-"""Records of EKF2, and of versions that name each core's records: the names of today's EKF3."""
-_EKF2 = 2  # AHRS_EKF_TYPE
+_FILTERS = {
+    3: {"XKF1": "XKF1", "XKF4": "XKF4", "XKQ": "XKQ", "XKQ1": "XKQ"},
+    2: {"NKF1": "XKF1", "NKF4": "XKF4", "NKQ": "XKQ", "NKQ1": "XKQ"},
+}
+"""Records of EKF3 and EKF2 (AHRS_EKF_TYPE), also of versions that name each core's records, by
+today's names of EKF3."""
 WANTED = (
     "ACC",
     "ARM",
@@ -43,7 +46,7 @@ WANTED = (
     "IMU",
     "MODE",
     "MSG",
-    *EKF2_NAMES,
+    *_FILTERS[2],
     "PARM",
     "RATE",
     "RCIN",
@@ -54,6 +57,7 @@ WANTED = (
     "XKF1",
     "XKF4",
     "XKQ",
+    "XKQ1",
 )
 _HORIZ_VEL, _HORIZ_POS, _CONST_POS = 1 << 1, 1 << 3 | 1 << 4, 1 << 7
 _ARMED_EVENT, _DISARMED_EVENT = 10, 11
@@ -72,7 +76,7 @@ def signals_from_bin(
             another.
     """
     usable = {name: _usable(table) for name, table in log.tables.items()}
-    tables = _as_ekf3({name: table for name, table in usable.items() if table["t"].size})
+    tables = one_filter({name: table for name, table in usable.items() if table["t"].size})
     core = _primary_core(tables)
     attitude = _attitude(tables, core)
     first, last = float(attitude.t[0]), float(attitude.t[-1])
@@ -127,17 +131,25 @@ def _messages(tables: Mapping[str, Table]) -> list[bytes]:
     return [bytes(text).strip(b"\0") for text in tables["MSG"]["Message"]]
 
 
-def _as_ekf3(tables: dict[str, Table]) -> dict[str, Table]:
-    """The tables with EKF2's records under EKF3's names, if there are no others or it flew."""
+def one_filter(tables: dict[str, Table]) -> dict[str, Table]:
+    """The tables with the records of one filter under EKF3's names: the one that flew.
+
+    It is AHRS_EKF_TYPE's if it logged a motion, else EKF3 before EKF2. Where both run, records of
+    the other describe another estimate.
+    """
     parameters = tables.get("PARM")
     flew = np.zeros(0)
     if parameters is not None:
         flew = parameters["Value"][parameters["Name"] == b"AHRS_EKF_TYPE"]
-    preferred = flew.size > 0 and flew[-1] == _EKF2
-    found = dict(tables)
-    for old, new in EKF2_NAMES.items():
-        if old in tables and (new not in tables or (preferred and old.startswith("N"))):
-            found[new] = tables[old]
+    order = sorted(_FILTERS, key=lambda kind: (not (flew.size and flew[-1] == kind), -kind))
+    moved = [kind for kind in order if any(_FILTERS[kind].get(n) == "XKF1" for n in tables)]
+    logged = [kind for kind in order if _FILTERS[kind].keys() & tables.keys()]
+    chosen = next(iter([*moved, *logged]), 3)
+    every = {name for names in _FILTERS.values() for name in names}
+    found = {name: table for name, table in tables.items() if name not in every}
+    for old, new in _FILTERS[chosen].items():
+        if old in tables:
+            found.setdefault(new, tables[old])
     return found
 
 

@@ -84,7 +84,9 @@ def _signals(
     first, last = float(attitude.t[0]), float(attitude.t[-1])
     parameters, strange = _parameters(taken)
     known = {p.name: p.value for p in parameters}
-    outputs, command, wired, wire_notes = _outputs(bag, taken, parameters, (first, last), vehicle)
+    outputs, command, wired, wire_notes, frame = _outputs(
+        bag, taken, parameters, (first, last), vehicle
+    )
     if proposed:
         taken = _by_motion(taken, attitude)
     position, velocity, motion_notes = _motion(taken, attitude, proposed)
@@ -99,7 +101,7 @@ def _signals(
     spans = {"wiring": wired.spans, **_states(taken), **_aiding(taken, velocity)}
     voltage = _voltage(taken)
     batteries = [one.topic for one in (taken.topic("voltage"),) if one is not None]
-    findings = axes_findings(taken, attitude, taken.position(), force)
+    findings = frame + axes_findings(taken, attitude, taken.position(), force)
     findings += [*missing_states(spans, voltage, batteries, "mavros_msgs/State"), *_broken(columns)]
     return Signals(
         attitude=attitude,
@@ -172,8 +174,8 @@ def _outputs(
     parameters: Sequence[Parameter],
     span: tuple[float, float],
     vehicle: str | None,
-) -> tuple[Series, str, Wiring, list[str]]:
-    """What drives the thrusters, its name in a recording, and the vehicle's thrusters."""
+) -> tuple[Series, str, Wiring, list[str], list[Finding]]:
+    """What drives the thrusters, its name in a recording, the vehicle's thrusters, sentences."""
     quantity: Quantity | None = next((q for q in COMMANDS if taken.topic(q) is not None), None)
     found = None if quantity is None else taken.taken(quantity)
     if quantity is None or found is None:
@@ -185,7 +187,7 @@ def _outputs(
     one, t, x = found
     if quantity == "wrench":
         wired = wiring(parameters, *span, vehicle)
-        return _there(taken.wrench(), one), "F_Bo_B", wired, []
+        return _there(taken.wrench(), one), "F_Bo_B", wired, [], []
     if quantity == "forces":
         wired = wiring(parameters, *span, vehicle or _by_count(one, x.shape[0]))
         count = len(load_vehicle(wired.vehicle).propulsion.mounts)
@@ -196,7 +198,7 @@ def _outputs(
             )
         signs = np.array(one.directions or (1,) * count)
         x = x * signs[:count, None] if signs.size >= count else x
-        return _there(series(t, x, one.topic, "thrust"), one), "thruster_force", wired, []
+        return _there(series(t, x, one.topic, "thrust"), one), "thruster_force", wired, [], []
     bare = taken.columns[one.topic].type.startswith("std_msgs")
     named = vehicle
     counted = bare or bool(one.channels)
@@ -208,7 +210,8 @@ def _outputs(
     directed = [*parameters, *_directions(one, span[0])]
     wired = wiring(directed, *span, named, pulses=channels)
     outputs, notes = thruster_outputs(t, channels, wired, one.topic)
-    return _there(outputs, one), "pwm", wired, [*wired.notes, *notes]
+    found = _there(outputs, one), "pwm", wired, [*wired.notes, *notes]
+    return *found, wired.frame_findings(channels, vehicle is not None)
 
 
 def _there(found: Series | None, topic: Topic) -> Series:

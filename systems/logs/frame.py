@@ -30,6 +30,7 @@ _KINDS = {
 _MAKERS = {12: "PX4"}
 _SUBMARINE, _ARDUPILOT = 12, 3
 _FIRMWARE = re.compile(r"(Ardu(?:Copter|Plane|Rover)|APM:(?:Copter|Plane|Rover)|PX4|Rover|Blimp)\b")
+_OURS = ("ArduSub", "APM:Sub")
 _SAID = re.compile(r"Frame: *(\w+)")
 _MOVES_US = 20.0
 
@@ -46,8 +47,17 @@ def kind_findings(kind: int, maker: int) -> list[Finding]:
     return [_not_a_submarine("HEARTBEAT", said)] if said else []
 
 
-def firmware_findings(place: str, texts: Iterable[str]) -> list[Finding]:
-    """What the autopilot's messages say of its firmware."""
+def firmware_findings(place: str, texts: Iterable[str], maker: int = -1) -> list[Finding]:
+    """What the autopilot's messages say of its firmware; `maker` as in `kind_findings`.
+
+    A message of ArduPilot's may begin with PX4: up to 3.5 it names the board's drivers in this way
+    ("PX4: 8d505a02 NuttX: 1a99ba58"). With a heartbeat of ArduPilot it does not tell the firmware.
+    """
+    texts = list(texts)
+    if any(text.strip().startswith(_OURS) for text in texts):
+        return []
+    if maker == _ARDUPILOT:
+        texts = [text for text in texts if not text.strip().startswith(tuple(_MAKERS.values()))]
     for text in texts:
         found = _FIRMWARE.match(text.strip())
         if found is not None:
@@ -107,9 +117,7 @@ def frame_findings(
                 "correct FRAME_CONFIG and start the autopilot anew before the next dive",
             )
         ]
-    extra = [
-        c for c, motor in sorted(motors.items()) if motor > count and _moves(outputs_us[c - 1])
-    ]
+    extra = [c for c, motor in sorted(motors.items()) if motor > count and moves(outputs_us[c - 1])]
     if extra:
         which = ", ".join(str(c) for c in extra)
         return [
@@ -132,7 +140,8 @@ def frame_findings(
     return []
 
 
-def _moves(pulses: np.ndarray) -> bool:
+def moves(pulses: np.ndarray) -> bool:
+    """Whether an output is driven: its pulses are not always the same."""
     known = pulses[pulses > 0]
     return known.size > 0 and bool(np.ptp(known) > _MOVES_US)
 
@@ -141,21 +150,23 @@ def settled(recording: Recording, turned: Collection[int]) -> tuple[Recording, l
     """Decide by the motion whether outputs with SERVOn_REVERSED are mirrored.
 
     `turned` are the thrusters (from 1) whose PWM was mirrored for it. ArduSub's mixer writes
-    pulses that the parameter does not touch, pass-through and other firmware do: where the
-    mirrored output contradicts the motion, the recorded one is restored.
+    pulses that the parameter does not touch, pass-through and other firmware do. Where the
+    mirrored outputs together contradict the motion and the recorded ones do not, these are
+    restored; else each of which the motion says so.
     """
     if not turned:
         return recording, []
-    against = {
-        int(f.place.rsplit("pwm", 1)[1])
-        for f in command_findings(recording, load_vehicle(recording.vehicle))
-        if f.word == "thruster-reversed"
-    }
+    against = set(turned)
+    severe = _severe(recording)
+    if not severe or _severe(_unmirrored(recording, turned)):
+        reversed_ = [f.place for f in severe if f.word == "thruster-reversed"]
+        against &= {int(place.rsplit("pwm", 1)[1]) for place in reversed_}
     found = []
     for k in sorted(turned):
-        kept = k in against
         told = (
-            "but the motion says that it is not" if kept else "and its PWM is mirrored about 1500"
+            "but the motion says that it is not"
+            if k in against
+            else "and its PWM is mirrored about 1500"
         )
         found.append(
             Finding(
@@ -164,9 +175,19 @@ def settled(recording: Recording, turned: Collection[int]) -> tuple[Recording, l
                 f"the output of thruster {k} is set to be reversed, {told}",
             )
         )
-    back = [k - 1 for k in turned if k in against]
+    return _unmirrored(recording, against), found
+
+
+def _severe(recording: Recording) -> list[Finding]:
+    """What in the commands would stop a command."""
+    found = command_findings(recording, load_vehicle(recording.vehicle))
+    return [f for f in found if f.severity == "severe"]
+
+
+def _unmirrored(recording: Recording, thrusters: Collection[int]) -> Recording:
+    """The recording with the PWM of some thrusters (from 1) mirrored back."""
+    columns = [k - 1 for k in thrusters]
     pwm = recording.dataset["pwm"]
     values = pwm.to_numpy().copy()
-    values[..., back] = 2 * NEUTRAL_US - values[..., back]
-    dataset = recording.dataset.assign(pwm=(pwm.dims, values, pwm.attrs))
-    return Recording(dataset), found
+    values[..., columns] = 2 * NEUTRAL_US - values[..., columns]
+    return Recording(recording.dataset.assign(pwm=(pwm.dims, values, pwm.attrs)))

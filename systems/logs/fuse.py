@@ -2,10 +2,11 @@
 
 Attitude is interpolated along the geodesic, position by the Hermite cubic with the estimated
 velocity as its slope, velocity linearly and then rotated into the body; rates and IMU are means
-about each instant (`models/recordings/resample.py`). The command of a step is the mean over that
-step of the linear interpolation of the logged outputs: a zero-order hold of these samples would
-delay the commands by half a sampling period (50 ms at the 10 Hz of a DataFlash log). Commands that
-act until the next one (`Signals.held`) are held.
+about each instant (`models/recordings/resample.py`). Accelerometer and pressure are measurements:
+they have a value where there was a sample, and are NaN elsewhere. The command of a step is the mean
+over that step of the linear interpolation of the logged outputs: a zero-order hold of these samples
+would delay the commands by half a sampling period (50 ms at the 10 Hz of a DataFlash log). Commands
+that act until the next one (`Signals.held`) are held.
 """
 
 from itertools import pairwise
@@ -24,8 +25,7 @@ from ...models.recordings.resample import (
 )
 from .segments import Segment, segments
 from .signals import Series, Signals
-from .signals_tlog import UNAIDED
-from .streams import DEAD_RECKONING
+from .streams import DEAD_RECKONING, UNAIDED
 
 _FAST_HZ, _MEAN_S = 200.0, 0.01
 _LONGEST_S = 300.0
@@ -116,11 +116,11 @@ def resample(signals: Signals, segment: Segment, number: int, dt: float) -> Traj
             p[:2] = np.nan
             v[2] = v_W[2] * rotations(q).as_matrix()[:, 2, 2]
     if signals.specific_force is not None:
-        sensors["imu_specific_force"] = _instants(signals.specific_force, t).T
+        sensors["imu_specific_force"] = _readings(signals.specific_force, t, dt).T
     if signals.rates.source.startswith(("RAW_IMU", "SCALED_IMU", "IMU", "GYR")):
         sensors["imu_angular_rate"] = omega.T
     if signals.pressure_depth is not None:
-        sensors["pressure_depth"] = _instants(signals.pressure_depth, t)
+        sensors["pressure_depth"] = _readings(signals.pressure_depth, t, dt)
     if signals.voltage is not None:
         sensors["voltage"] = linear(t, signals.voltage.t, signals.voltage.x)
     if signals.rc is not None:
@@ -142,7 +142,7 @@ def _first(rates: Series, segment: Segment, dt: float) -> float:
     smoothed, and looks slower than it was.
     """
     following = rates.t[np.searchsorted(rates.t, segment.start) :]
-    if rates.rate * dt < _EQUAL or not following.size:
+    if slower(rates, dt) or not following.size:
         return segment.start
     first = float(following[0])
     return first if first < segment.start + dt else segment.start
@@ -169,3 +169,25 @@ def _instants(series: Series, t: np.ndarray) -> np.ndarray:
     if series.rate > _FAST_HZ:
         return mean(t, series.t, series.x, _MEAN_S)
     return linear(t, series.t, series.x)
+
+
+def _readings(series: Series, t: np.ndarray, dt: float) -> np.ndarray:
+    """Readings of a sensor at the instants t; NaN where it gave none.
+
+    A sample counts at the instant nearest to it. A sensor that is no slower than the grid also
+    counts between samples of which at most one is lost.
+    """
+    known = np.zeros(t.size, bool)
+    nearest = np.rint((series.t - t[0]) / dt)
+    known[nearest[(nearest >= 0) & (nearest < t.size)].astype(int)] = True
+    if not slower(series, dt):
+        after = np.searchsorted(series.t, t, side="right")
+        inside = (after > 0) & (after < series.t.size)
+        pause = np.diff(series.t)[np.clip(after - 1, 0, series.t.size - 2)]
+        known |= inside & (pause <= 2 * max(dt, 1 / series.rate))
+    return np.where(known, _instants(series, t), np.nan)
+
+
+def slower(series: Series, dt: float) -> bool:
+    """Whether a stream has fewer samples than a grid of step `dt` (s)."""
+    return series.rate * dt < _EQUAL

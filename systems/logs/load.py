@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import numpy as np
+
 from ...models.config.errors import UserError
 from ...models.recordings.checks.finding import enforce, with_findings
 from ...models.recordings.csv import METADATA, read_csv
@@ -122,8 +124,17 @@ def import_log(  # long: a third of it says what it takes and refuses
 
 
 def own_rate(signals: Signals) -> float:
-    """The largest of `RATES` that every stream of state and outputs reaches, or else the least."""
-    streams = (signals.attitude, signals.rates, signals.outputs, signals.velocity)
+    """The largest of `RATES` that every stream of state and outputs reaches, or else the least.
+
+    Without a horizontal velocity the accelerometer is such a stream: nothing else tells of surge
+    and sway, and it has no reading at a sample between two of its own. One below the least rate
+    is too slow to tell of them.
+    """
+    streams = [signals.attitude, signals.rates, signals.outputs, signals.velocity]
+    v = signals.velocity
+    if v is None or not np.isfinite(v.x[:2]).any():
+        force = signals.specific_force
+        streams.append(force if force is not None and force.rate >= RATES[-1] else None)
     slowest = min(s.rate for s in streams if s is not None)
     return next((rate for rate in RATES if rate <= 1.05 * slowest), RATES[-1])
 

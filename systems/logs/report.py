@@ -8,11 +8,14 @@ import numpy as np
 from ...models.recordings.build import Trajectory
 from ...models.recordings.kinematics import agreement
 from ...models.se3 import TWIST
+from .fuse import slower
 from .signals import Series, Signals
 
 _SLOW_OUTPUTS_HZ, _SLOW_STATE_HZ = 25.0, 10.0
 _STILL = 0.03
 _CONSISTENT = 0.9
+_SILENT = 0.02
+"""Share of the time of which a pause of a sensor is said."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ def tell(
         source,
         tuple(lines),
         tuple(has),
-        (*bad, *_lacking(signals), *_unexcited(kept), *signals.lacks),
+        (*bad, *_lacking(signals), *_unread(signals, kept, dt), *_unexcited(kept), *signals.lacks),
         (*signals.notes, *_left_out(signals)),
         tuple(dropped),
     )
@@ -211,6 +214,32 @@ def _lacking(signals: Signals) -> list[str]:
     if signals.specific_force is None:
         told.append("No accelerometer: without a DVL, surge and sway are the preset's.")
     return told
+
+
+def _unread(signals: Signals, kept: Sequence[Trajectory], dt: float) -> list[str]:
+    """Sentences on sensors without a reading at some samples: they are slow, or were silent."""
+    told = []
+    whole = dt * sum(len(k) for k in kept)
+    for series in (signals.specific_force, signals.pressure_depth):
+        if series is None or not kept:
+            continue
+        if slower(series, dt):
+            told.append(
+                f"{_at(series)} is slower than the recording ({1 / dt:g} Hz): its readings stand "
+                "at the samples nearest to them, and the other samples have none."
+            )
+        silent = sum(_silence(series, k, dt) for k in kept)
+        if silent > _SILENT * whole:
+            told.append(f"{series.source} is silent for {silent:.1f} s of {whole:.1f} s.")
+    return told
+
+
+def _silence(series: Series, k: Trajectory, dt: float) -> float:
+    """Time (s) of a trajectory in pauses of a sensor that are longer than one lost sample makes."""
+    start, stop = k.start, k.start + dt * (len(k) - 1)
+    inside = series.t[(series.t > start) & (series.t < stop)]
+    pauses = np.diff(np.concatenate([[start], inside, [stop]]))
+    return float(pauses[pauses > 2 * max(dt, 1 / series.rate)].sum())
 
 
 def _unexcited(kept: Sequence[Trajectory]) -> list[str]:

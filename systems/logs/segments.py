@@ -48,6 +48,7 @@ def segments(signals: Signals, gap: float) -> tuple[list[Segment], list[str]]:
         pieces = _without_gaps(one, gap)
         spans = _intersect(spans, pieces)
         gaps += zip(pieces.stop[:-1].tolist(), pieces.start[1:].tolist(), strict=True)
+    told += _short(signals, series[1:], armed, gap)
     felt = [(a, b) for a, b in gaps if any(a < s.stop and b > s.start for s in armed)]
     if felt:
         starts = np.sort([a for a, _ in felt])
@@ -61,6 +62,21 @@ def segments(signals: Signals, gap: float) -> tuple[list[Segment], list[str]]:
         count = 1 + int(np.count_nonzero(np.diff(times) > 1.0))
         told.append(f"{count} × {kind}")
     return sorted(spans, key=lambda s: s.start), told
+
+
+def _short(
+    signals: Signals, series: Sequence[Series], armed: Sequence[Segment], gap: float
+) -> list[str]:
+    """Streams that begin after the attitude or end before it, and so shorten what is kept."""
+    first, last = float(signals.attitude.t[0]), float(signals.attitude.t[-1])
+    told = []
+    for one in {one.source: one for one in series}.values():
+        ends = (first, float(one.t[0]), "late start"), (float(one.t[-1]), last, "early end")
+        for a, b, what in ends:
+            lost = sum(max(0.0, min(b, s.stop) - max(a, s.start)) for s in armed)
+            if lost > max(gap, 1.0 / one.rate if one.rate else gap):
+                told.append(f"the {what} of {one.source} ({lost:.1f} s)")
+    return told
 
 
 def jumps(signals: Signals) -> list[tuple[float, str]]:

@@ -163,13 +163,23 @@ _RANGES = (
 """Plausible ranges of the parameters in use, somewhat wider than the autopilot's."""
 
 
+_FORMER = {
+    "GND_SPEC_GRAV": "BARO_SPEC_GRAV",
+    "GND_ABS_PRESS": "BARO1_GND_PRESS",
+    "GND_ABS_PRESS2": "BARO2_GND_PRESS",
+    "GND_ABS_PRESS3": "BARO3_GND_PRESS",
+}
+"""Names up to ArduSub 4.0, and those of today."""
+
+
 def parameters_of(
     t: np.ndarray, names: np.ndarray, values: np.ndarray
 ) -> tuple[list[Parameter], list[str]]:
-    """The parameters of a log, and a sentence on those left out as implausible."""
+    """The parameters of a log by today's names, and a sentence on those left out as implausible."""
     found, strange = [], []
     for at, raw, value in zip(t.tolist(), names.tolist(), values.tolist(), strict=True):
-        name = raw.decode("ascii", "replace")
+        written: str = raw.decode("ascii", "replace")
+        name = _FORMER.get(written, written)
         low, high = next(
             ((low, high) for form, low, high in _RANGES if re.fullmatch(form, name)),
             (-math.inf, math.inf),

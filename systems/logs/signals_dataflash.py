@@ -12,6 +12,7 @@ from ..mavlink import codec
 from .dataflash import BinLog
 from .depth import in_water
 from .frame import firmware_findings, frame_said
+from .pressure import followed
 from .signals import (
     Series,
     Signals,
@@ -22,18 +23,22 @@ from .signals import (
     series,
     undelayed,
 )
-from .signals_tlog import UNAIDED
-from .streams import aid_spans, missing_states
+from .streams import UNAIDED, aid_spans, missing_states
 from .table import Table, whole
 from .wiring import DIRECTION_CHANGED, Wiring, direction_findings, thruster_outputs, wiring
 
-EKF2_NAMES = {"NKF1": "XKF1", "NKF4": "XKF4", "NKQ": "XKQ", "NKQ1": "XKQ", "XKQ1": "XKQ"}
-"""Records of EKF2, and of versions that name each core's records: the names of today's EKF3."""
-_EKF2 = 2  # AHRS_EKF_TYPE
+_FILTERS = {
+    3: {"XKF1": "XKF1", "XKF4": "XKF4", "XKQ": "XKQ", "XKQ1": "XKQ"},
+    2: {"NKF1": "XKF1", "NKF4": "XKF4", "NKQ": "XKQ", "NKQ1": "XKQ"},
+}
+"""Records of EKF3 and EKF2 (AHRS_EKF_TYPE), also of versions that name each core's records, by
+today's names of EKF3."""
 WANTED = (
     "ACC",
     "ARM",
     "ATT",
+    "BAR2",
+    "BAR3",
     "BARO",
     "BAT",
     "EV",
@@ -41,7 +46,7 @@ WANTED = (
     "IMU",
     "MODE",
     "MSG",
-    *EKF2_NAMES,
+    *_FILTERS[2],
     "PARM",
     "RATE",
     "RCIN",
@@ -52,10 +57,12 @@ WANTED = (
     "XKF1",
     "XKF4",
     "XKQ",
+    "XKQ1",
 )
 _HORIZ_VEL, _HORIZ_POS, _CONST_POS = 1 << 1, 1 << 3 | 1 << 4, 1 << 7
 _ARMED_EVENT, _DISARMED_EVENT = 10, 11
 _AIDS = ("VISO", "VISP", "VISV")
+_BAROMETERS = {"BARO": 0, "BAR2": 1, "BAR3": 2}
 _LATEST_S = 1e9  # of a clock that counts from the boot
 
 
@@ -69,7 +76,7 @@ def signals_from_bin(
             another.
     """
     usable = {name: _usable(table) for name, table in log.tables.items()}
-    tables = _as_ekf3({name: table for name, table in usable.items() if table["t"].size})
+    tables = one_filter({name: table for name, table in usable.items() if table["t"].size})
     core = _primary_core(tables)
     attitude = _attitude(tables, core)
     first, last = float(attitude.t[0]), float(attitude.t[-1])
@@ -79,9 +86,11 @@ def signals_from_bin(
     )
     known = {p.name: p.value for p in parameters}
     texts = [] if "MSG" not in tables else [m.decode("ascii", "replace") for m in _messages(tables)]
-    wired = wiring(parameters, first, last, vehicle, frame_said(texts))
-    outputs, notes, frame = _outputs(tables, wired, vehicle is not None)
+    channels = _channels(tables)
+    wired = wiring(parameters, first, last, vehicle, frame_said(texts), channels)
+    outputs, notes, frame = _outputs(tables["RCOU"], channels, wired, vehicle is not None)
     position, velocity = _motion(tables, core, known, density)
+    depth = followed(_pressure_depth(tables, known, density), position)
     rates, rate_notes = _rates(tables, core)
     force = _imu(tables, core, "ACC", ("AccX", "AccY", "AccZ"), "specific force")
     if not rates.source.startswith("GYR"):  # GYR and ACC are the sensors before the filters
@@ -105,14 +114,14 @@ def signals_from_bin(
         position=position,
         velocity=velocity,
         specific_force=force,
-        pressure_depth=_pressure_depth(tables, known, density),
+        pressure_depth=depth.depth,
         voltage=voltage,
         rc=_rc(tables),
         spans={**spans, **no_aid},
         cuts=tuple((t, DIRECTION_CHANGED) for t in wired.changes),
         has=(f"Horizontal aid: {', '.join(aids)}.",) if aids else (),
         lacks=() if aids else ("No DVL, odometry or vision record in the log.",),
-        notes=(*log.notes, *strange, *wired.notes, *notes, *rate_notes),
+        notes=(*log.notes, *strange, *wired.notes, *notes, *rate_notes, *depth.told),
         findings=tuple(findings),
         turned=wired.turned,
     )
@@ -122,17 +131,25 @@ def _messages(tables: Mapping[str, Table]) -> list[bytes]:
     return [bytes(text).strip(b"\0") for text in tables["MSG"]["Message"]]
 
 
-def _as_ekf3(tables: dict[str, Table]) -> dict[str, Table]:
-    """The tables with EKF2's records under EKF3's names, if there are no others or it flew."""
+def one_filter(tables: dict[str, Table]) -> dict[str, Table]:
+    """The tables with the records of one filter under EKF3's names: the one that flew.
+
+    It is AHRS_EKF_TYPE's if it logged a motion, else EKF3 before EKF2. Where both run, records of
+    the other describe another estimate.
+    """
     parameters = tables.get("PARM")
     flew = np.zeros(0)
     if parameters is not None:
         flew = parameters["Value"][parameters["Name"] == b"AHRS_EKF_TYPE"]
-    preferred = flew.size > 0 and flew[-1] == _EKF2
-    found = dict(tables)
-    for old, new in EKF2_NAMES.items():
-        if old in tables and (new not in tables or (preferred and old.startswith("N"))):
-            found[new] = tables[old]
+    order = sorted(_FILTERS, key=lambda kind: (not (flew.size and flew[-1] == kind), -kind))
+    moved = [kind for kind in order if any(_FILTERS[kind].get(n) == "XKF1" for n in tables)]
+    logged = [kind for kind in order if _FILTERS[kind].keys() & tables.keys()]
+    chosen = next(iter([*moved, *logged]), 3)
+    every = {name for names in _FILTERS.values() for name in names}
+    found = {name: table for name, table in tables.items() if name not in every}
+    for old, new in _FILTERS[chosen].items():
+        if old in tables:
+            found.setdefault(new, tables[old])
     return found
 
 
@@ -264,9 +281,8 @@ def _states(tables: Mapping[str, Table], first: float, last: float) -> dict[str,
     return spans
 
 
-def _outputs(
-    tables: Mapping[str, Table], wired: Wiring, named: bool
-) -> tuple[Series, list[str], list[Finding]]:
+def _channels(tables: Mapping[str, Table]) -> np.ndarray:
+    """Pulses (µs) of all output channels (32, n)."""
     if "RCOU" not in tables:
         raise UserError(
             "no RCOU in this log, so nothing tells what the thrusters did; "
@@ -277,12 +293,13 @@ def _outputs(
     for n in range(1, 15):
         if f"C{n}" in table:
             channels[n - 1] = table[f"C{n}"]
-    outputs, notes = thruster_outputs(
-        table["t"],
-        channels,
-        wired,
-        "RCOU",
-    )
+    return channels
+
+
+def _outputs(
+    table: Table, channels: np.ndarray, wired: Wiring, named: bool
+) -> tuple[Series, list[str], list[Finding]]:
+    outputs, notes = thruster_outputs(table["t"], channels, wired, "RCOU")
     if outputs is None:
         raise UserError("RCOU: a single record is no record of the thrusters")
     return outputs, notes, wired.frame_findings(channels, named)
@@ -291,15 +308,20 @@ def _outputs(
 def _pressure_depth(
     tables: Mapping[str, Table], known: Mapping[str, float], density: float | None
 ) -> Series | None:
-    if "BARO" not in tables:
+    """Depth by the second barometer, which is outside the hull, or else by the first there is.
+
+    Up to ArduSub 4.0 each has records of its own name, later those of one name have an instance.
+    """
+    found = next((n for n in ("BAR2", "BARO", "BAR3") if n in tables), None)
+    if found is None:
         return None
     gradient = codec.pascal_per_metre(known.get("BARO_SPEC_GRAV", 1.0), density)
-    baro = _of(tables["BARO"], "I", 1)
-    instance = int(whole(baro["I"])[0]) if "I" in baro else 0
+    baro = _of(tables[found], "I", 1)
+    instance = int(whole(baro["I"])[0]) if "I" in baro else _BAROMETERS[found]
     surface = known.get(f"BARO{instance + 1}_GND_PRESS", 0.0) / 100
     surface = surface if 800 < surface < 1200 else codec.SURFACE_PRESSURE_HPA
     depth = codec.depth_from_pressure(baro["Press"] / 100.0, surface, gradient)
-    return series(baro["t"], depth, "BARO", "depth")
+    return series(baro["t"], depth, found, "depth")
 
 
 def _voltage(tables: Mapping[str, Table]) -> Series | None:

@@ -9,7 +9,18 @@ from ...models.recordings.checks.finding import Finding
 from ..mavlink import codec
 from .depth import in_water
 from .frame import firmware_findings, frame_said, kind_findings
-from .signals import Series, Signals, Spans, parameters_of, sampled_spans, series, undelayed
+from .motion_tlog import motion
+from .pressure import followed
+from .signals import (
+    Parameter,
+    Series,
+    Signals,
+    Spans,
+    parameters_of,
+    sampled_spans,
+    series,
+    undelayed,
+)
 from .streams import aid_spans, missing_states
 from .table import Table
 from .tlog import TlogLog
@@ -36,10 +47,8 @@ WANTED = (
     "VFR_HUD",
     "SYS_STATUS",
 )
-UNAIDED = "unaided"
 AIDS = ("VISION_POSITION_DELTA", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE", "ODOMETRY")
 _FIX_3D = 3
-_VELOCITY_HORIZ, _POS_HORIZ, _CONST_POS = 2, 8 | 16, 128
 
 
 def signals_from_tlog(
@@ -59,24 +68,24 @@ def signals_from_tlog(
             "ask for it with SET_MESSAGE_INTERVAL (50 Hz or more) while logging"
         )
     first, last = float(attitude.t[0]), float(attitude.t[-1])
-    table = tables.get("PARAM_VALUE")
-    columns = None if table is None else (table[c] for c in ("t", "param_id", "param_value"))
-    parameters, strange = ([], []) if columns is None else parameters_of(*columns)
+    parameters, strange = _parameters(tables.get("PARAM_VALUE"))
     texts = [] if "STATUSTEXT" not in tables else _texts(tables["STATUSTEXT"]["text"])
-    wired = wiring(parameters, first, last, vehicle, frame_said(texts))
+    wired = wiring(parameters, first, last, vehicle, frame_said(texts), _pulses(outputs_table))
     known = {p.name: p.value for p in parameters}
     outputs, notes, frame = _outputs(outputs_table, wired, vehicle is not None)
-    aiding = _aiding(tables)
-    position, velocity = _motion(tables, known, density)
+    moved, aiding, motion_notes = motion(tables)
+    position, velocity = in_water(*moved, known, density)
+    depth = followed(_pressure_depth(tables, known, density), position)
     rates, bias_note = _rates(tables, attitude)
     rates, rate_delay = undelayed(rates, known, "INS_GYRO_FILTER")
     force, force_delay = _specific_force(tables, known)
+    told = [*bias_note, *rate_delay, *force_delay, *depth.told]
     aids = _aids(log)
     no_aid, stops = ({}, []) if "GPS" in aids else aid_spans(tables, AIDS, last)
     spans = {"wiring": wired.spans, **_states(tables), **aiding, **no_aid}
     voltage = _voltage(tables)
     batteries = [name for name in ("BATTERY_STATUS", "SYS_STATUS") if name in tables]
-    findings = kind_findings(*log.kind) or firmware_findings("STATUSTEXT", texts)
+    findings = kind_findings(*log.kind) or firmware_findings("STATUSTEXT", texts, log.kind[1])
     findings += [*frame, *stops, *missing_states(spans, voltage, batteries)]
     has = [f"Horizontal aid: {', '.join(aids)}."] if aids else []
     return Signals(
@@ -87,7 +96,7 @@ def signals_from_tlog(
         position=position,
         velocity=velocity,
         specific_force=force,
-        pressure_depth=_pressure_depth(tables, known, density),
+        pressure_depth=depth.depth,
         voltage=voltage,
         rc=_rc(tables),
         spans=spans,
@@ -97,10 +106,16 @@ def signals_from_tlog(
         ),
         has=tuple(has),
         lacks=() if aids else ("No DVL, odometry, vision or GPS message in the log.",),
-        notes=(*log.notes, *strange, *wired.notes, *notes, *bias_note, *rate_delay, *force_delay),
+        notes=(*log.notes, *strange, *wired.notes, *notes, *motion_notes, *told),
         findings=(*findings, *direction_findings(wired)),
         turned=wired.turned,
     )
+
+
+def _parameters(table: Table | None) -> tuple[list[Parameter], list[str]]:
+    if table is None:
+        return [], []
+    return parameters_of(table["t"], table["param_id"], table["param_value"])
 
 
 def _aids(log: TlogLog) -> list[str]:
@@ -155,51 +170,6 @@ def _specific_force(
     return None, []
 
 
-def _motion(
-    tables: Mapping[str, Table], known: Mapping[str, float], density: float | None
-) -> tuple[Series | None, Series | None]:
-    local, glob = tables.get("LOCAL_POSITION_NED"), tables.get("GLOBAL_POSITION_INT")
-    if local is not None and local["t"].size > 1:
-        t, name = local["t"], "LOCAL_POSITION_NED"
-        p = codec.world_vector(local["x"], local["y"], local["z"])
-        v = codec.world_vector(local["vx"], local["vy"], local["vz"])
-    elif glob is not None:
-        t, name = glob["t"], "GLOBAL_POSITION_INT"
-        lacking = np.full(t.size, np.nan)
-        p = np.stack([lacking, lacking, codec.height_from_relative_alt(glob["relative_alt"])])
-        v = np.stack([lacking, lacking, codec.climb_from_vz(glob["vz"])])
-    else:
-        return None, None
-    position, velocity = series(t, p, name, "position"), series(t, v, name, "velocity")
-    if local is None or local["t"].size < 2:
-        velocity = _finer_climb(tables, velocity)
-    return in_water(position, velocity, known, density)
-
-
-def _finer_climb(tables: Mapping[str, Table], velocity: Series | None) -> Series | None:
-    """The climb of VFR_HUD where it comes more often: the same estimate, not rounded to 1 cm/s."""
-    hud = tables.get("VFR_HUD")
-    if hud is None:
-        return velocity
-    lacking = np.full(hud["t"].size, np.nan)
-    v = np.stack([lacking, lacking, np.asarray(hud["climb"], float)])
-    found = series(hud["t"], v, "VFR_HUD", "velocity")
-    if found is None or (velocity is not None and found.rate <= velocity.rate):
-        return velocity
-    return found
-
-
-def _aiding(tables: Mapping[str, Table]) -> dict[str, Spans]:
-    status = tables.get("EKF_STATUS_REPORT")
-    if "LOCAL_POSITION_NED" not in tables:
-        return {"aiding": Spans(np.array([-np.inf]), np.array([np.inf]), (UNAIDED,))}
-    if status is None:
-        return {}
-    flags = status["flags"].astype(int)
-    aided = (flags & _VELOCITY_HORIZ > 0) & (flags & _POS_HORIZ > 0) & (flags & _CONST_POS == 0)
-    return {"aiding": sampled_spans(status["t"], ["" if a else UNAIDED for a in aided])}
-
-
 def _states(tables: Mapping[str, Table]) -> dict[str, Spans]:
     beats = tables.get("HEARTBEAT")
     if beats is None:
@@ -247,6 +217,16 @@ def _outputs(table: Table, wired: Wiring, named: bool) -> tuple[Series, list[str
     if outputs is None:
         raise UserError("SERVO_OUTPUT_RAW: a single message is no record of the thrusters")
     return outputs, notes, wired.frame_findings(channels, named)
+
+
+def _pulses(table: Table) -> np.ndarray | None:
+    """Pulses (µs) of the first eight outputs of the first port that has any."""
+    for port in (0, 1):
+        rows = table.rows(table["port"] == port)
+        pulses = np.stack([rows[f"servo{n}_raw"] for n in range(1, 9)]).astype(float)
+        if pulses.any():
+            return pulses
+    return None
 
 
 def _silent(rows: Table, wanted: set[int]) -> bool:

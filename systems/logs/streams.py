@@ -10,6 +10,7 @@ from .signals import Series, Spans
 from .table import Table
 
 DEAD_RECKONING = "dead-reckoning"
+UNAIDED = "unaided"
 _SILENT_S, _SILENT_PERIODS = 2.0, 10.0
 """An aid that is silent for this long, and for this many of its periods, has stopped."""
 

@@ -10,8 +10,14 @@ from jaxtyping import Float
 from ...models.config.errors import UserError
 from ...models.recordings.checks.finding import Finding
 from ...models.vehicles.vehicle import load_vehicle
-from ..mavlink.codec import FRAME_THRUSTERS, MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS, thruster_pwm
-from .frame import frame_findings, frame_in_words
+from ..mavlink.codec import (
+    FRAME_THRUSTERS,
+    MOTOR_FUNCTIONS,
+    PASS_THROUGH_FUNCTIONS,
+    THRUSTER_INPUTS,
+    thruster_pwm,
+)
+from .frame import frame_findings, frame_in_words, moves
 from .signals import Parameter, Series, Spans, series
 
 PRESETS, _USUAL = {6: "bluerov2", 8: "bluerov2_heavy"}, 8
@@ -67,13 +73,15 @@ def wiring(
     last: float,
     vehicle: str | None = None,
     said: int | None = None,
+    pulses: Float[np.ndarray, "c n"] | None = None,
 ) -> Wiring:
     """Read frame and thruster wiring from the parameters as they were during the log.
 
     A channel that ever had motor function 33 … 40 drives that thruster, even while it is set to
     pass-through (1, 51 … 66) or off. Without a named `vehicle` it is the preset with the frame's
-    number of thrusters, with eight if the log doesn't tell. `said` is the frame that the autopilot
-    named, which counts where the log lacks FRAME_CONFIG.
+    number of thrusters. `said` is the frame that the autopilot named, which counts where the log
+    lacks FRAME_CONFIG. Where the log has neither a frame nor functions of outputs 7 and 8, those
+    that move in `pulses` (µs) tell the number (`moving_thrusters`), and the report says so.
 
     Raises:
         UserError: the log's frame has another number of thrusters than the named vehicle.
@@ -87,7 +95,7 @@ def wiring(
     source = f"FRAME_CONFIG {frame}"
     if frame is None and said is not None:
         frame, source = said, frame_in_words(said)
-    name, notes = _vehicle(vehicle, frame, source, channel_of, functions)
+    name, notes = _vehicle(vehicle, frame, source, channel_of, functions, pulses)
     mounts = load_vehicle(name).propulsion.mounts
     channels, told = _channels(len(mounts), channel_of, functions)
     if not directions:
@@ -162,12 +170,17 @@ def _vehicle(
     source: str,
     channel_of: Mapping[int, int],
     functions: _Functions,
+    pulses: np.ndarray | None,
 ) -> tuple[str, list[str]]:
-    """The vehicle's name, and a sentence if it is not the usual one."""
+    """The vehicle's name, and a sentence if it is not the usual one, or the log does not tell."""
     count, told = FRAME_THRUSTERS.get(-1 if frame is None else frame), source
     six = set(channel_of) == set(range(1, 7)) and functions.keys() >= {7, 8}
     if count is None and six and not _drives(functions[7]) and not _drives(functions[8]):
         count, told = 6, "SERVOn_FUNCTION"
+    if named is None and count is None:
+        name, why = _by_outputs(channel_of, functions, pulses)
+        said = f"Frame not in the log: read as {name}{why} (--vehicle names another)."
+        return name, [said, *([] if name == PRESETS[_USUAL] else [load_vehicle(name).limitation()])]
     if named is None:
         name = PRESETS[count or _USUAL]
         said = f"{told}: {count} thrusters, read as those of {name} (--vehicle names another)."
@@ -182,8 +195,27 @@ def _vehicle(
     return named, []
 
 
+def _by_outputs(
+    channel_of: Mapping[int, int], functions: _Functions, pulses: np.ndarray | None
+) -> tuple[str, str]:
+    """The preset with as many thrusters as outputs move, and the reason in words."""
+    known = functions.keys() & {7, 8} or channel_of.keys() & {7, 8}
+    if known or pulses is None:
+        return PRESETS[_USUAL], ""
+    rows = [channel_of.get(n, n) - 1 for n in range(1, _USUAL + 1)]
+    count = moving_thrusters(pulses[[row for row in rows if row < len(pulses)]])
+    why = ", as outputs 7 and 8 stand still while the others move" if count != _USUAL else ""
+    return PRESETS[count], why
+
+
+def moving_thrusters(pulses: Float[np.ndarray, "c n"]) -> int:
+    """Thrusters that outputs (µs) drive: six if 7 and 8 stand still while the others move."""
+    driven = [moves(x) for x in pulses[:_USUAL]]
+    return 6 if len(driven) >= 6 and all(driven[:6]) and not any(driven[6:]) else _USUAL
+
+
 def _drives(history: Sequence[tuple[float, int]]) -> bool:
-    return any(f in (*MOTOR_FUNCTIONS, *PASS_THROUGH_FUNCTIONS) for _, f in history)
+    return any(f in (*MOTOR_FUNCTIONS, *THRUSTER_INPUTS) for _, f in history)
 
 
 def _used(history: Sequence[tuple[float, int]]) -> bool:

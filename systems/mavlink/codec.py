@@ -45,6 +45,7 @@ ARMED_FLAG = 128
 MOTOR_FUNCTIONS = range(33, 41)  # SERVOn_FUNCTION of Motor1 … Motor8
 FRAME_THRUSTERS = {1: 6, 2: 8}  # of VECTORED and VECTORED_6DOF, by FRAME_CONFIG
 PASS_THROUGH_FUNCTIONS = (1, *range(51, 67))  # RCPassThru, RCIN1 … RCIN16
+THRUSTER_INPUTS = (1, *range(51, 59))  # those of the pilot's eight axes; beyond are lamps, cameras
 
 
 def mode_name(custom_mode: int) -> str:

@@ -323,11 +323,11 @@ class _Completion:
                 sd = np.sqrt(np.maximum(np.concatenate([place, rest], axis=1), 0.0))
                 deviation[at] = np.where(own, 0.0, sd)
                 observed[j, k] = followed[j, k] = own
-                known = np.asarray(self.track.known[g, 0])
-                followed[j, k, 5] |= known[12]
-                if known[13:].all():
-                    felt = np.asarray(self.track.seen[g, : at[2].stop, 13:])
-                    force[at] = felt - _of_instrument(twist[:, 3:], others, self.recording.dt)
+                known = np.asarray(self.track.known[g, : at[2].stop])
+                followed[j, k, 5] |= known[0, 12]
+                felt = np.asarray(self.track.seen[g, : at[2].stop, 13:])
+                felt = felt - _of_instrument(twist[:, 3:], others, self.recording.dt)
+                force[at] = np.where(known[:, 13:], felt, np.nan)
                 causal[at] = np.where(own[3:], seen, early)
                 causal_cov[at] = P_early * np.outer(~own[3:], ~own[3:])
         completed = {

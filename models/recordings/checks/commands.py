@@ -336,7 +336,8 @@ def _reversed_thruster(data: Driven, k: int) -> Finding:
     return Finding(
         "thruster-reversed",
         f"column {data.columns[k]}",
-        f"thruster {k + 1} pushes the other way: SERVO{k + 1}_REVERSED or MOT_{k + 1}_DIRECTION",
+        f"thruster {k + 1} pushes the other way: MOT_{k + 1}_DIRECTION, or SERVOn_REVERSED of the "
+        "output n that drives it",
         f"correct the parameter, or the sign of {data.columns[k]}",
     )
 

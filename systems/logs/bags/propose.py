@@ -22,6 +22,10 @@ _PULSES_US = (800.0, 2200.0)
 _USUAL = re.compile(r"odom", re.I)
 """In the names of topics of the vehicle's own estimate (REP 105), before fixes of a GPS."""
 _FASTER = 3.0
+FIRST_BAROMETER = "/imu/static_pressure"
+"""End of mavros' topic of SCALED_PRESSURE: on a BlueROV2 the barometer in the hull."""
+_GLOBAL = re.compile(r"/global_position/(local|raw/[^/]+)$")
+"""mavros' topics of a GPS: without one they stand still, or hold the climb alone."""
 _NUMBERED = re.compile(r"(?:thrust|motor|propeller)\D*(\d+)", re.I)
 """In the name of a topic that drives one thruster."""
 _STICKS = "mavros_msgs/msg/OverrideRCIn"
@@ -157,16 +161,22 @@ def propose(bag: Bag) -> TopicMap:
     """
     seen = inspect(bag)
     measured = [s for s in seen if not _ORDERED.search(s.topic)]
-    chosen: dict[Quantity, Seen | None] = {"position": _best(measured, "position")}
+    moving = [s for s in measured if not _GLOBAL.search(s.topic)]
+    chosen: dict[Quantity, Seen | None] = {"position": _best(moving, "position")}
     place = chosen["position"]
     alike = [s for s in measured if place is None or _space(s) == _space(place)]
     chosen["attitude"] = _best(alike, "attitude") or _best(measured, "attitude")
     own = [s for s in (place, chosen["attitude"]) if s is not None]
-    chosen["velocity"] = _best(own, "velocity") or _best(measured, "velocity")
+    mine = [s for s in own if s in moving]
+    chosen["velocity"] = _best(mine, "velocity") or _best(moving, "velocity")
     chosen["rates"] = _rates(measured, own)
     chosen["acceleration"] = _best(own, "acceleration") or _best(measured, "acceleration")
     pressures = [s for s in measured if s.column.type == PRESSURE and s.has("depth")]
-    outside = max(pressures, key=lambda s: float(np.nanmax(s.column.x)), default=None)
+    outside = max(
+        pressures,
+        key=lambda s: (not s.topic.endswith(FIRST_BAROMETER), float(np.nanmax(s.column.x))),
+        default=None,
+    )
     chosen["depth"] = outside or _best(measured, "depth")
     for alone in _ALONE:
         chosen[alone] = _best(measured, alone)

@@ -12,6 +12,7 @@ from ....models.vehicles.vehicle import load_vehicle
 from ...mavlink import codec
 from ..depth import in_water
 from ..log_bytes import Progress, no_progress
+from ..pressure import Followed, followed
 from ..signals import (
     Parameter,
     Series,
@@ -22,18 +23,16 @@ from ..signals import (
     series,
     undelayed,
 )
-from ..signals_tlog import UNAIDED
-from ..streams import missing_states
+from ..streams import UNAIDED, missing_states
 from ..wiring import PRESETS, Wiring, direction_findings, thruster_outputs, wiring
 from .axes import axes_findings, velocity_axes
 from .bag import Bag, Column, open_bag
 from .clocks import Clock
 from .messages import COMMANDS, PRESSURE, SAMPLED, Quantity
-from .propose import listed, propose
+from .propose import FIRST_BAROMETER, listed, propose
 from .quantities import Quantities, derivative, turning
 from .topics import Topic, TopicMap, beside, load_map
 
-_MOVES_US = 20.0
 _HOW = "name one in a topic map (`spinndrift import BAG --topics`)"
 
 
@@ -85,10 +84,12 @@ def _signals(
     first, last = float(attitude.t[0]), float(attitude.t[-1])
     parameters, strange = _parameters(taken)
     known = {p.name: p.value for p in parameters}
-    outputs, command, wired, wire_notes = _outputs(bag, taken, parameters, (first, last), vehicle)
+    outputs, command, wired, wire_notes, frame = _outputs(
+        bag, taken, parameters, (first, last), vehicle
+    )
     if proposed:
         taken = _by_motion(taken, attitude)
-    position, velocity, motion_notes = _motion(taken, attitude)
+    position, velocity, motion_notes = _motion(taken, attitude, proposed)
     rates = taken.rates(attitude)
     if rates is None:
         rates = turning(attitude)
@@ -96,10 +97,11 @@ def _signals(
     rates, force, delays = _undelayed(taken, rates, known)
     if _same(taken.topic("parameters"), taken.topic("position")):
         position, velocity = in_water(position, velocity, known, density)
+    depth = _followed(taken, _pressure_depth(taken, known, density), position, proposed)
     spans = {"wiring": wired.spans, **_states(taken), **_aiding(taken, velocity)}
     voltage = _voltage(taken)
     batteries = [one.topic for one in (taken.topic("voltage"),) if one is not None]
-    findings = axes_findings(taken, attitude, taken.position(), force)
+    findings = frame + axes_findings(taken, attitude, taken.position(), force)
     findings += [*missing_states(spans, voltage, batteries, "mavros_msgs/State"), *_broken(columns)]
     return Signals(
         attitude=attitude,
@@ -111,11 +113,11 @@ def _signals(
         position=position,
         velocity=velocity,
         specific_force=force,
-        pressure_depth=_pressure_depth(taken, known, density),
+        pressure_depth=depth.depth,
         voltage=voltage,
         rc=_rc(taken),
         spans=spans,
-        notes=(*taken.notes, *strange, *wire_notes, *motion_notes, *delays),
+        notes=(*taken.notes, *strange, *wire_notes, *motion_notes, *delays, *depth.told),
         findings=(*findings, *direction_findings(wired)),
         turned=wired.turned,
     )
@@ -172,8 +174,8 @@ def _outputs(
     parameters: Sequence[Parameter],
     span: tuple[float, float],
     vehicle: str | None,
-) -> tuple[Series, str, Wiring, list[str]]:
-    """What drives the thrusters, its name in a recording, and the vehicle's thrusters."""
+) -> tuple[Series, str, Wiring, list[str], list[Finding]]:
+    """What drives the thrusters, its name in a recording, the vehicle's thrusters, sentences."""
     quantity: Quantity | None = next((q for q in COMMANDS if taken.topic(q) is not None), None)
     found = None if quantity is None else taken.taken(quantity)
     if quantity is None or found is None:
@@ -185,7 +187,7 @@ def _outputs(
     one, t, x = found
     if quantity == "wrench":
         wired = wiring(parameters, *span, vehicle)
-        return _there(taken.wrench(), one), "F_Bo_B", wired, []
+        return _there(taken.wrench(), one), "F_Bo_B", wired, [], []
     if quantity == "forces":
         wired = wiring(parameters, *span, vehicle or _by_count(one, x.shape[0]))
         count = len(load_vehicle(wired.vehicle).propulsion.mounts)
@@ -196,17 +198,20 @@ def _outputs(
             )
         signs = np.array(one.directions or (1,) * count)
         x = x * signs[:count, None] if signs.size >= count else x
-        return _there(series(t, x, one.topic, "thrust"), one), "thruster_force", wired, []
+        return _there(series(t, x, one.topic, "thrust"), one), "thruster_force", wired, [], []
     bare = taken.columns[one.topic].type.startswith("std_msgs")
     named = vehicle
-    if vehicle is None and not any(p.name == "FRAME_CONFIG" for p in parameters):
-        named = _by_count(one, x.shape[0] if bare or one.channels else _moving(x))
-    wired = wiring([*parameters, *_directions(one, span[0])], *span, named)
+    counted = bare or bool(one.channels)
+    if vehicle is None and counted and not any(p.name == "FRAME_CONFIG" for p in parameters):
+        named = _by_count(one, x.shape[0])
     channels = np.zeros((32, t.size))
     rows = min(x.shape[0], 32)
     channels[:rows] = np.nan_to_num(x[:rows])
+    directed = [*parameters, *_directions(one, span[0])]
+    wired = wiring(directed, *span, named, pulses=channels)
     outputs, notes = thruster_outputs(t, channels, wired, one.topic)
-    return _there(outputs, one), "pwm", wired, [*wired.notes, *notes]
+    found = _there(outputs, one), "pwm", wired, [*wired.notes, *notes]
+    return *found, wired.frame_findings(channels, vehicle is not None)
 
 
 def _there(found: Series | None, topic: Topic) -> Series:
@@ -220,12 +225,6 @@ def _there(found: Series | None, topic: Topic) -> Series:
 
 def _directions(topic: Topic, t: float) -> list[Parameter]:
     return [Parameter(t, f"MOT_{n}_DIRECTION", float(d)) for n, d in enumerate(topic.directions, 1)]
-
-
-def _moving(pwm: np.ndarray) -> int:
-    """Thrusters that outputs drive: six if 7 and 8 stand still while the others move."""
-    moves = [bool(np.ptp(x[x > 0]) > _MOVES_US) if (x > 0).any() else False for x in pwm[:8]]
-    return 6 if all(moves[:6]) and len(moves) >= 6 and not any(moves[6:]) else 8
 
 
 def _by_count(topic: Topic, count: int) -> str:
@@ -242,7 +241,9 @@ def _by_count(topic: Topic, count: int) -> str:
     return PRESETS[count]
 
 
-def _motion(taken: Quantities, attitude: Series) -> tuple[Series | None, Series | None, list[str]]:
+def _motion(
+    taken: Quantities, attitude: Series, proposed: bool
+) -> tuple[Series | None, Series | None, list[str]]:
     """Position and velocity in W; what one of them lacks is derived from the other topics."""
     position, velocity = taken.position(), taken.velocity(attitude)
     if position is not None and velocity is not None:
@@ -251,7 +252,7 @@ def _motion(taken: Quantities, attitude: Series) -> tuple[Series | None, Series 
         said = f"{position.source}: velocities are differences of the positions."
         return position, derivative(position), [said]
     z = taken.scalar("height", "position")
-    if z is None:
+    if z is None and not (proposed and _may_be_the_hulls(taken)):
         depth = _pressure_depth(taken, {}, None)
         z = None if depth is None else replace(depth, x=-depth.x)
     if velocity is not None:
@@ -320,6 +321,26 @@ def _pressure_depth(
     gradient = codec.pascal_per_metre(known.get("BARO_SPEC_GRAV", 1.0), density)
     depth = codec.depth_from_pressure(hPa, surface, gradient)
     return series(t, depth, topic.topic, "depth")
+
+
+def _may_be_the_hulls(taken: Quantities) -> bool:
+    """Whether the depth is of mavros' SCALED_PRESSURE, the autopilot's first barometer."""
+    topic = taken.topic("depth")
+    return topic is not None and topic.topic.endswith(FIRST_BAROMETER)
+
+
+def _followed(
+    taken: Quantities, depth: Series | None, position: Series | None, proposed: bool
+) -> Followed:
+    """The depth, unless it does not follow the height, or nothing tells that it is the water's."""
+    found = followed(depth, position)
+    if found.depth is None or found.sure or not (proposed and _may_be_the_hulls(taken)):
+        return found
+    said = (
+        f"{found.depth.source} may be of the barometer in the hull, and no height tells: it was "
+        "left out; name it in a topic map (`--topics`) if it is the water's."
+    )
+    return Followed(None, (said,))
 
 
 def _voltage(taken: Quantities) -> Series | None:

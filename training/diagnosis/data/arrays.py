@@ -14,6 +14,7 @@ from ....models.recordings.kinematics import dead_reckoned
 from ....models.recordings.store import Recording
 from ....models.se3 import AXES, TWIST, XYZ
 from ....models.vehicles.vehicle import Vehicle
+from .readings import sensors_of_latent
 
 SEGMENT = 256
 """Longest piece (samples) that a run is cut into; pieces are filtered side by side."""
@@ -225,7 +226,7 @@ def make_data(
     """
     unmeasured = unmeasured_channels(recording)
     latent = [i for i, name in enumerate(TWIST) if name in unmeasured]
-    extra = _sensors_of_latent(recording, latent)
+    extra = sensors_of_latent(recording, latent)
     data, lengths = recording.dataset, recording.lengths
     thrust, volts = recording.thrust(vehicle)
     kept = _kept(lengths, without)
@@ -324,21 +325,6 @@ def unmeasured_channels(recording: Recording) -> tuple[str, ...]:
             "Give rates from the attitude (differences, turned into B)"
         )
     return (*lacking.get("X_WB", ()), *lacking.get("V_WB_B", ()))
-
-
-def _sensors_of_latent(recording: Recording, latent: Sequence[int]) -> dict[str, np.ndarray]:
-    """Readings that tell of latent velocities, where every run has them."""
-    found = {}
-    wanted = {"specific_force": "imu_specific_force", "climb": "vertical_velocity"}
-    for name, variable in wanted.items() if latent else ():
-        if variable not in recording.dataset:
-            continue
-        values = recording.dataset[variable].to_numpy()
-        if np.isfinite(values[recording.mask]).all():
-            found[name] = values
-    if 2 in latent:
-        found.pop("climb", None)
-    return found
 
 
 def _cut(

@@ -274,7 +274,7 @@ def _of_latent(data: Data) -> list[str]:
     if data.unseen:
         found.append(
             f"{', '.join(data.unseen)}: no instrument tells of this motion, so drag, inertia and "
-            "thrust there stay as believed; log u, v (a DVL) or the accelerometer"
+            "thrust there stay as believed; log u, v (a DVL), or the accelerometer at every sample"
         )
     return found
 

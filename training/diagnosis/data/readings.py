@@ -1,0 +1,44 @@
+"""Readings of sensors that tell of velocities without an instrument."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ....models.recordings.store import Recording
+
+_READ, _BRIDGED = 0.9, 0.5
+"""Least share of the samples at which a sensor has a reading, and longest gap (s) that is
+interpolated: the one that an import allows in the state (`LogOptions.gap`)."""
+
+
+def sensors_of_latent(recording: Recording, latent: Sequence[int]) -> dict[str, np.ndarray]:
+    """Readings that tell of latent velocities, where every run has them.
+
+    Single lost samples are interpolated, as those of the state are.
+    """
+    found = {}
+    wanted = {"specific_force": "imu_specific_force", "climb": "vertical_velocity"}
+    for name, variable in wanted.items() if latent else ():
+        if variable not in recording.dataset:
+            continue
+        values = _bridged(recording, variable)
+        if values is not None:
+            found[name] = values
+    if 2 in latent:
+        found.pop("climb", None)
+    return found
+
+
+def _bridged(recording: Recording, variable: str) -> np.ndarray | None:
+    """Readings with their gaps interpolated; None if in a run they are too long or too many."""
+    values = recording.dataset[variable].to_numpy().copy()
+    for j, k in np.argwhere(recording.lengths > 0):
+        length = int(recording.lengths[j, k])
+        own = values[j, k, :length].reshape(length, -1)
+        there = np.isfinite(own).all(axis=1)
+        t = recording.elapsed(int(j), int(k))
+        if there.mean() < _READ or np.diff(t[there], prepend=t[0], append=t[-1]).max() > _BRIDGED:
+            return None
+        for x in own.T:
+            x[~there] = np.interp(t[~there], t[there], x[there])
+    return values

@@ -327,8 +327,8 @@ class Driver:
         attitude = min(link.age(name) for name in ("ATTITUDE_QUATERNION", "ATTITUDE"))
         seen = {"vehicle": link.silence, "attitude": attitude, "depth": depth, **ages}
         leak = "a leak is reported" if status is not None and status.leak else ""
-        told = link.latest("SYS_STATUS")
-        health = None if told is None else told.message.onboard_control_sensors_health
+        system = link.latest("SYS_STATUS")
+        sensors = None if system is None else int(system.message.onboard_control_sensors_health)
         # in a dry run the vehicle stays as it is
         armed = self._dry or (status is not None and status.armed)
         mode = _FLY if self._dry or status is None else status.mode
@@ -344,7 +344,7 @@ class Driver:
             leak,
             len(link.others(2.0)),
             self._unlike(now),
-            health is None or is_depth_healthy(health),
+            sensors is None or is_depth_healthy(sensors),
         )
 
     def _unlike(self, now: float) -> float:

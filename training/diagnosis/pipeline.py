@@ -27,6 +27,7 @@ from .causes import (
 from .config import DiagnoseConfig
 from .data.arrays import Data
 from .data.checks import limits, problems, require_enough, settled, unexcited
+from .data.readings import with_velocity
 from .disturbance.found import OF_OTHERS, all_laws, reported_laws
 from .disturbance.laws import Law
 from .disturbance.levels import LEVEL
@@ -96,6 +97,7 @@ class Diagnoser:
         self.config = replace(config, refit="none") if config.refit == "auto" else config
         self.furthest = 0.0
         self.report = progress
+        recording, self.left_out = with_velocity(recording)
         self.faults, faulty = problems(recording)
         self.checked = [
             result.DataFinding(f.word, f.severity, f.place, f.text, f.remedy)
@@ -221,6 +223,7 @@ class Diagnoser:
             limits=[
                 *limits(d, self.quiet, self.resampled, estimated, self.command_period),
                 *(settled(kept, d.dt) if d.latent else []),
+                *([self.left_out] if self.left_out else []),
             ],
             noise=reported.noise_levels(problem, final),
             findings=self.checked,

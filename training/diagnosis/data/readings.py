@@ -4,11 +4,30 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ....models.recordings.build import window
+from ....models.recordings.schema import observed
 from ....models.recordings.store import Recording
 
 _READ, _BRIDGED = 0.9, 0.5
 """Least share of the samples at which a sensor has a reading, and longest gap (s) that is
 interpolated: the one that an import allows in the state (`LogOptions.gap`)."""
+
+
+def with_velocity(recording: Recording) -> tuple[Recording, str]:
+    """The runs whose velocity was measured, if they hold most of the samples, and a sentence.
+
+    Else all runs and none: then the velocity counts as not measured in any of them.
+    """
+    lengths, V = recording.lengths, recording.dataset["V_WB_B"].to_numpy()
+    measured = observed(V, recording.mask)[..., :3].all(axis=-1) & (lengths > 0)
+    seconds, total = recording.dt * lengths[measured].sum(), recording.dt * lengths.sum()
+    if measured.sum() == (lengths > 0).sum() or seconds <= total / 2:
+        return recording, ""
+    kept = window(recording.dataset, np.zeros_like(lengths), np.where(measured, lengths, 0))
+    return Recording(kept), (
+        f"in {total - seconds:.0f} of {total:.0f} s the velocity was not measured: these runs are "
+        "left out"
+    )
 
 
 def sensors_of_latent(recording: Recording, latent: Sequence[int]) -> dict[str, np.ndarray]:

@@ -186,7 +186,7 @@ def _fitted(
 def _refined(
     problem: DiagnosisProblem, seen: Evaluation, session: Session, h: Hypothesis, span: Span
 ) -> Span:
-    """The shortest part, with its edges moved by up to a block each, of those that win most."""
+    """The part with its edges moved by up to a block each, to the median of where they may lie."""
     if span.kind == "drift":
         return span
     library, (name, where) = problem.library, h
@@ -204,9 +204,15 @@ def _refined(
     low, high = max(first - block, run[0]), min(first + block, last - 2)
     if high > low:  # what the part wins from each start on
         gains = np.cumsum(won[low : high + 1][::-1])[::-1]
-        first = low + int(np.flatnonzero(gains >= gains.max() - _UNDECIDED)[-1])
+        first = low + _median(gains)
     if span.kind == "window" and last <= run[-1]:
         low, high = max(last - block, first + 2), min(last + block, run[-1] + 1)
         gains = np.concatenate([[0.0], np.cumsum(won[low:high])])
-        last = low + int(np.flatnonzero(gains >= gains.max() - _UNDECIDED)[0])
+        last = low + _median(gains)
     return Span(span.kind, int(first), int(last))
+
+
+def _median(gains: Float[np.ndarray, " n"]) -> int:
+    """Where the probability of an edge reaches a half, from the nats of each place (Smith 1975)."""
+    below = np.cumsum(np.exp(gains - gains.max()))
+    return int(np.searchsorted(below, below[-1] / 2))

@@ -1,5 +1,6 @@
 """Healthy runs to compare with, and a model of them: from a diagnosis, or from data."""
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -94,15 +95,19 @@ def _sessions(path: Path) -> list[Path]:
 
 def _is_recording(path: Path) -> bool:
     """Whether a path is a folder with CSV runs or a ROS 2 bag."""
-    return path.is_dir() and ((path / CSV_FOLDER).exists() or bag_kind(path) is not None)
+    if not path.is_dir() or not os.access(path, os.R_OK | os.X_OK):
+        return False
+    return (path / CSV_FOLDER).exists() or bag_kind(path) is not None
 
 
 def _check_sessions(path: Path) -> None:
     """Refuse a folder whose recordings are partly in folders deeper than those that are read."""
-    if not path.is_dir() or (path / MARKER).exists():  # dives of a collection are in its recording
+    # dives of a collection are in its recording; what lies beside CSV runs belongs to them
+    if not path.is_dir() or (path / MARKER).exists() or _is_recording(path):
         return
     for inner in sorted(set(path.iterdir()) - set(_sessions(path))):
-        if inner.is_dir() and _sessions(inner):
+        readable = inner.is_dir() and os.access(inner, os.R_OK | os.X_OK)
+        if readable and _sessions(inner):
             raise UserError(
                 f"--against {path}: the recordings in its folder {inner.name} would be left out; "
                 f"move them into {path.name}"

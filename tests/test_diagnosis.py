@@ -538,6 +538,7 @@ def test_a_velocity_that_heading_turns_is_found_with_its_terms_alone(tmp_path):
 
     ten = replace(problem.data, u=10 * problem.data.u)
     np.testing.assert_allclose(numbers(ten), 10 * numbers(problem.data))
+    assert not numbers(replace(problem.data, u=0 * problem.data.u)).size
 
 
 def test_what_runs_ahead_of_its_command_has_no_rate_limit(tmp_path, monkeypatch):

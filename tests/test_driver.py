@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +17,7 @@ from served_vehicle import Served
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.vehicle.telemetry import messages
-from spinndrift.systems.mavlink import commands, telemetry
+from spinndrift.systems.mavlink import commands, guard_process, telemetry
 from spinndrift.systems.mavlink.config import Mavlink
 from spinndrift.systems.mavlink.driver import Acted, Driver
 from spinndrift.systems.mavlink.link import Link
@@ -261,6 +262,42 @@ def test_a_killed_or_hung_process_leaves_no_thruster_running(port: int, how: sig
     process.wait(5.0)  # the guard has killed a process that hangs
     process.stdout.close()
     check_at_rest(port)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [(b".", ("died", False)), (b"..p.", ("died", True)), (b".w!", ("", False)),
+     (b"p?", (guard_process._UNABLE, True))],
+)  # fmt: skip
+def test_a_guard_knows_whether_a_pilot_steers(monkeypatch, words, said):
+    ours, theirs = os.pipe()
+    with os.fdopen(ours) as reading, monkeypatch.context() as patched:
+        patched.setattr(sys, "stdin", reading)
+        os.write(theirs, words)
+        os.close(theirs)
+        assert guard_process._watch() == said
+
+
+def test_the_id_that_the_vehicle_obeys_is_set_first_and_given_back_last(tmp_path):
+    class Told(Parameters):
+        written: ClassVar[list] = []
+
+        def __init__(self):
+            pass
+
+        def read(self, name):
+            return 1.0
+
+        def write(self, name, value):
+            self.written.append((name, value))
+
+    told, calls = Told(), []
+    borrowed = Borrowed(told, tmp_path / "borrowed.param")
+    borrowed.borrow({"SERVO1_FUNCTION": 51.0, "MAV_GCS_SYSID": 254.0}, lambda: calls.append(1))
+    borrowed.give_back()
+    names = [name for name, _ in told.written]
+    assert names == ["MAV_GCS_SYSID", "SERVO1_FUNCTION", "SERVO1_FUNCTION", "MAV_GCS_SYSID"]
+    assert len(calls) == 2
 
 
 def test_borrowed_parameters_belong_to_a_vehicle_and_not_to_its_address(served: Served):

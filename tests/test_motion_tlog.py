@@ -23,9 +23,10 @@ def imported(folder, log, **options):
     return import_log(path, **options)
 
 
-def partly(silent, glob=True, duration=36.0):
+def partly(silent, glob=True, duration=36.0, **settings):
     """A dive whose local positions are silent at some times; the global ones are not."""
-    log, other = dive(duration=duration), dive(duration=duration, horizontal=False)
+    log = dive(duration=duration, **settings)
+    other = dive(duration=duration, horizontal=False, **settings)
     log.records = [r for r in log.records if number(r[1]) != LOCAL or not silent(r[0])]
     log.records += [r for r in other.records if number(r[1]) == GLOBAL and glob]
     return log
@@ -55,6 +56,14 @@ def test_height_and_climb_where_the_local_position_is_silent(tmp_path, silent, u
             assert np.abs(run.V_WB_B.T - V).max() < 2e-3
             assert np.abs(run.X_WB[:, 4:].T - X[4:]).max() < 1e-3
     assert "LOCAL_POSITION_NED is silent for" in str(report)
+
+
+def test_positions_slower_than_the_climb_of_the_display_are_read_to_their_last(tmp_path):
+    log = partly(lambda t: t > 112.0, rates=(50.0, 3.0, 50.0), hud=10.0)
+    recording, _ = imported(tmp_path, log)
+    runs = list(recording.trajectories())
+    assert sum(len(run) for run in runs) * recording.dt > 30.0
+    assert not np.isnan(runs[0].X_WB).any()
 
 
 def test_short_pauses_of_the_local_position_stay_gaps(tmp_path):

@@ -98,3 +98,9 @@ def test_signs_of_quaternions_are_made_continuous():
     smooth = continuous(flipped)
     assert ((smooth[:, 1:] * smooth[:, :-1]).sum(axis=0) > 0.9).all()
     assert smooth[0, 0] >= 0
+
+
+def test_what_is_unknown_beside_a_sample_does_not_hide_it():
+    t, x = np.arange(4.0), np.array([[0.0, 1.0, np.nan, 3.0]])
+    found = linear(np.array([0.0, 1.0, 1.5, 2.0, 3.0]), t, x)
+    np.testing.assert_array_equal(found, [[0.0, 1.0, np.nan, np.nan, 3.0]])

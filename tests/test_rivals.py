@@ -105,6 +105,7 @@ def test_rivals_stand_beside_judgements(tmp_path, monkeypatch):
             True,
             True,
             None,
+            True,
             1,
             0,
             gain={"all": 0.99},

@@ -61,7 +61,7 @@ class _Loader(yaml.SafeLoader):
             lines[key] = line
         return super().construct_mapping(node, deep=deep)
 
-    def construct_scalar(self, node: yaml.ScalarNode | yaml.MappingNode) -> Any:
+    def construct_scalar(self, node: Any) -> Any:
         """The text of a node; one with a null character is no name, and no path can hold it."""
         found = super().construct_scalar(node)
         if isinstance(found, str) and "\0" in found:

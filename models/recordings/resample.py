@@ -19,9 +19,10 @@ def grid(first: float, last: float, dt: float) -> Float[np.ndarray, " N"]:
 def linear(
     t_new: Float[np.ndarray, " N"], t: Float[np.ndarray, " n"], x: Float[np.ndarray, "*c n"]
 ) -> Float[np.ndarray, "*c N"]:
-    """Linear interpolation; constant outside the samples."""
+    """Linear interpolation; constant outside the samples, and the sample itself at its time."""
     i, s = _locate(t_new, t)
-    return x[..., i] + s * (x[..., i + 1] - x[..., i])
+    between = x[..., i] + s * (x[..., i + 1] - x[..., i])
+    return np.where(s == 0, x[..., i], np.where(s == 1, x[..., i + 1], between))
 
 
 def hold(

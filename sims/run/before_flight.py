@@ -23,7 +23,8 @@ _RATES = (200.0, 100.0, 50.0, 40.0, 20.0)  # Hz that the filter may have; their 
 _FEW = 5  # values
 _NEVER = 1e6
 _PATIENCE = 30.0  # s for what passes by itself after the vehicle's start
-_PASSING = {"attitude", "inertial sensors", "link", *telemetry.IMUS, "depth", "compass", "dvl"}
+_PASSING = {"attitude", "inertial sensors", "depth sensor", "link", *telemetry.IMUS}
+_PASSING |= {"depth", "compass", "dvl"}
 
 Tell = Callable[[str], None]
 

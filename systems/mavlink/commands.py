@@ -18,6 +18,7 @@ FORCED_DISARM = 21196.0
 """Parameter 2 of a disarming that is not refused (ArduPilot's magic number)."""
 _SPOKEN = 0.3  # s to wait for the text that gives the reason of a refusal
 _STATE = 3.0  # s in which a heartbeat shows what was accepted
+_AGAIN = 0.5  # s after which a heartbeat is asked for again
 _WARNING = mavlink.MAV_SEVERITY_WARNING
 
 
@@ -174,12 +175,13 @@ def _until_seen(
         raise VehicleRefused(f"{what}: {_answer(result)}{_reason(link, started, _SPOKEN)}")
     vehicle = link.find_vehicle()
     heartbeat = float(mavlink.MAVLINK_MSG_ID_HEARTBEAT)  # without waiting for the next second's
-    link.send(command_long(vehicle, mavlink.MAV_CMD_REQUEST_MESSAGE, heartbeat))
-    if link.wait_for("HEARTBEAT", _STATE, shows, started) is None:
-        raise VehicleRefused(
-            f"{what}: accepted, and not seen in {_STATE:g} s of heartbeats"
-            f"{_reason(link, started, 0.0)}"
-        )
+    for _ in range(round(_STATE / _AGAIN)):
+        link.send(command_long(vehicle, mavlink.MAV_CMD_REQUEST_MESSAGE, heartbeat))
+        if link.wait_for("HEARTBEAT", _AGAIN, shows, started) is not None:
+            return
+    raise VehicleRefused(
+        f"{what}: accepted, and not seen in {_STATE:g} s of heartbeats{_reason(link, started, 0.0)}"
+    )
 
 
 def _answer(result: int | None) -> str:

@@ -13,6 +13,8 @@ Way = Literal["manual_control", "rc_override", "thruster_passthrough"]
 
 GROUND_STATION = 255
 """The system id that ArduSub obeys by default (SYSID_MYGCS)."""
+OBEYED = ("SYSID_MYGCS", "MAV_GCS_SYSID")
+"""The parameter with the system id whose commands ArduSub follows, until 4.6 and since."""
 
 
 @dataclass(frozen=True)

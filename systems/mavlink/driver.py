@@ -225,7 +225,7 @@ class Driver:
             self._guard.busy()
             # overrides of old may be at work: before pass-through follows them, and before arming
             self._neutral(0.2)
-            self._borrowed.borrow(changed)
+            self._borrowed.borrow(changed, lambda: self._neutral(0.06))
             self._neutral(0.2)
             commands.arm(self.link)
         except BaseException:
@@ -275,6 +275,8 @@ class Driver:
         if held and status is not None and not (status.armed and status.mode == _HOLD):
             order = "yield"  # a pilot has taken the vehicle from its depth
         if order == "yield" or self._ended == "yield":
+            if self._guard is not None and self._ended != "yield":
+                self._guard.pilot()
             self._ended = "yield"
             return
         if self._dry:

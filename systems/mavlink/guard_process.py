@@ -28,8 +28,8 @@ from .link import Link, Peer
 from .parameters import Borrowed, Parameters
 from .transport import Connection
 
-_BEAT, _BUSY, _RELEASE, _LEAVE = b".", b"w", b"!", b"?"
-_PATIENCE = {_BEAT: 1.0, _BUSY: 30.0}  # s without a word, after the last one
+_BEAT, _BUSY, _PILOT, _RELEASE, _LEAVE = b".", b"w", b"p", b"!", b"?"
+_PATIENCE = {_BEAT: 1.0, _BUSY: 30.0, _PILOT: 30.0}  # s without a word, after the last one
 _NEUTRAL_FOR, _PERIOD = 1.0, 0.05  # s of neutral messages, s between them
 _READY_IN = 30.0  # s: a loaded machine starts an interpreter slowly
 _READY = b"ready\n"
@@ -91,6 +91,14 @@ class Guard:
         except OSError as error:
             raise UserError("the guard process has ended; the dive can't go on") from error
 
+    def pilot(self) -> None:
+        """Say that a pilot steers: from now on a rescue only gives parameters back.
+
+        Raises:
+            UserError: the guard is gone.
+        """
+        self._say(_PILOT)
+
     def leave(self) -> None:
         """Leave the vehicle to the guard, which stops it if it can be reached, and ends.
 
@@ -145,19 +153,20 @@ def _give_back(link: Link, borrowed: Path | None) -> Mapping[str, float]:
     return {} if borrowed is None else Borrowed(Parameters(link), borrowed).give_back()
 
 
-def _watch() -> str:
-    """Wait for the release; what happened if the words end without it."""
-    last = _BUSY
+def _watch() -> tuple[str, bool]:
+    """Wait for the release; what happened if the words end without it, and if a pilot steers."""
+    last, steered = _BUSY, False
     while True:
         if not select.select([sys.stdin.buffer], [], [], _PATIENCE[last])[0]:
-            return f"hung for {_PATIENCE[last]:g} s"
+            return f"hung for {_PATIENCE[last]:g} s", steered
         read = os.read(sys.stdin.fileno(), 4096)
+        steered = steered or _PILOT in read
         if _RELEASE in read:
-            return ""
+            return "", steered
         if _LEAVE in read:
-            return _UNABLE
+            return _UNABLE, steered
         if not read:
-            return "died"
+            return "died", steered
         last = read[-1:]
 
 
@@ -173,7 +182,7 @@ def main(arguments: list[str]) -> int:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     sys.stdout.buffer.write(_READY)
     sys.stdout.flush()
-    ended = _watch()
+    ended, steered = _watch()
     if not ended:
         return 0
     if ended != _UNABLE and os.getppid() == int(parent):  # it hangs, and holds the connection
@@ -181,8 +190,9 @@ def main(arguments: list[str]) -> int:
     for _ in range(_TRIES):
         try:
             with Link(connection, system=int(system)) as link:
-                failed = stop_thrusters(link, borrowed)
-            _tell(f"the commanding process {ended}: thrusters stopped", *failed)
+                failed = stop_thrusters(link, borrowed, steered)
+            done = "parameters given back" if steered else "thrusters stopped"
+            _tell(f"the commanding process {ended}: {done}", *failed)
             return 2 if failed else 1
         except UserError as error:
             _tell(str(error))

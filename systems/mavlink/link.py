@@ -24,8 +24,7 @@ from .transport import Connection, Lost, Transport
 _COMPONENT = mavlink.MAV_COMP_ID_MISSIONPLANNER
 _HEARTBEAT, _TIMESYNC, _RETRY = 0.5, 0.5, 1.0  # s between heartbeats, TIMESYNC requests, attempts
 _WAIT = 0.05  # s: longest wait for data
-_TELLINGS = 5  # calls, a second apart, after a boot
-_RECENT = 2.0  # s over which rates are counted
+_TELLINGS, _RECENT = 5, 2.0  # calls, a second apart, after a boot; s over which rates are counted
 _BY_FIELD = {"NAMED_VALUE_FLOAT": "name", "BATTERY_STATUS": "id"}  # kept by that field as well
 _AIDS = ("VISION_POSITION_DELTA", "ODOMETRY", "DISTANCE_SENSOR")
 """What a companion computer sends to the autopilot about the motion, under any system id."""
@@ -139,7 +138,8 @@ class Link:
             self._transport.close()
         with self._sending:
             if self._record is not None:
-                self._record.close()
+                with suppress(OSError):  # full
+                    self._record.close()
                 self._record = None
 
     # ------------------------------------------------------------------------------------- reading
@@ -372,7 +372,7 @@ class Link:
             with suppress(OSError):
                 self._record.close()
             self._record = None
-            self._texts.append((time.monotonic(), mavlink.MAV_SEVERITY_WARNING, text))
+            self._texts.append((time.monotonic(), 4, text))  # a warning
 
 
 def boot_time(message: Message, arrival: float, clock: VehicleClock) -> float | None:

@@ -17,6 +17,7 @@ from platformdirs import user_state_path
 from ...models.config.errors import UserError
 from ...models.files.atomic import atomic_path
 from .commands import VehicleRefused
+from .config import OBEYED
 from .dialect import mavlink
 from .link import Link, Received
 from .transport import Connection
@@ -26,16 +27,15 @@ _PATIENCE = 1.0  # s without an answer before a request is repeated
 _ATTEMPTS = 5
 
 
+class Unanswered(VehicleRefused):
+    """Neither a value nor its present one came back."""
+
+
 class Parameters:
     """The parameters of a link's vehicle."""
 
     def __init__(self, link: Link):
         self._link = link
-
-    @property
-    def silent(self) -> bool:
-        """Whether the vehicle has not been heard for longer than a request takes."""
-        return self._link.silence > _PATIENCE
 
     def read(self, name: str) -> float | None:
         """One parameter's value, None if the vehicle has none of that name."""
@@ -56,8 +56,10 @@ class Parameters:
         message = mavlink.MAVLink_param_set_message(*vehicle, name.encode(), value, kind)
         if self._asked(name, message, lambda found: same(found, value)) is None:
             kept = self.read(name)
-            state = "has no such parameter" if kept is None else f"keeps {kept:g}"
-            raise VehicleRefused(f"parameter {name}: {value:g} was sent, and the vehicle {state}")
+            sent = f"parameter {name}: {value:g} was sent, and the vehicle"
+            if kept is None:
+                raise Unanswered(f"{sent} does not answer, or has no such parameter")
+            raise VehicleRefused(f"{sent} keeps {kept:g}")
 
     def read_all(
         self, progress: Callable[[float], None] = lambda share: None, timeout: float = 60.0
@@ -179,8 +181,12 @@ class Borrowed:
         """Whether values wait to be given back."""
         return self.path.exists()
 
-    def borrow(self, values: Mapping[str, float]) -> None:
-        """Save the present values, then set the new ones.
+    def borrow(
+        self, values: Mapping[str, float], each: Callable[[], object] = lambda: None
+    ) -> None:
+        """Save the present values, then set the new ones, first the id that the vehicle obeys.
+
+        `each` is called after each.
 
         Raises:
             VehicleRefused: a parameter can't be read or set; those already changed are given back.
@@ -199,8 +205,9 @@ class Borrowed:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         save_parameters(self.path, former)
         try:
-            for name, value in values.items():
-                self._parameters.write(name, value)
+            for name in sorted(values, key=lambda name: name not in OBEYED):
+                self._parameters.write(name, values[name])
+                each()
         except BaseException:
             self.give_back()
             raise
@@ -208,19 +215,21 @@ class Borrowed:
     def give_back(self) -> dict[str, float]:
         """Write the former values, check them, remove the file; what was restored.
 
+        The id that the vehicle obeys comes last: until then it hears our neutral commands.
+
         Raises:
             VehicleRefused: a value can't be restored; the file stays, and the rest is restored,
-                unless the vehicle is silent.
+                unless the vehicle does not answer.
         """
         if not self.left_over:
             return {}
         former, refused = load_parameters(self.path), []
-        for name, value in former.items():
+        for name in sorted(former, key=lambda name: name in OBEYED):
             try:
-                self._parameters.write(name, value)
+                self._parameters.write(name, former[name])
             except VehicleRefused as error:
                 refused.append(str(error))
-                if self._parameters.silent:
+                if isinstance(error, Unanswered):
                     break
         if refused:
             raise VehicleRefused(f"{'; '.join(refused)}; {self.path} keeps the former values")

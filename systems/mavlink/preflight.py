@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from .codec import FRAME_THRUSTERS, MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS
-from .config import GROUND_STATION
+from .config import GROUND_STATION, OBEYED
 from .dialect import mavlink
 from .link import Statistics
 from .mixer import FRAMES
@@ -28,8 +28,6 @@ stricter stays: a shorter time, the surface on a leak.
 """
 _TIMES = ("FS_PILOT_TIMEOUT", "RC_OVERRIDE_TIME")
 _AT_LEAST = ("FS_LEAK_ENABLE",)
-_OBEYED = ("SYSID_MYGCS", "MAV_GCS_SYSID")
-"""The system id whose commands ArduSub follows, until 4.6 and since."""
 
 _MOTOR_1 = MOTOR_FUNCTIONS[0]
 _PULSES = {"MIN": 1100.0, "TRIM": 1500.0, "MAX": 1900.0}
@@ -117,7 +115,7 @@ def for_dive(parameters: Mapping[str, float], system: int) -> dict[str, float]:
         weaker = name in _AT_LEAST and value < wanted
         if longer or weaker or (name not in (*_TIMES, *_AT_LEAST) and value != wanted):
             found[name] = wanted
-    obeyed = {name: float(system) for name in _OBEYED if name in parameters}
+    obeyed = {name: float(system) for name in OBEYED if name in parameters}
     return found | {name: own for name, own in obeyed.items() if parameters[name] != own}
 
 
@@ -207,7 +205,7 @@ def _outputs(needs: Requirements, facts: Facts) -> Found:
 def _failsafes(needs: Requirements, facts: Facts) -> Found:
     p = facts.parameters
     verb = "would be" if needs.dry else "is"
-    name = next((n for n in _OBEYED if n in p), _OBEYED[0])
+    name = next((n for n in OBEYED if n in p), OBEYED[0])
     mine = int(p.get(name, GROUND_STATION))
     words = f"the vehicle obeys system {mine}, and we are {needs.system}"
     told = f"; {name} {verb} set for the dive" if name in needs.sets else ""

@@ -50,9 +50,9 @@ def groups(
     """
     d = problem.data
     level = d.command != "F_Bo_B"
-    if level:
+    if level and d.u.any():
         yield _of_exchange(problem)
-        largest = float(np.quantile(np.abs(d.u).max(axis=1)[d.weight > 0], 0.99))
+        largest = _largest_force(d)
         for where in ("thrusters", *(str(k + 1) for k in range(d.u.shape[1]))):
             for kind, numbers in FOLLOWED.items():
                 yield _of_follower(problem, kind, where, [n * largest for n in numbers])
@@ -82,6 +82,12 @@ def groups(
     if len(bumps) > 9 and not d.latent:
         for kind in ("place", "flow"):
             yield _of_state(problem, Unknown.neutral(kind=kind, acts_on="W", numbers=bumps))
+
+
+def _largest_force(d: Data) -> float:
+    """Of a thruster (N), but for the largest hundredth where any acts."""
+    force = np.abs(d.u).max(axis=1)[d.weight > 0]
+    return float(np.quantile(force[force > 0], 0.99)) if force.any() else 1.0
 
 
 _ALL_MOTION = tuple(float(i) for i in range(len(MOTION)))

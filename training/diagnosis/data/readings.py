@@ -56,7 +56,8 @@ def _bridged(recording: Recording, variable: str) -> np.ndarray | None:
         own = values[j, k, :length].reshape(length, -1)
         there = np.isfinite(own).all(axis=1)
         t = recording.elapsed(int(j), int(k))
-        if there.mean() < _READ or np.diff(t[there], prepend=t[0], append=t[-1]).max() > _BRIDGED:
+        longest = max(_BRIDGED, 1.5 * recording.dt)
+        if there.mean() < _READ or np.diff(t[there], prepend=t[0], append=t[-1]).max() > longest:
             return None
         for x in own.T:
             x[~there] = np.interp(t[~there], t[there], x[there])

@@ -37,7 +37,7 @@ FAULTS = {
     "silence": {"ages": {"vehicle": 1.1}},
     "attitude": {"ages": {"attitude": float("inf")}},
     "depth": {"ages": {"depth": 0.6}},
-    "depth_sensor": {"deep": False},
+    "depth_sensor": {"depth_healthy": False},
     "aid": {"ages": {"aid": 2.1}},
     "loop": {"ages": {"loop": 0.6}},
     "estimate": {"health": 2},

@@ -102,19 +102,20 @@ def is_depth_healthy(health: int) -> bool:
     return bool(health & _DEPTH)
 
 
+def _weaker(name: str, value: float, wanted: float) -> bool:
+    """Whether a failsafe stops the thrusters later, or in fewer cases, than with `wanted`."""
+    if name in _TIMES:
+        return not 0 < value <= wanted
+    return value < wanted if name in _AT_LEAST else value != wanted
+
+
 def for_dive(parameters: Mapping[str, float], system: int) -> dict[str, float]:
     """Parameters that a dive needs with other values, and these.
 
     They are failsafes that are weaker than `FAILSAFES`, and the id that the vehicle obeys. Those
     that it does not have are left out: the pre-flight check names them.
     """
-    found = {}
-    for name, wanted in FAILSAFES.items():
-        value = parameters.get(name, wanted)
-        longer = name in _TIMES and not 0 < value <= wanted
-        weaker = name in _AT_LEAST and value < wanted
-        if longer or weaker or (name not in (*_TIMES, *_AT_LEAST) and value != wanted):
-            found[name] = wanted
+    found = {n: v for n, v in FAILSAFES.items() if _weaker(n, parameters.get(n, v), v)}
     obeyed = {name: float(system) for name in OBEYED if name in parameters}
     return found | {name: own for name, own in obeyed.items() if parameters[name] != own}
 

@@ -100,7 +100,7 @@ class Snapshot(NamedTuple):
     """Other ground stations with our system id."""
     outputs: float = 0.0
     """Time for which the vehicle's outputs have not been those that are commanded (s)."""
-    deep: bool = True
+    depth_healthy: bool = True
     """Whether the vehicle takes its depth sensor for healthy."""
 
 
@@ -190,7 +190,7 @@ def _failsafe(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
 
 def _depth_sensor(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:
     del config, state
-    return "" if snapshot.deep else "the vehicle's depth sensor is not healthy"
+    return "" if snapshot.depth_healthy else "the vehicle's depth sensor is not healthy"
 
 
 def _rival(config: SafetyConfig, state: State, snapshot: Snapshot) -> str:

@@ -188,11 +188,10 @@ class Scan:
         halves = [columns[:, odd].astype(float), columns[:, ~odd].astype(float)]
         products = [half @ half.T for half in halves]
         prior = np.concatenate([self.prior[own], self.prior[self.free]]) / 2
-        free = list(range(1 + len(own), len(columns)))
+        free, every = list(range(1 + len(own), len(columns))), list(range(1, len(columns)))
         return sum(
             _loss(there, free, _fitted(here, free, prior))
             - _loss(there, every, _fitted(here, every, prior))
-            for every in [list(range(1, len(columns)))]
             for here, there in (products, products[::-1])
         )
 

@@ -85,8 +85,8 @@ def test_every_axis_gets_the_outputs_that_are_foreseen(port: int, way):
     check_at_rest(port)
 
 
-def check_at_rest(port: int) -> None:
-    """Disarmed, neutral, with the motors' functions."""
+def check_at_rest(port: int, rounding: float = 0.0) -> None:
+    """Disarmed, neutral (but for `rounding`, µs), with the motors' functions."""
     with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
         link.find_vehicle(15.0)
         parameters = Parameters(link)
@@ -96,7 +96,7 @@ def check_at_rest(port: int) -> None:
         assert link.wait_for("SERVO_OUTPUT_RAW", 5.0) is not None
         shown = telemetry.outputs(link, 8)
         assert shown is not None
-        np.testing.assert_array_equal(shown.value, 1500.0)
+        np.testing.assert_allclose(shown.value, 1500.0, rtol=0, atol=rounding)
         status = telemetry.status(link, time.monotonic())
         assert status is not None
         assert not status.armed
@@ -187,7 +187,7 @@ def test_directions_are_the_vehicles_and_outputs_are_told_with_the_scenarios(por
             parameters = Parameters(link)
             parameters.write("MOT_3_DIRECTION", 1.0)
             parameters.write("JS_THR_GAIN", 1.0)
-    check_at_rest(port)
+    check_at_rest(port, rounding=1.0)  # outputs are cut to whole µs: a mirrored zero may be 1499
 
 
 def test_a_pilot_s_station_is_obeyed_again_after_the_dive(served: Served, port: int):

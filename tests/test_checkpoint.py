@@ -178,6 +178,7 @@ def test_a_missing_file_and_a_folder_are_refused_by_name(tmp_path):
         (lambda h: h["config"].update(whidth=3), "whidth"),
         (lambda h: h["config"].update(width=6), "shapes"),
         (lambda h: h["config"].update(activation="relu"), "activation"),
+        (lambda h: h["config"].update(velocity_scale=[1e-200] * 6), "beyond single precision"),
         (lambda h: h["arrays"].pop(), "header and arrays don't agree"),
         (lambda h: h.pop("config"), "config"),
         (lambda h: h.update(metadata=3), "agree"),

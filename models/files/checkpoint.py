@@ -132,9 +132,15 @@ def load_model(
     """
     header, leaves = _read(path)
     try:
-        model = template(header)
+        with np.errstate(over="raise"):
+            model = template(header)
     except UserError as error:
         raise UserError(f"{path}: not a model this version can make ({error}).") from error
+    except FloatingPointError as error:
+        raise UserError(
+            f"{path}: not a model this version can make (a number in its description is beyond "
+            "single precision); save it again."
+        ) from error
     except (LookupError, TypeError, ValueError, RecursionError) as error:
         raise UserError(
             f"{path}: not a model this version can make (its description is damaged, or another "

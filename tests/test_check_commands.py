@@ -6,7 +6,8 @@ from recordings_changed import as_wrench, changed
 
 from helpers import ROOT
 from spinndrift.models.recordings.build import Trajectory
-from spinndrift.models.recordings.checks.commands import command_findings
+from spinndrift.models.recordings.checks.commands import command_findings, explains
+from spinndrift.models.recordings.checks.hypotheses import Driven
 from spinndrift.models.recordings.checks.response import LAGS_S, responses
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.vehicles.vehicle import load_vehicle
@@ -95,6 +96,31 @@ def test_reversed_thrusters_are_named_by_number(dive, thrusters):
     assert [f.word for f in found] == ["thruster-reversed"] * len(thrusters)
     assert [f.place for f in found] == [f"column pwm{k}" for k in thrusters]
     assert f"MOT_{thrusters[0]}_DIRECTION, or SERVOn_REVERSED of the output" in found[0].text
+
+
+def test_changes_that_explain_nothing_more_are_not_named(dive):
+    """Without roll, pitch and heave the order of the vertical thrusters is of no effect."""
+    hidden = dive.dataset["V_WB_B"].copy()
+    hidden[..., 2:5] = np.nan
+    blind = Recording(dive.dataset.assign(V_WB_B=hidden))
+    (finding,) = command_findings(changed(blind, "pwm", mirrored(3)), HEAVY)
+    assert (finding.word, finding.place) == ("thruster-reversed", "column pwm3")
+
+
+def test_a_gain_at_the_expense_of_an_axis_that_a_thruster_acts_on_is_no_fault(dive):
+    forces, _ = dive.thrust(HEAVY)
+    weights = np.asarray(HEAVY.thrusters().allocation)
+    found = responses(dive, forces, dive.command_period)
+    data = Driven(found, weights, ("",) * 8, {}, {}, {}, tuple(range(8)))
+    exchanged = weights[:, [2, 1, 0, 3, 4, 5, 6, 7]]  # acts on surge and yaw
+    usual = dict.fromkeys(range(6), 0.6)
+    assert explains(data, exchanged, usual, usual | {0: 0.95, 5: 0.95})
+    assert not explains(data, exchanged, usual, usual | {0: 0.95, 5: 0.3})
+    assert not explains(data, exchanged, usual, usual | {4: 0.95})  # pitch is a lever arm's alone
+
+
+def test_parts_of_a_good_dive_have_no_finding(dive):
+    assert [words(dive.cut(start, start + 10.0)) for start in (0.0, 5.0, 10.0)] == [[], [], []]
 
 
 def test_exchanged_thrusters_are_named(dive):

@@ -17,6 +17,16 @@ from ...se3 import AXES, WRENCH
 from ...vehicles.vehicle import Vehicle
 from ..commands import voltage_of
 from ..store import Recording
+from .command_sentences import (
+    dead_thruster,
+    exchanged_columns,
+    exchanged_thrusters,
+    no_answer,
+    no_commands,
+    reversed_axes,
+    reversed_thruster,
+    silent_axis,
+)
 from .finding import Finding
 from .hypotheses import ALL, CAUSAL, PLAUSIBLE, Driven
 from .response import LAGS_S, AxisResponse, responses
@@ -24,22 +34,24 @@ from .response import LAGS_S, AxisResponse, responses
 _EVIDENCE = 12.0
 """Nats by which a named hypothesis is more likely than the recorded order: 6e-6 by chance, some
 hundred hypotheses together 1e-3."""
+_MAINLY = 0.75
+"""Share of the largest effect of a change, from which on an axis is one that it acts on mainly."""
+_CONTRARY = 3.0
+"""Nats that an axis may lose by chance under a hypothesis that is true: less than 1 in 20."""
 _MOST = 0.5
 """Share that a named hypothesis accounts for, and most of the rest that it leaves."""
 _HARDLY, _SURE = 10.0, 0.9
 """Commanded force over the force that the motion shows, above which no vehicle's numbers explain
 it; the largest share of a force that a command is expected to make up."""
 _DEAD = 0.15
+_STRONG = 0.04
+"""Share of a thruster's largest thrust, that of a fifth of its command: four to six times what its
+dead band takes."""
 _NO_FORCE = 1e-3
 """N or N·m below which nothing is driven; pulses in a thruster's dead band give up to 1e-6 N."""
 _FACTORS = np.round(np.arange(-1.5, 1.51, 0.05), 2)
 _LEAST_COUNT = 20.0
 """Independent windows below which nothing is said of an axis."""
-_ORDERS = {
-    "in ArduSub's order of RC channels (pitch, roll, heave, yaw, surge, sway)": (4, 3, 2, 5, 0, 1),
-    "torque first (K,M,N,X,Y,Z), as Drake's spatial forces": (3, 4, 5, 0, 1, 2),
-}
-_RIGHT_DOWN = np.array([1, -1, -1, 1, -1, -1])
 
 
 def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Finding]:
@@ -50,13 +62,15 @@ def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Find
     forces, weights, names = columns
     mask = recording.mask
     if not np.abs(forces[mask]).max(initial=0.0) > _NO_FORCE:
-        return [_no_commands(recording)]
+        return [no_commands(recording)]
     axes = {
         i: r
         for i, r in responses(recording, forces, recording.command_period).items()
         if r.count >= _LEAST_COUNT
     }
     data = _data(axes, weights, names, vehicle)
+    if vehicle is not None:
+        data = replace(data, driven=_strong(forces[mask], vehicle))
     # an axis without a command tells nothing of the order of columns
     driven = replace(data, axes={i: r for i, r in axes.items() if data.given[i] > 0})
     if not driven.axes:
@@ -70,8 +84,8 @@ def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Find
         return found
     silent = [i for i in driven.axes if _unanswered(data, i)]
     if silent and not any(_answered(data, i) for i in driven.axes):
-        return [_no_answer(data, silent)]
-    return [_silent(data, i) for i in silent] + _lag(driven)
+        return [no_answer(data, silent)]
+    return [silent_axis(data, i) for i in silent] + _lag(driven)
 
 
 def _columns(
@@ -92,6 +106,17 @@ def _columns(
         volts = voltage_of(recording.dataset, thrusters)[..., None]
         values = thrusters.curve.steady(mirrored, volts)
     return values, np.asarray(thrusters.allocation), names
+
+
+def _strong(forces: np.ndarray, vehicle: Vehicle) -> tuple[int, ...]:
+    """Thrusters that for a while gave enough thrust to be judged: near its dead band, a thruster's
+    curve does not tell its thrust to a factor.
+    """
+    low, high = (np.asarray(limit) for limit in vehicle.thrusters().force_limits())
+    if forces.shape[-1] != len(vehicle.propulsion.mounts):
+        return ()
+    often = np.percentile(np.abs(forces), 95, axis=0)
+    return tuple(np.flatnonzero(often > _STRONG * np.minimum(-low, high)).tolist())
 
 
 def _data(
@@ -174,8 +199,8 @@ def _orders(data: Driven, wrench: bool) -> tuple[float, list[Finding]]:
     if not moved or worth < 0:
         return 0.0, []
     if any(i != j for i, j, _ in moved):
-        return worth, [_exchanged(moved)]
-    return worth, [_reversed_axes(data, moved, wrench)]
+        return worth, [exchanged_columns(moved)]
+    return worth, [reversed_axes(data, moved, wrench)]
 
 
 def _named(usual: float, share: float, count: float) -> bool:
@@ -184,26 +209,45 @@ def _named(usual: float, share: float, count: float) -> bool:
     return share >= _MOST and rest < _MOST and bool(-0.5 * count * np.log(rest) > _EVIDENCE)
 
 
+def explains(
+    data: Driven,
+    weights: np.ndarray,
+    usual: dict[int, float],
+    shares: dict[int, float],
+) -> bool:
+    """Whether changed weights are clearly better on an axis, and on none of their own worse.
+
+    Thrusters show where they act most. A gain elsewhere, or at the expense of such an axis, is a
+    force that the vehicle's numbers lack, such as the pitch that thrust in surge makes.
+    """
+    largest = np.maximum(np.abs(data.weights).max(axis=1), 1e-12)
+    change = np.abs(weights - data.weights).max(axis=1) / largest
+    main = [i for i in data.axes if change[i] >= _MAINLY * change.max()]
+    named = [_named(usual[i], shares[i], data.axes[i].count) for i in main]
+    lost = [0.5 * data.axes[i].count * (np.log1p(-shares[i]) - np.log1p(-usual[i])) for i in main]
+    return any(named) and bool(max(lost) < _CONTRARY)
+
+
 def _thrusters(data: Driven) -> tuple[float, list[Finding]]:
     """Thrusters that push the other way, are exchanged or dead; as `_orders` returns them."""
-    m = len(data.columns)
-    flips = [("reversed", k, k) for k in range(m)]
-    swaps = [("exchanged", a, b) for a, b in combinations(range(m), 2)]
+    flips = [("reversed", k, k) for k in data.driven]
+    swaps = [("exchanged", a, b) for a, b in combinations(data.driven, 2)]
     usual, first, _ = data.best(data.weights[..., None], PLAUSIBLE)
-    chains = [_chain(data, options) for options in (flips, swaps, flips + swaps)]
+    chains = [_chain(data, options) for options in (flips, swaps, flips + swaps) if options]
+    if not chains:
+        return 0.0, []
     worth, weights, changes = max(chains, key=lambda chain: chain[0])
     _, last, lags = data.best(weights[..., None], PLAUSIBLE)
-    if not any(
-        _named(float(first[i][0]), float(last[i][0]), r.count) for i, r in data.axes.items()
-    ):
+    before, after = ({i: float(s[0]) for i, s in shares.items()} for shares in (first, last))
+    if changes and not explains(data, weights, before, after):
         worth, weights, changes, last = float(usual[0]), data.weights, [], first
-    dead = [k for k in range(m) if _is_dead(data, weights, k, last, int(lags[0]))]
+    dead = [k for k in data.driven if _is_dead(data, weights, k, last, int(lags[0]))]
     found = [
-        _reversed_thruster(data, a) if kind == "reversed" else _swapped(data, a, b)
+        reversed_thruster(data, a) if kind == "reversed" else exchanged_thrusters(data, a, b)
         for kind, a, b in sorted(changes)
         if a not in dead
     ]
-    found += [_dead(data, k) for k in dead]
+    found += [dead_thruster(data, k) for k in dead]
     return (worth - float(usual[0]) if changes else 0.5 * bool(dead)), found
 
 
@@ -220,9 +264,9 @@ def _chain(data: Driven, options: Sequence[_Change]) -> tuple[float, np.ndarray,
         at = int(nats.argmax())
         if nats[at] - _EVIDENCE < now:
             break
-        now, weights = float(nats[at]) - _EVIDENCE, tried[..., at]
+        now, weights = float(nats[at]), tried[..., at]
         changes.append(options[at])
-    return now, weights, changes
+    return now - _EVIDENCE * len(changes), weights, changes
 
 
 def _changed(weights: np.ndarray, kind: str, a: int, b: int) -> np.ndarray:
@@ -242,9 +286,13 @@ def _is_dead(
     tried[:, k] *= _FACTORS
     shares = data.shares(tried, lag)
     at = int(data.evidence(shares).argmax())
-    return bool(abs(_FACTORS[at]) <= _DEAD) and any(
-        _named(float(usual[i][0]), float(shares[i][at]), r.count) for i, r in data.axes.items()
-    )
+    if abs(_FACTORS[at]) > _DEAD:
+        return False
+    before = {i: float(s[0]) for i, s in usual.items()}
+    after = {i: float(s[at]) for i, s in shares.items()}
+    without = weights.copy()
+    without[:, k] = 0.0
+    return explains(data, without, before, after)
 
 
 def _lag(data: Driven) -> list[Finding]:
@@ -264,97 +312,3 @@ def _lag(data: Driven) -> list[Finding]:
             "align the clocks of commands and motion",
         )
     ]
-
-
-# sentences
-
-
-def _no_commands(recording: Recording) -> Finding:
-    rates = recording.dataset["V_WB_B"].to_numpy()[recording.mask][:, 3:]
-    turned = bool(np.nanmax(np.abs(rates), initial=0.0) > 0.2)
-    told = "the vehicle was turned by hand or drifted" if turned else "nothing was driven"
-    return Finding(
-        "no-commands",
-        ", ".join(recording.commands),
-        f"no command ever differs from zero: {told}, and nothing tells how it answers thrusters",
-        "record a dive with the thrusters driven",
-    )
-
-
-def _no_answer(data: Driven, silent: Sequence[int]) -> Finding:
-    axes = ", ".join(AXES[i] for i in silent)
-    times = min(data.given[i] / max(data.needed[i], 1e-12) for i in silent)
-    return Finding(
-        "no-answer",
-        axes,
-        f"the motion follows no command, though those of {axes} are {times:.1g} times the force "
-        "that the motion shows: a bench test, thrusters without power, or commands of another run",
-        "give a dive, with the commands that made it",
-    )
-
-
-def _silent(data: Driven, axis: int) -> Finding:
-    times = data.given[axis] / max(data.needed[axis], 1e-12)
-    return Finding(
-        "axis-silent",
-        AXES[axis],
-        f"{AXES[axis]} never or hardly answers its command, which is {times:.1g} times the force "
-        "that the motion shows",
-        f"check the thrusters that act in {AXES[axis]}",
-    )
-
-
-def _exchanged(moved: Sequence[tuple[int, int, int]]) -> Finding:
-    names = [n for n, order in _ORDERS.items() if all(order[j] == i for i, j, _ in moved)]
-    parts = [f"`{WRENCH[j]}` drives {AXES[i]}{' backwards' * (s < 0)}" for i, j, s in moved]
-    look = f": columns X…N stand {names[0]}" if names else ""
-    return Finding(
-        "columns-exchanged",
-        "columns X,Y,Z,K,M,N",
-        f"the motion says that {', '.join(parts)}{look}",
-        "give X,Y,Z,K,M,N in this order, forces first",
-    )
-
-
-def _reversed_axes(data: Driven, moved: Sequence[tuple[int, int, int]], wrench: bool) -> Finding:
-    axes = [i for i, _, _ in moved]
-    right_down = [i for i in data.axes if _RIGHT_DOWN[i] < 0]
-    frd = wrench and set(axes) == set(right_down)
-    told = ": they look like forward-right-down" if frd else ""
-    names = ", ".join(WRENCH[i] if wrench else AXES[i] for i in axes)
-    return Finding(
-        "axis-reversed",
-        f"column{'s' * (len(axes) > 1)} {names}" if wrench else names,
-        f"the motion goes against the command of {', '.join(AXES[i] for i in axes)}{told}",
-        "give forward, left and up as positive, or `frames: NED/FRD` for all of the files"
-        if wrench
-        else "check the directions of the thrusters (MOT_n_DIRECTION) and the vehicle's file",
-    )
-
-
-def _reversed_thruster(data: Driven, k: int) -> Finding:
-    return Finding(
-        "thruster-reversed",
-        f"column {data.columns[k]}",
-        f"thruster {k + 1} pushes the other way: MOT_{k + 1}_DIRECTION, or SERVOn_REVERSED of the "
-        "output n that drives it",
-        f"correct the parameter, or the sign of {data.columns[k]}",
-    )
-
-
-def _swapped(data: Driven, a: int, b: int) -> Finding:
-    return Finding(
-        "thruster-exchanged",
-        f"columns {data.columns[a]}, {data.columns[b]}",
-        f"thrusters {a + 1} and {b + 1} look exchanged",
-        "give the columns in the order of the vehicle's file",
-    )
-
-
-def _dead(data: Driven, k: int) -> Finding:
-    return Finding(
-        "thruster-dead",
-        f"column {data.columns[k]}",
-        f"thruster {k + 1} has no effect on the motion",
-        "check its power and propeller",
-    )

@@ -32,6 +32,8 @@ class Driven:
 
     mass: dict[int, float]
     """The vehicle's mass or moment of inertia by axis; 0 if it is not known."""
+    driven: tuple[int, ...] = ()
+    """Columns of thrusters that gave enough thrust to be judged."""
 
     def shares(self, weights: np.ndarray, lag: int, strict: bool = False) -> dict[int, np.ndarray]:
         """Shares by axis for hypotheses of weights (6, m, *H).

@@ -305,7 +305,8 @@ def test_borrowed_parameters_belong_to_a_vehicle_and_not_to_its_address(served: 
     port = served.ports[0]
     died = Connection.parse(f"tcp:localhost:{port}")
     with Link(died) as link:
-        number = commands.serial_number(link)
+        number, version = commands.identity(link)
+        assert version == (4, 5)
         assert number == served.simulation.vehicle.serial_number.hex() + "0000"
         Borrowed(Parameters(link), borrowed_file(died, number)).borrow({"FS_PILOT_TIMEOUT": 0.5})
     assert borrowed_file(died, "another") != borrowed_file(died, number)

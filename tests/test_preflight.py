@@ -75,7 +75,7 @@ def test_a_vehicle_in_order_passes():
         (FINE._replace(given_back=False), "outputs", "former run"),
         (with_parameter("MOT_PWM_MAX", 1800.0), "MOT_PWM_MAX", "1800"),
         (with_parameter("RC5_TRIM", 1480.0), "RC channels", "RC5_TRIM 1480"),
-        (with_parameter("RC3_TRIM", 1500.0), "RC channels", "RC3_TRIM 1500"),
+        (with_parameter("RC3_TRIM", 1500.0), "RC channels", "RC3_TRIM 1500 (1100"),
         (with_parameter("RC2_REVERSED", 1.0), "RC channels", "RC2_REVERSED"),
         (FINE._replace(health=3), "depth sensor", "not healthy"),
         (with_parameter("SYSID_MYGCS", 250.0), "ground station id", "system 250"),
@@ -96,6 +96,16 @@ def test_each_fault_is_found_and_nothing_else(facts: Facts, name: str, words: st
     assert words in found[name]
     beside = {"inertial sensors": {"depth sensor"}}
     assert set(found) <= {name, "ATTITUDE_QUATERNION", "SCALED_PRESSURE2", *beside.get(name, ())}
+
+
+def test_the_throttle_is_measured_from_its_trim_since_4_7():
+    """`norm_input` in mode_manual.cpp: the throttle itself, then half of it about the neutral."""
+    middle = with_parameter("RC3_TRIM", 1500.0)
+    for version in (None, (4, 5), (4, 6)):
+        assert failed(FINE._replace(version=version)) == {}
+        assert "RC3_TRIM 1500" in failed(middle._replace(version=version))["RC channels"]
+    assert failed(middle._replace(version=(4, 7))) == {}
+    assert "RC3_TRIM 1100 (" in failed(FINE._replace(version=(5, 0)))["RC channels"]
 
 
 def test_a_failsafe_that_is_set_for_the_dive_is_told_with_its_present_value():

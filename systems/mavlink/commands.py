@@ -5,6 +5,7 @@ They take up to seconds, so they belong before and after a dive, not in its loop
 
 import time
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 from ...models.config.errors import UserError
 from .codec import ARMED_FLAG, MODES
@@ -54,10 +55,17 @@ def command(
     return None
 
 
-def serial_number(link: Link, timeout: float = 0.5, attempts: int = 4) -> str:
-    """The autopilot's serial number (`uid2` of AUTOPILOT_VERSION, or `uid`) in hexadecimal.
+class Identity(NamedTuple):
+    """What AUTOPILOT_VERSION tells."""
 
-    Empty if it does not answer or has none.
+    serial_number: str = ""
+    """`uid2`, or `uid`, in hexadecimal; empty if it has none."""
+    version: tuple[int, int] | None = None
+    """Of the firmware, such as (4, 5); None if it is not told."""
+
+
+def identity(link: Link, timeout: float = 0.5, attempts: int = 4) -> Identity:
+    """Which autopilot it is; empty if it does not answer.
 
     Raises:
         UserError: there is no vehicle.
@@ -75,11 +83,12 @@ def serial_number(link: Link, timeout: float = 0.5, attempts: int = 4) -> str:
             started,
         )
         if found is not None:
-            long = bytes(found.message.uid2)
-            if any(long):
-                return long.hex()
-            return f"{found.message.uid:x}" if found.message.uid else ""
-    return ""
+            told, long = found.message, bytes(found.message.uid2)
+            short = f"{told.uid:x}" if told.uid else ""
+            version = int(told.flight_sw_version)
+            numbers = (version >> 24, version >> 16 & 0xFF) if version else None
+            return Identity(long.hex() if any(long) else short, numbers)
+    return Identity()
 
 
 def mode_of(heartbeat: Message) -> int:

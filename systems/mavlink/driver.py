@@ -93,7 +93,7 @@ class Driver:
         self.link = Link(connection, system=config.system, record=record)
         try:
             self.vehicle = self.link.find_vehicle()
-            number = commands.serial_number(self.link)
+            self._identity = commands.identity(self.link)
             self._parameters = Parameters(self.link)
             self._read_vehicle()
             rates = _STREAMS | {"RAW_IMU": config.imu_rate}
@@ -102,7 +102,9 @@ class Driver:
         except BaseException:
             self.link.close()
             raise
-        self._borrowed = Borrowed(self._parameters, borrowed_file(connection, number))
+        self._borrowed = Borrowed(
+            self._parameters, borrowed_file(connection, self._identity.serial_number)
+        )
         self._guard: Guard | None = None
         self.use(config)
         self._state: State | None = None
@@ -176,6 +178,7 @@ class Driver:
             status.leak,
             len(self.link.others()),
             not self._borrowed.left_over,
+            self._identity.version,
         )
         return preflight(self.requirements(), facts)
 

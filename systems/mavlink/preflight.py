@@ -30,6 +30,8 @@ _TIMES = ("FS_PILOT_TIMEOUT", "RC_OVERRIDE_TIME")
 _AT_LEAST = ("FS_LEAK_ENABLE",)
 
 _MOTOR_1 = MOTOR_FUNCTIONS[0]
+_TRIM_IS_NEUTRAL = (4, 7)
+"""First version of ArduSub whose throttle is measured from RC3_TRIM."""
 _PULSES = {"MIN": 1100.0, "TRIM": 1500.0, "MAX": 1900.0}
 _LOSS, _DAMAGED = 0.05, 0.01  # shares of packets that may be lost, and damaged
 _DEPTH = mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE  # ArduSub's own word on its depth sensor
@@ -82,6 +84,8 @@ class Facts(NamedTuple):
     """Other ground stations with our system id."""
     given_back: bool
     """Whether no parameters of a former run wait to be restored."""
+    version: tuple[int, int] | None = None
+    """Of its firmware, None if unknown."""
 
 
 class Finding(NamedTuple):
@@ -190,17 +194,26 @@ def _outputs(needs: Requirements, facts: Facts) -> Found:
         found = facts.parameters.get(f"MOT_PWM_{word}", value)
         yield f"MOT_PWM_{word}", found == value, f"{found:g} µs ({value:g} is assumed)"
     if not needs.passthrough:
+        trim = _throttle_trim(facts.version)
         odd = [
             f"RC{n}_{word} {found:g}"
             for n in range(1, 7)
             for word, value in _PULSES.items()
-            # the trim of the throttle is its lower end: with 1500 there, 1500 is full down
-            for right in [_PULSES["MIN"] if (n, word) == (3, "TRIM") else value]
+            for right in [trim if (n, word) == (3, "TRIM") else value]
             if (found := facts.parameters.get(f"RC{n}_{word}", right)) != right
         ]
         odd += [f"RC{n}_REVERSED" for n in range(1, 7) if facts.parameters.get(f"RC{n}_REVERSED")]
-        assumed = " (1100, 1500, 1900, RC3_TRIM 1100 and not reversed are assumed)"
+        assumed = f" (1100, 1500, 1900, RC3_TRIM {trim:g} and not reversed are assumed)"
         yield "RC channels", not odd, ", ".join(odd) + assumed if odd else "ok"
+
+
+def _throttle_trim(version: tuple[int, int] | None) -> float:
+    """RC3_TRIM with which 1500 µs is no vertical thrust.
+
+    Up to ArduSub 4.6 the throttle's trim is its lower end: with 1500 there, 1500 is full down. From
+    4.7 on it is the neutral: with 1100 there, 1500 is half up.
+    """
+    return _PULSES["TRIM" if version is not None and version >= _TRIM_IS_NEUTRAL else "MIN"]
 
 
 def _failsafes(needs: Requirements, facts: Facts) -> Found:

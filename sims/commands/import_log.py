@@ -54,6 +54,9 @@ class Import:
     """MAVLink system id, if a log holds several autopilots."""
     topics: tuple[Path, ...] | None = None
     """Topic map of a ROS bag (YAML); without a file, print a proposal and import nothing."""
+    align: Path | None = None
+    """Recording of the same dive (.nc), or the folder of its run: the log is cut to it, with its
+    samples, times and world frame. So a .BIN that is fetched from the vehicle joins what flew."""
     accept: tuple[str, ...] = ()
     """Words of severe findings on the data that are accepted (docs/checks.md), such as no-commands.
     """
@@ -85,8 +88,18 @@ class Import:
         out = self._out()
         if out.suffix != ".nc":
             raise UserError(f"--out {out}: a Recording is a NetCDF file; give a name ending in .nc")
+        if self.align is not None and self.rate is not None:
+            raise UserError(
+                f"--rate {self.rate:g}: the rate is that of --align {self.align}; leave --rate away"
+            )
         options = LogOptions(
-            self.minimum, self.gap, self.water_density, self.disarmed, self.system, self._map()
+            self.minimum,
+            self.gap,
+            self.water_density,
+            self.disarmed,
+            self.system,
+            self._map(),
+            self.align,
         )
         with progress_bar(f"reading {self.log.name}") as update:
             recording = load_data(

@@ -304,7 +304,11 @@ class Cockpit:
         epoch = time.monotonic() + 0.02
         self.interface.ages = self._ages(context)
         self.interface.begin(self.driver, epoch, self.anchor)
-        self.journal.epoch = epoch
+        offset = self.driver.link.clock.offset
+        self.journal.epoch, self.journal.boot = (
+            epoch,
+            epoch - (np.nan if offset is None else offset),
+        )
         return Clockwork(simulator, self.tick, epoch)
 
     def _await_readings(self) -> None:

@@ -56,6 +56,9 @@ class Journal:
         self.tripped = ""
         """Name of the guard that has ended it."""
         self.epoch: float | None = None
+        """Local time at which the dive begins (s)."""
+        self.boot: float = math.nan
+        """Time at which it begins on the vehicle's boot clock (s)."""
 
     def act(self, t: float, acted: Acted) -> None:
         """Take in a command at time t (s)."""
@@ -185,4 +188,5 @@ def collect_flight(
         source=f"scenario {scenario.name} on the vehicle at {link and link.connection}",
         notes=_NOTES,
         fused=scenario.station.sensing.fused,
+        start=journal.boot,
     )

@@ -89,17 +89,19 @@ class RunLog:
         notes: tuple[str, ...] = (),
         least_risk: float | None = None,
         fused: tuple[str, ...] = FUSED,
+        start: float = 0.0,
     ) -> "RunLog":
         """Build from arrays with time first; `variables` holds at least X_WB, V_WB_B, F_Bo_B.
 
         `least_risk` is the probability of a collision on the widest path to the goal; `fused` are
-        the names of the sensors that the filter fuses.
+        the names of the sensors that the filter fuses; `start` is the time of the first sample on
+        the vehicle's clock (s), NaN if unknown.
         """
         rest = dict(variables)
         X, V = rest.pop("X_WB"), rest.pop("V_WB_B")
         commands = {name: rest.pop(name) for name in ("F_Bo_B", "pwm") if name in rest}
         recording = Recording.from_trajectories(
-            [Trajectory(scenario, X, V, commands, rest)],
+            [Trajectory(scenario, X, V, commands, rest, start)],
             dt,
             vehicle=vehicle,
             source=source,

@@ -47,20 +47,7 @@ def fuse(
     Stretches shorter than `minimum` (s) are dropped, and so are disarmed ones unless wanted or
     unless there are no others.
     """
-    found, told = segments(signals, gap)
-    dropped = [f"Cut at {', '.join(told)}."] if told else []
-    if not disarmed:
-        armed = [s for s in found if "disarmed" not in s.labels]
-        if any(s.duration >= minimum for s in armed):
-            idle = sum(s.duration for s in found) - sum(s.duration for s in armed)
-            if idle > 0:
-                dropped.append(f"{idle:.1f} s disarmed were left out.")
-            found = armed
-        elif any(s.duration >= minimum for s in found):
-            dropped.append(
-                "The vehicle was never armed for long: the disarmed time was kept, which tells "
-                "nothing about thrusters."
-            )
+    found, dropped = wanted(signals, minimum, gap, disarmed)
     long = [s for s in found if s.duration >= minimum]
     short = [s for s in found if s.duration < minimum]
     if sum(s.duration for s in short) > 0.5:
@@ -82,6 +69,31 @@ def fuse(
     return trajectories, lines, dropped
 
 
+def wanted(
+    signals: Signals, minimum: float, gap: float, disarmed: bool
+) -> tuple[list[Segment], list[str]]:
+    """Stretches of a log that are armed, if any of `minimum` (s) is or `disarmed` ones are wanted.
+
+    The second result are sentences on the cuts and on what was left out.
+    """
+    found, told = segments(signals, gap)
+    dropped = [f"Cut at {', '.join(told)}."] if told else []
+    if disarmed:
+        return found, dropped
+    armed = [s for s in found if "disarmed" not in s.labels]
+    if any(s.duration >= minimum for s in armed):
+        idle = sum(s.duration for s in found) - sum(s.duration for s in armed)
+        if idle > 0:
+            dropped.append(f"{idle:.1f} s disarmed were left out.")
+        return armed, dropped
+    if any(s.duration >= minimum for s in found):
+        dropped.append(
+            "The vehicle was never armed for long: the disarmed time was kept, which tells "
+            "nothing about thrusters."
+        )
+    return found, dropped
+
+
 def _parts(segment: Segment) -> list[Segment]:
     """Equal parts of at most `_LONGEST_S`, because a recording pads all runs to the longest one."""
     count = int(np.ceil(segment.duration / _LONGEST_S))
@@ -100,6 +112,13 @@ def name_of(segment: Segment, number: int) -> str:
 def resample(signals: Signals, segment: Segment, number: int, dt: float) -> Trajectory:
     """Resample one segment to the grid of step `dt` (s)."""
     t = grid(_first(signals.rates, segment, dt), segment.stop - dt, dt)
+    return at_instants(signals, segment, t, name_of(segment, number), dt)
+
+
+def at_instants(
+    signals: Signals, segment: Segment, t: np.ndarray, name: str, dt: float
+) -> Trajectory:
+    """What a log holds of a segment at the instants t (s) in it, `dt` apart."""
     q = slerp(t, signals.attitude.t, signals.attitude.x)
     omega = _instants(signals.rates, t)
     aided = UNAIDED not in segment.labels
@@ -126,7 +145,7 @@ def resample(signals: Signals, segment: Segment, number: int, dt: float) -> Traj
     if signals.rc is not None:
         sensors["rc"] = hold(t, signals.rc.t, signals.rc.x, dt).T
     return Trajectory(
-        name_of(segment, number),
+        name,
         np.concatenate([q, p]).T,
         np.concatenate([v, omega]).T,
         {signals.command: _commands(signals, t, dt)},

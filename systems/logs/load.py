@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from ...models.recordings.csv import METADATA, read_csv
 from ...models.recordings.schema import check_plausible
 from ...models.recordings.store import Recording
 from ...models.vehicles.vehicle import load_vehicle
+from .align import aligned, reference
 from .bags.bag import bag_kind
 from .bags.signals import read_bag
 from .dataflash import read_bin
@@ -44,6 +45,8 @@ class LogOptions:
         disarmed: keep disarmed stretches too.
         system: MAVLink system id, if several autopilots are in the log.
         topics: topic map of a ROS bag; None takes the one beside the bag, or else a proposed one.
+        align: a recording of the same dive, or the folder of its run, whose samples and world frame
+            the result is to have (`align`).
     """
 
     minimum: float = 5.0
@@ -52,6 +55,7 @@ class LogOptions:
     disarmed: bool = False
     system: int | None = None
     topics: Path | None = None
+    align: Path | None = None
 
 
 def import_log(  # long: a third of it says what it takes and refuses
@@ -84,17 +88,25 @@ def import_log(  # long: a third of it says what it takes and refuses
     _check_options(RATES[-1] if rate is None else rate, options)
     if vehicle is not None:
         load_vehicle(vehicle)
+    other = None if options.align is None else reference(options.align)
     damage, signals = _signals(path, vehicle, options, progress)
     enforce(str(path), signals.findings, accept)
     try:
-        rate = own_rate(signals) if rate is None else rate
-        trajectories, lines, dropped = fuse(
-            signals,
-            rate=rate,
-            minimum=options.minimum,
-            gap=options.gap,
-            disarmed=options.disarmed,
-        )
+        if other is not None:
+            rate = 1.0 / other.dt
+            trajectories, lines, dropped, note = aligned(
+                signals, other, options.minimum, options.gap, options.disarmed
+            )
+            signals = replace(signals, notes=(*signals.notes, note))
+        else:
+            rate = own_rate(signals) if rate is None else rate
+            trajectories, lines, dropped = fuse(
+                signals,
+                rate=rate,
+                minimum=options.minimum,
+                gap=options.gap,
+                disarmed=options.disarmed,
+            )
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     if not trajectories:

@@ -21,7 +21,6 @@ from .config import GROUND_STATION
 from .dialect import Message, Parser, mavlink
 from .transport import Connection, Lost, Transport
 
-_COMPONENT = mavlink.MAV_COMP_ID_MISSIONPLANNER
 _HEARTBEAT, _TIMESYNC, _RETRY = 0.5, 0.5, 1.0  # s between heartbeats, TIMESYNC requests, attempts
 _WAIT = 0.05  # s: longest wait for data
 _TELLINGS, _RECENT = 5, 2.0  # calls, a second apart, after a boot; s over which rates are counted
@@ -87,7 +86,7 @@ class Link:
         connection: Connection,
         *,
         system: int = GROUND_STATION,
-        component: int = _COMPONENT,
+        component: int = heartbeat.COMPONENT,
         record: Path | None = None,
     ):
         """Open the connection and start the thread; `record` is a telemetry log (.tlog) to write.

@@ -29,6 +29,7 @@ from spinndrift.sims.run.live import LivePage
 from spinndrift.sims.scenarios.maneuvers import Maneuvers
 from spinndrift.sims.scenarios.scenario import Scenario, load_scenario, overridden
 from spinndrift.systems.controllers.maneuvers import Steadiness
+from spinndrift.systems.logs.load import LogOptions, import_log
 from spinndrift.systems.mavlink import telemetry
 from spinndrift.systems.mavlink.link import Link
 from spinndrift.systems.mavlink.parameters import Parameters
@@ -90,7 +91,13 @@ def test_a_flight_holds_its_pose_and_leaves_the_vehicle_as_it_was(port: int, tmp
     assert run.scenario.station.sensing.imu.rate in (20, 40, 100)
     values = write_files(run, tmp_path, report=True)
     assert values["link"]["damaged"] == 0
-    assert (tmp_path / "telemetry.tlog").stat().st_size > 10_000
+    telemetry_log = tmp_path / "telemetry.tlog"
+    (told,) = import_log(telemetry_log, options=LogOptions(1.0, align=tmp_path))[0].trajectories()
+    (flown,) = run.log.recording.trajectories()
+    first = round((told.start - flown.start) / run.log.dt)
+    assert first * run.log.dt < 1.0
+    apart = told.X_WB - flown.X_WB[first : first + len(told)]
+    assert np.abs(apart[:, :4]).max() < 0.05  # one dive, one clock, one W
     with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
         link.find_vehicle(15.0)
         parameters = Parameters(link)

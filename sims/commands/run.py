@@ -51,7 +51,8 @@ class Run:
     engine: Literal["auto", "drake", "compiled"] = "auto"
     """Engine that steps the diagram: Drake, or one compiled loop, which is faster but needs systems
     with pure functions (no user-defined system without `pure`). `auto` takes the loop for runs of
-    10 s and more if every system has `pure`; in it the planner's rollouts run in one thread."""
+    10 s and more without a sampling planner, if every system has `pure`; in it the planner's
+    rollouts run in one thread."""
     arm: Annotated[bool, FlagCreatePairsOff] = False
     """Arm the vehicle of the scenario's vehicle_link and fly."""
     dry_run: Annotated[bool, FlagCreatePairsOff] = False

@@ -15,9 +15,10 @@ from pydrake.systems.framework import Context, Diagram
 from ...models.config.errors import UserError
 from ...models.files.interrupts import interrupt_noted
 from ...systems.closed_loop import build_diagram, logged, seeded
-from ...systems.compiled.network import NotPureError
+from ...systems.compiled.network import NotPureError, compile_functions
 from ...systems.compiled.simulator import CompiledSimulator
 from ...systems.drake import value
+from ...systems.planning.mppi import Mppi
 from ...systems.planning.passage import Passage
 from ..scenarios.criteria import FollowPath, Monitor, Outcome
 from ..scenarios.scenario import Scenario
@@ -231,8 +232,9 @@ def _simulator(
     diagram: Diagram, scenario: Scenario, engine: Engine
 ) -> Simulator | CompiledSimulator:
     """The simulator that steps a diagram."""
-    if engine == "auto" and scenario.duration < _WORTH_A_LOOP:
-        engine = "drake"
+    if engine == "auto":
+        samples = isinstance(plan_source(diagram), Mppi)  # takes most of the time, in threads
+        engine = "drake" if samples or scenario.duration < _WORTH_A_LOOP else engine
     if engine == "drake":
         return Simulator(diagram)
     try:
@@ -333,6 +335,7 @@ def _samples_at_once(simulator: Simulator | CompiledSimulator, tap: PlanTap, dt:
 
 def _warm_up(diagram: Diagram, duration: float) -> None:
     """Compile every event's function by a short run in a context of its own."""
+    compile_functions(diagram)
     simulator = Simulator(diagram)
     seeded(diagram, simulator.get_mutable_context(), 0)
     with suppress(FloatingPointError):  # the actual run reports it

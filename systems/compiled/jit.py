@@ -49,21 +49,44 @@ _RECENT: deque[Program] = deque(maxlen=8)
 """Programs kept alive for later functions of the same text, without other references to them."""
 
 
-def compiled(function: Callable[..., Any], *like: Any, keep: bool = False) -> Program:
-    """`function` compiled for arguments like these (arrays or their shapes), or an equal program.
+class Lowered:
+    """A function's program before compilation, for arguments like these (arrays or shapes).
 
-    With `keep` the program outlives its references for a while, for the next equal function.
+    Attributes:
+        result: shapes of what the function returns.
     """
-    lowered = jax.jit(function).lower(*like)
-    # the text has all digits of all constants; the trees have the names of arguments and results
-    text = f"{lowered.in_tree}\n{lowered.out_tree}\n{lowered.as_text()}"
-    key = hashlib.sha256(text.encode()).digest()
-    program = _PROGRAMS.get(key)
-    if program is None:
-        program = _PROGRAMS[key] = Program(lowered)
-    if keep:
-        _RECENT.append(program)
-    return program
+
+    def __init__(self, function: Callable[..., Any], *like: Any):
+        """Trace the function."""
+        self.lowered = jax.jit(function).lower(*like)
+        self.result = jax.tree.map(
+            lambda info: jax.ShapeDtypeStruct(info.shape, info.dtype), self.lowered.out_info
+        )
+
+    @cached_property
+    def key(self) -> bytes:
+        """Equal for equal programs."""
+        one = self.lowered
+        # the text has all digits of all constants; the trees the names of arguments and results
+        text = f"{one.in_tree}\n{one.out_tree}\n{one.as_text()}"
+        return hashlib.sha256(text.encode()).digest()
+
+
+def compiled(*codes: Lowered, keep: bool = False) -> list[Program]:
+    """The program of each, or an equal one that is there; compiled in parallel.
+
+    With `keep` programs outlive their references for a while, for the next equal functions.
+    """
+    found = {code.key: _PROGRAMS.get(code.key) for code in codes}
+    missing = {code.key: code for code in codes if found[code.key] is None}
+    made = _threads().map(lambda code: Program(code.lowered), missing.values())
+    found |= dict(zip(missing, made, strict=True))
+    programs = [program for code in codes if (program := found[code.key]) is not None]
+    for code, program in zip(codes, programs, strict=True):
+        _PROGRAMS[code.key] = program
+        if keep:
+            _RECENT.append(program)
+    return programs
 
 
 @cache
@@ -129,12 +152,20 @@ class VectorFunction:
 
     @cached_property
     def _program(self) -> Program:
-        size = jax.ShapeDtypeStruct((sum(self._inputs),), np.float64)
-        return compiled(self._packed, size, keep=self._keep)
+        return compiled(self._lowered(), keep=self._keep)[0]
 
-    def compile(self) -> None:
-        """Compile now, so that no call has to wait for it."""
-        _ = self._program
+    def _lowered(self) -> Lowered:
+        return Lowered(self._packed, jax.ShapeDtypeStruct((sum(self._inputs),), np.float64))
+
+    @staticmethod
+    def compile(*functions: "VectorFunction") -> None:
+        """Compile functions now, in parallel, so that no call has to wait for it."""
+        waiting = [one for one in functions if "_program" not in vars(one)]
+        programs = compiled(*(one._lowered() for one in waiting))
+        for one, program in zip(waiting, programs, strict=True):
+            vars(one)["_program"] = program
+            if one._keep:
+                _RECENT.append(program)
 
     def flat(self, *parts: Float[np.ndarray, "_"]) -> Float[np.ndarray, "m"]:
         """Call with one array for each input and return all results in one (read-only) array."""

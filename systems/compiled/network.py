@@ -214,10 +214,8 @@ def flatten(system: System, wires: dict[Port, Port]) -> Flat:
 
 def compile_functions(system: System) -> None:
     """Compile every `VectorFunction` of a system's leaves, so that no event has to wait for it."""
-    for leaf in flatten(system, {}).leaves:
-        for part in vars(leaf).values():
-            if isinstance(part, VectorFunction):
-                part.compile()
+    parts = [part for leaf in flatten(system, {}).leaves for part in vars(leaf).values()]
+    VectorFunction.compile(*(part for part in parts if isinstance(part, VectorFunction)))
 
 
 def holders(port: Port, wires: Mapping[Port, Port]) -> set[System]:

@@ -5,9 +5,11 @@ import os
 from .dialect import Message, mavlink
 
 COMPONENT = mavlink.MAV_COMP_ID_USER1 + os.getpid() % 75
-"""Our component, in MAVLink's range for users. An autopilot passes a ground station's heartbeat on to
-its other links, but not to one where it knows the same system and component: with the usual 190 a
-rival of our system id there would stay unseen."""
+"""Our component, in MAVLink's range for users.
+
+An autopilot passes a ground station's heartbeat on to its other links, but not to one where it
+knows the same system and component: with the usual 190 a rival of our system id would stay unseen.
+"""
 
 
 def ours() -> Message:

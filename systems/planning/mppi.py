@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, UInt32
 from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from ..compiled.jit import Program, compiled, require_double, together
+from ..compiled.jit import Lowered, Program, compiled, require_double, together
 from ..compiled.pure import Event, Inputs, Pure, State, shown
 from ..drake import group, set_groups, value, value_or_zeros
 from .mppi_core import Draw, MppiPlanner, MppiState
@@ -103,11 +103,14 @@ class Mppi(LeafSystem):
         vector = {n: jax.ShapeDtypeStruct((n,), np.float64) for n in (1, 4, 6, 7)}
         nominal = jax.ShapeDtypeStruct((6 * self.planner.config.horizon,), np.float64)
         of_draw = vector[1], nominal, vector[7], vector[6], vector[6], vector[4]
-        draw = jax.eval_shape(self._draw, *of_draw)
-        roll = [compiled(self._roll, part, draw.at) for part in draw.parts]
-        rolled = [jax.eval_shape(self._roll, part, draw.at) for part in draw.parts]
-        choose = compiled(self._choose, vector[1], draw, rolled)
-        return compiled(self._draw, *of_draw), roll, choose
+        draw = Lowered(self._draw, *of_draw)
+        parts, at = draw.result.parts, draw.result.at
+        roll = {part.shape: Lowered(self._roll, part, at) for part in parts}
+        rolled = [roll[part.shape].result for part in parts]
+        choose = Lowered(self._choose, vector[1], draw.result, rolled)
+        drawing, choosing, *rolling = compiled(draw, choose, *roll.values())
+        by_shape = dict(zip(roll, rolling, strict=True))
+        return drawing, [by_shape[part.shape] for part in parts], choosing
 
     def _draw(
         self, t: Array, nominal: Array, X: Array, V: Array, bias: Array, noise: Array

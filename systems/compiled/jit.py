@@ -79,7 +79,8 @@ def compiled(*codes: Lowered, keep: bool = False) -> list[Program]:
     """
     found = {code.key: _PROGRAMS.get(code.key) for code in codes}
     missing = {code.key: code for code in codes if found[code.key] is None}
-    made = _threads().map(lambda code: Program(code.lowered), missing.values())
+    with ThreadPoolExecutor() as threads:
+        made = list(threads.map(lambda code: Program(code.lowered), missing.values()))
     found |= dict(zip(missing, made, strict=True))
     programs = [program for code in codes if (program := found[code.key]) is not None]
     for code, program in zip(codes, programs, strict=True):
@@ -91,6 +92,7 @@ def compiled(*codes: Lowered, keep: bool = False) -> list[Program]:
 
 @cache
 def _threads() -> ThreadPoolExecutor:
+    """Threads of `together`; each inherits the priority of the thread that first needs it."""
     return ThreadPoolExecutor(thread_name_prefix="spinndrift")
 
 

@@ -356,6 +356,7 @@ def test_thrusters_of_the_uuv_simulator(tmp_path):
     given = forces_of(6)
     signals = read(tmp_path, m, odometry(m, "/rexrov/pose_gt", "world") + uuv_rows(m, given))
     assert signals.command == "thruster_force"
+    assert (signals.voltage, signals.pressure_depth) == (None, None)
     close(signals.outputs, given, 1e-9)
 
 
@@ -454,6 +455,15 @@ def test_pressures_in_other_units(unit, name, tmp_path):
     assert f"taken as {name}" in said(signals)
 
 
+def test_the_other_pressures_of_mavros_are_not_the_waters(tmp_path):
+    """`diff_pressure` is published beside `static_pressure`, and is zero."""
+    m = Messages("mcap")
+    rows = plain(m) + pressure(m, np.zeros(T.size), "/mavros/imu/diff_pressure")
+    rows += pressure(m, 101325.0 - 9800.0 * X[6], "/mavros/imu/static_pressure")
+    signals = read(tmp_path, m, rows + number(m, X[6], "/mavros/global_position/rel_alt"))
+    close(signals.pressure_depth, -X[6])
+
+
 def test_pressures_above_that_of_the_air_are_left_out_and_said(tmp_path):
     m = Messages("mcap")
     signals = read(tmp_path, m, plain(m) + pressure(m, 9800.0 * (1.0 - X[6])))
@@ -488,6 +498,14 @@ def test_a_body_in_ned_without_a_name_of_its_own_is_frd(tmp_path):
         "- {topic: /pwm, gives: [pwm]}\n"
     )
     assert "upside down most of the time" in said(read_bag(tmp_path / "bag.bag", path))
+
+
+def test_accelerations_in_g_are_left_out_and_said(tmp_path):
+    m = Messages("mcap")
+    up = R_WB.inv().apply([0.0, 0.0, 1.0]).T
+    signals = read(tmp_path, m, imu(m, "base_link", X[:4], V[3:], up) + pwm(m))
+    assert signals.specific_force is None
+    assert "accelerations are of 1 m/s²" in said(signals)
 
 
 @pytest.mark.parametrize(

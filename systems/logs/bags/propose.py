@@ -122,6 +122,8 @@ def propose(bag: Bag) -> TopicMap:
     chosen["velocity"] = _first(mine, moving, "velocity")
     chosen["rates"] = _rates(measured, own)
     chosen["acceleration"] = _best(own, "acceleration") or _best(measured, "acceleration")
+    if chosen["acceleration"] is None:
+        _say_accelerations(measured, bag)
     chosen["depth"] = _outside(measured) or _best(measured, "depth")
     for alone in _ALONE:
         chosen[alone] = _best(measured, alone)
@@ -157,13 +159,26 @@ def _of_one_vehicle(seen: Sequence[Seen], bag: Bag) -> Sequence[Seen]:
     return [s for s in seen if found.among(s.topic, first)]
 
 
+def _say_accelerations(measured: Sequence[Seen], bag: Bag) -> None:
+    """Note of an accelerometer that is left out."""
+    for one in measured:
+        part = one.column.form.gives.get("acceleration")
+        if part is not None and one.column.type.endswith("/Imu"):
+            size = np.median(np.linalg.norm(np.nan_to_num(one.column.x[part]), axis=0))
+            if size > 0:
+                bag.note(
+                    f"{one.topic}: its accelerations are of {size:.3g} m/s², without gravity or in "
+                    "another unit, and were left out (an entry with `scale` in a topic map)."
+                )
+
+
 def _outside(measured: Sequence[Seen]) -> Seen | None:
-    """The barometer under the greatest pressure, but that of the hull last."""
+    """The barometer under the greatest absolute pressure, but that of the hull last."""
 
     def rank(one: Seen) -> tuple[bool, bool, float]:
         unit = unit_of(one.column.x[0])
         greatest = float(np.nanmax(one.column.x)) * (1.0 if unit is None else unit[0])
-        return not one.topic.endswith(FIRST_BAROMETER), unit is not None, greatest
+        return unit is not None, not one.topic.endswith(FIRST_BAROMETER), greatest
 
     pressures = [s for s in measured if s.column.type == PRESSURE and s.has("depth")]
     return max(pressures, key=rank, default=None)

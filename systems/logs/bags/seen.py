@@ -112,7 +112,7 @@ class Seen:
             return self.only_height
         if self.column.type.startswith(_VECTOR) and not self._named_vector(quantity):
             return False
-        bare = self.column.type.startswith(_BARE)
+        bare = self.single or self.column.type.startswith(_BARE)
         test: Callable[[np.ndarray], bool] | None = _TESTS.get(quantity)
         if test is not None and (bare or quantity not in COMMANDS) and not test(x):
             return False

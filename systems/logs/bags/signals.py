@@ -241,7 +241,7 @@ def _outputs(
         return _there(series(t, x, one.topic, "thrust"), one), "thruster_force", wired, [], []
     bare = taken.columns[one.topic].type.startswith("std_msgs")
     named = vehicle
-    counted = bare or bool(one.channels)
+    counted = bare or bool(one.channels) or one.thruster > 0
     if vehicle is None and counted and not any(p.name == "FRAME_CONFIG" for p in parameters):
         named = _by_count(one, x.shape[0])
     channels = np.zeros((32, t.size))

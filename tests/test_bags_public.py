@@ -421,6 +421,14 @@ def test_depths_as_numbers_of_either_sign(topic, value, tmp_path):
     assert ("taken as heights" in said(signals)) == (value[0] < 0)
 
 
+def test_a_depth_with_a_type_of_its_own(tmp_path):
+    m = Messages("ros1")
+    kind = "mil_msgs/msg/DepthStamped"
+    m.define(kind, "std_msgs/Header header\nfloat64 depth")
+    rows = each("/depth", lambda i, t: m.make(kind, header=(t, ""), depth=float(-X[6, i])))
+    close(read(tmp_path, m, plain(m) + rows).pressure_depth, -X[6])
+
+
 def test_an_altitude_is_the_distance_to_the_bottom(tmp_path):
     m = Messages("mcap")
     signals = read(tmp_path, m, plain(m) + number(m, 3.0 - X[6], "/altimeter/altitude"))
@@ -464,7 +472,15 @@ def test_the_other_pressures_of_mavros_are_not_the_waters(tmp_path):
     close(signals.pressure_depth, -X[6])
 
 
-def test_pressures_above_that_of_the_air_are_left_out_and_said(tmp_path):
+def test_pressures_above_that_of_the_air_begin_at_the_surface(tmp_path):
+    m = Messages("ros1")
+    below = 0.05 + X[6].max() - X[6]
+    signals = read(tmp_path, m, plain(m) + pressure(m, 9800.0 * below))
+    close(signals.pressure_depth, below)
+    assert "taken as Pa above the air's" in said(signals)
+
+
+def test_pressures_that_may_be_either_are_left_out_and_said(tmp_path):
     m = Messages("mcap")
     signals = read(tmp_path, m, plain(m) + pressure(m, 9800.0 * (1.0 - X[6])))
     assert signals.pressure_depth is None
@@ -486,11 +502,14 @@ def test_a_body_in_ned_without_a_name_of_its_own_is_frd(tmp_path):
     turned = {"R": NED * R_WB * FRD, "p": NED.apply(X[4:].T).T}
     moved = {"v": FRD.apply(V[:3].T).T, "w": FRD.apply(V[3:].T).T}
     rows = odometry(m, "/girona/odometry", "world_ned", "girona/base_link", **turned, **moved)
+    up = R_WB.inv().apply([0.0, 0.0, 9.81])
+    rows += imu(m, "girona/imu", None, None, FRD.apply(up).T)
     signals = read(tmp_path, m, rows + pwm(m))
     same_attitude(signals.attitude)
     close(signals.rates, V[3:])
     close(signals.velocity, V_W)
     close(signals.position, X[4:])
+    close(signals.specific_force, up.T)
     assert "is taken as FRD" in said(signals)
     path = tmp_path / "map.yaml"
     path.write_text(

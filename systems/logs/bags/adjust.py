@@ -8,11 +8,13 @@ import numpy as np
 from ....models.recordings.resample import rotations
 from .bag import Bag, Column
 from .depths import is_reversed, unit_of
-from .messages import NUMBERS, PRESSURE
+from .messages import PRESSURE
 from .mounting import Mounts, mounted
 from .quantities import attitude_of
 from .topics import Frames, Topic, TopicMap
 
+_DOWN = -5.0
+"""m/s² along z of a specific force that points down."""
 _UPSIDE_DOWN = -0.5
 """Cosine of the tilt from which on a vehicle counts as upside down."""
 
@@ -25,19 +27,20 @@ def adjusted(
     for sentence in told:
         bag.note(sentence)
     used = TopicMap(tuple(_measured(one, columns[one.topic], bag) for one in used.topics))
-    return _upright(used, columns, bag)
+    return _with_gravity(_upright(used, columns, bag), columns, bag)
 
 
 def _measured(one: Topic, column: Column, bag: Bag) -> Topic:
     if "depth" in one.gives and column.type == PRESSURE:
         unit = unit_of(column.x[0])
-        if unit is not None and unit[0] != 1.0:
+        if unit is not None and unit[:2] != (1.0, 0.0):
+            scale, offset, name = unit
             bag.note(
-                f"{one.topic}: its pressures are taken as {unit[1]}, by their size "
-                f"(`scale: {unit[0]:g}` in a topic map)."
+                f"{one.topic}: its pressures are taken as {name}, by their size "
+                f"(`scale: {scale:g}`, `offset: {offset:g}` in a topic map)."
             )
-            return replace(one, scale=unit[0])
-    if "depth" in one.gives and column.type in NUMBERS and is_reversed(column.x[0]):
+            return replace(one, scale=scale, offset=offset)
+    if "depth" in one.gives and column.type != PRESSURE and is_reversed(column.x[0]):
         bag.note(f"{one.topic}: its negative numbers are taken as heights, positive up.")
         return replace(one, scale=-1.0)
     if "height" in one.gives and "position" in column.form.gives and not one.world_down:
@@ -70,6 +73,25 @@ def _upright(used: TopicMap, columns: Mapping[str, Column], bag: Bag) -> TopicMa
             for t in used.topics
         )
     )
+
+
+def _with_gravity(used: TopicMap, columns: Mapping[str, Column], bag: Bag) -> TopicMap:
+    """The map with FRD for an accelerometer with z down beside a body in NED/FRD.
+
+    Elsewhere z down may as well be an acceleration of the other sign: that is a finding.
+    """
+    attitude = used.of("attitude")
+    one = used.of("acceleration")
+    if one is None or attitude is None or attitude.frame != "NED/FRD":
+        return used
+    column = columns[one.topic]
+    if one.frame != "ENU/FLU" or one.rpy is not None or "attitude" in one.gives:
+        return used
+    z = column.x[column.form.gives["acceleration"]][2]
+    if not np.nanmedian(z) < _DOWN:
+        return used
+    bag.note(f"{one.topic}: it is taken as FRD, as the vehicle, since its specific force says so.")
+    return TopicMap(tuple(replace(t, frame="ENU/FRD") if t is one else t for t in used.topics))
 
 
 def is_upside_down(one: Topic, column: Column) -> bool:

@@ -168,7 +168,7 @@ class Bag:
             if self.counts.get(connection.topic) and connection.topic not in self.undefined:
                 self.undefined.append(connection.topic)
             return None
-        return form_by_fields({name: _type_of(told) for name, told in found})
+        return form_by_fields(connection.msgtype, {name: _type_of(told) for name, told in found})
 
     def read(
         self, wanted: Sequence[str], progress: Progress = no_progress, most: int | None = None

@@ -17,25 +17,35 @@ FIRST_BAROMETER = "/imu/static_pressure"
 """End of mavros' topic of SCALED_PRESSURE: on a BlueROV2 the barometer in the hull."""
 _UNITS = ((1.0, "Pa"), (100.0, "hPa"), (1e3, "kPa"), (1e5, "bar"))
 """Units of pressure in Pa, and their names."""
-_AIR_PA, _DEEP_PA = 6e4, 1.1e6
-"""Less than the pressure of the air on the highest lakes, and that of 100 m of water: the least of
-a bag lies between, unless it is in Pa, where nothing can be mistaken for it."""
+_LAKE_PA, _AIR_PA, _DEEP_PA = 6e4, 101325.0, 5e5
+"""Less than the pressure of the air on the highest lakes, that at sea level, and that of 40 m of
+water: in other units than Pa the least pressure of a bag lies between the first and the last."""
+_DIVES_PA = 1e6
+"""Larger than the changes of pressure in the part of a dive that is looked at: 100 m of water."""
+_MOVES_PA, _SURFACE_PA = 1e3, (-3e3, 5e4)
+"""Change that a pressure above the air's has at least to count as one, and where its least is."""
 _BELOW_M = 0.3
 """A depth that reaches this far above the surface, and mostly is there, has the other sign."""
 
 
-def unit_of(pressures: Float[np.ndarray, " n"]) -> tuple[float, str] | None:
-    """The unit of absolute pressures in Pa, and its name; None if they are in none that is known.
+def unit_of(pressures: Float[np.ndarray, " n"]) -> tuple[float, float, str] | None:
+    """Scale and offset that make pressures absolute ones in Pa, and the unit; None if unknown.
 
-    It is the smallest in which the least of them is that of the air or of shallow water.
+    It is the smallest unit in which the least of them is that of the air or of shallow water, and
+    in which they change as in a dive; or else they are in Pa above the pressure of the air.
     """
     known = pressures[np.isfinite(pressures)]
     if not known.size:
         return None
-    least = float(np.quantile(known, 0.01))
-    if least >= _AIR_PA:
-        return _UNITS[0]
-    return next((unit for unit in _UNITS if _AIR_PA <= least * unit[0] <= _DEEP_PA), None)
+    least, most = np.quantile(known, (0.01, 0.99)).tolist()
+    if least >= _LAKE_PA:
+        return 1.0, 0.0, "Pa"
+    for pascal, name in _UNITS[1:]:
+        if _LAKE_PA <= least * pascal <= _DEEP_PA and (most - least) * pascal < _DIVES_PA:
+            return pascal, 0.0, name
+    if _SURFACE_PA[0] < least < _SURFACE_PA[1] and most - least > _MOVES_PA:
+        return 1.0, _AIR_PA, "Pa above the air's"
+    return None
 
 
 def is_reversed(depths: Float[np.ndarray, " n"]) -> bool:
@@ -55,7 +65,7 @@ def depth(
     if taken.columns[topic.topic].type != PRESSURE:
         return taken.depth(attitude)
     pascal = found[2][0][np.isfinite(found[2][0])]
-    if not pascal.size or np.median(pascal) < _AIR_PA:
+    if not pascal.size or np.median(pascal) < _LAKE_PA:
         taken.note(
             f"{topic.topic}: its pressures are not absolute ones in Pa, so they were left out; "
             "give `scale` and `offset` (Pa) in a topic map."

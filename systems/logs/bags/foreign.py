@@ -1,4 +1,4 @@
-"""Messages of other packages, read by the names of their fields: DVLs, navigation, thrusters.
+"""Messages of other packages, read by the names of their fields: DVLs, depth, pose, thrusters.
 
 The packages differ in name and layout (uuv_sensor_ros_plugins_msgs, cola2_msgs, stonefish_ros,
 waterlinked_a50_ros_driver, dvl_msgs, marine_acoustic_msgs, ds_sensor_msgs, nortek_dvl), and hardly
@@ -22,6 +22,8 @@ _OF_A_DVL = {
 """Fields that stand beside the `velocity` of a DVL."""
 _OF_A_GOAL = {"acceleration", "acceleration_or_force", "type_mask"}
 """Fields that stand beside the velocity of a set-point, as of mavros_msgs/PositionTarget."""
+_OF_DEPTH = re.compile(r"depth|pressure|baro|bar\d0|ms5837", re.I)
+"""In the type of a message whose `depth` is the vehicle's, as mil_msgs/DepthStamped."""
 _VALID = ("velocity_valid", "beam_velocities_valid")
 _WATER_TRACK, _BEAMS = 2, 0
 """velocity_mode and coordinate_mode of ds_sensor_msgs and marine_acoustic_msgs."""
@@ -45,13 +47,15 @@ def points_down(type_: str) -> bool:
     return _Z_DOWN.match(type_) is not None
 
 
-def form_by_fields(fields: Mapping[str, str]) -> Form | None:
+def form_by_fields(type_: str, fields: Mapping[str, str]) -> Form | None:
     """The form of a message with these fields, by their types; None if it is none of those read."""
     names = fields.keys()
     if fields.get("velocity") in _VECTORS and names & _OF_A_DVL and not names & _OF_A_GOAL:
         return Form(_velocity, {"velocity": slice(0, 3)})
     if fields.get("position", "").endswith("/NED") and "body_velocity" in names:
         return Form(_navigation, _NAVIGATED)
+    if fields.get("depth") in ("float32", "float64") and _OF_DEPTH.search(type_):
+        return Form(lambda m: (m.depth,), {"depth": slice(None)})
     if fields.get("thrust", "").endswith("[]") and "setpoint" in names:  # Stonefish
         return Form(lambda m: m.thrust, {"forces": slice(None)})
     return None

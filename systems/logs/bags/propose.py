@@ -83,9 +83,9 @@ def inspect(bag: Bag) -> list[Seen]:
 
 
 def _looked_at(bag: Bag, topic: str) -> dict[str, Column]:
-    """The first messages of a topic; more of a command, and of a vehicle that rests at first."""
-    array = bag.topics[topic].endswith("MultiArray") or bag.topics[topic] in NUMBERS
-    if not array:
+    """The first messages of a topic; more of commands and pressures, and if the vehicle rests."""
+    kind = bag.topics[topic]
+    if not (kind.endswith("MultiArray") or kind in (*NUMBERS, PRESSURE)):
         found = bag.read([topic], most=_LOOKED_AT)
         resting = {q for q in _MOVING for one in found.values() if _rests(one, q)}
         if not resting or bag.counts[topic] <= _LOOKED_AT:
@@ -277,7 +277,7 @@ def _told(one: Topic) -> dict[str, Any]:
     for name in ("xyz", "rpy"):
         if (value := getattr(one, name)) is not None:
             told[name] = list(value)
-    if one.scale != 1.0:
-        told["scale"] = one.scale
+    told |= {"scale": one.scale} if one.scale != 1.0 else {}
+    told |= {"offset": one.offset} if one.offset else {}
     driven = {"thruster": one.thruster} if one.thruster else {}
     return {**told, "delay": one.delay, **driven}

@@ -557,6 +557,18 @@ def test_a_twist_that_nobody_fills_is_derived(tmp_path):
     close(signals.rates, V[3:], _DIFFERENCES)
 
 
+def test_an_odometry_that_holds_a_twist_alone(tmp_path):
+    """As of a DVL; its pose is the identity."""
+    m = Messages("mcap")
+    none = Rotation.identity(T.size), np.zeros((3, T.size))
+    twist_alone = odometry(m, "/dvl/odometry", R=none[0], p=none[1], w=none[1])
+    signals = read(tmp_path, m, plain(m) + twist_alone + number(m, -X[6], "/depth"))
+    same_attitude(signals.attitude)
+    close(signals.velocity, V_W)
+    close(signals.position, [X[6]])
+    assert "its position never changes" in said(signals)
+
+
 def test_a_vehicle_that_rests_at_first_is_not_mistaken_for_an_empty_field(tmp_path):
     m = Messages("mcap")
     R, p = quaternions(R_WB), X[4:].copy()

@@ -114,11 +114,13 @@ class Quantities:
         return series(t, v_W, one.topic, "velocity")
 
     def _own_attitude(self, one: Topic, t: np.ndarray, attitude: Series) -> np.ndarray:
-        """The attitude of a topic's own messages, or else that of the vehicle at their times."""
+        """The attitude of a topic's messages, or that of the vehicle where nobody fills them."""
         column = self.columns[one.topic]
         own = column.form.gives.get("attitude")
         q = None if own is None else attitude_of(column.x[own], one)
-        return slerp(t, attitude.t, attitude.x) if q is None or not np.isfinite(q).all() else q
+        if q is None or not np.isfinite(q).all() or not np.ptp(q, axis=1).any():
+            return slerp(t, attitude.t, attitude.x)
+        return q
 
     def rates(self, attitude: Series, topic: Topic | None = None) -> Series | None:
         """ω of B in W, in B (rad/s); the source begins with IMU if it is a bare gyro.

@@ -286,8 +286,13 @@ def _motion(
 ) -> tuple[Series | None, Series | None, list[str]]:
     """Position and velocity in W; what one of them lacks is derived from the other topics."""
     position, velocity = taken.position(attitude), taken.velocity(attitude)
-    if velocity is not None and position is not None and _never_filled(velocity, position):
-        velocity = None
+    told = []
+    if position is not None and velocity is not None:
+        if _moves(velocity) and not np.ptp(position.x, axis=1).any():
+            told = [f"{position.source}: its position never changes, and was left out."]
+            position = None
+        elif not velocity.x.any() and np.ptp(position.x, axis=1).max() > _MOVED_M:
+            velocity = None
     if position is not None and velocity is not None:
         return position, velocity, []
     if position is not None:
@@ -298,7 +303,7 @@ def _motion(
         below = depth(taken, attitude, {}, None)
         z = None if below is None else replace(below, x=-below.x)
     if velocity is not None:
-        told = [] if z is None else [f"{velocity.source}: the height is that of {z.source}."]
+        told += [] if z is None else [f"{velocity.source}: the height is that of {z.source}."]
         height = np.full(velocity.t.size, np.nan) if z is None else _within(velocity.t, z)
         lacking = np.full(velocity.t.size, np.nan)
         p = np.stack([lacking, lacking, height])
@@ -315,10 +320,9 @@ def _motion(
     )
 
 
-def _never_filled(velocity: Series, position: Series) -> bool:
-    """Whether a twist is zero throughout although the vehicle moves."""
-    moved = np.nanmax(np.ptp(position.x, axis=1), initial=0.0)
-    return not velocity.x.any() and bool(moved > _MOVED_M)
+def _moves(velocity: Series) -> bool:
+    way = np.cumsum(np.nan_to_num(velocity.x[:, 1:]) * np.diff(velocity.t), axis=1)
+    return float(np.abs(way).max(initial=0.0)) > _MOVED_M
 
 
 def _within(t: np.ndarray, one: Series) -> np.ndarray:

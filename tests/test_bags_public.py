@@ -175,6 +175,7 @@ def test_mountings_are_written_into_the_proposal_and_may_be_corrected(tmp_path):
     with open_bag(path) as bag:
         text = written(bag, propose(bag))
     assert typed_yaml.loads(TopicMap, text)
+    assert "/tf_static: tf2_msgs/msg/TFMessage, 2 messages, the mountings" in text
     (tmp_path / "map.yaml").write_text(text)
     (bare := tmp_path / "bare").mkdir()
     without = m.write(bare / "bag", mounted_rows(m))

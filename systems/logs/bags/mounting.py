@@ -75,9 +75,14 @@ def _is_base(frame: str) -> bool:
     return frame.rsplit("/", 1)[-1] == _BASE
 
 
+def is_tf(type_: str) -> bool:
+    """Whether a topic's type is that of tf."""
+    return type_.endswith(_TYPES)
+
+
 def read_mounts(bag: Bag) -> Mounts:
     """The constant transforms of a bag; of a frame with several parents each counts."""
-    topics = [topic for topic, kind in bag.topics.items() if kind.endswith(_TYPES)]
+    topics = [topic for topic, kind in bag.topics.items() if is_tf(kind)]
     seen: dict[tuple[str, str], RigidTransform | None] = {}
     last: dict[tuple[str, str], tuple[float, ...]] = {}
     for message in bag.decoded(topics, _READ):

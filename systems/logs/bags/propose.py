@@ -13,7 +13,7 @@ from .adjust import adjusted
 from .bag import Bag, Column
 from .depths import FIRST_BAROMETER, unit_of
 from .messages import COMMANDS, NUMBERS, PRESSURE, Quantity
-from .mounting import read_mounts
+from .mounting import is_tf, read_mounts
 from .seen import Seen
 from .singles import NUMBERED, singles
 from .topics import Topic, TopicMap, frames_of
@@ -252,19 +252,22 @@ def written(bag: Bag, proposed: TopicMap) -> str:
     """A proposal as YAML, with the topics that are not used as comments."""
     used = {one.topic for one in proposed.topics}
     rest = [
-        f"# {topic}: {kind}, {bag.counts[topic]} messages"
-        + (
-            f", may give {', '.join(form.gives)}"
-            if (form := bag.forms.get(topic))
-            else ", not read"
-        )
+        f"# {topic}: {kind}, {bag.counts[topic]} messages{_use(bag, topic)}"
         for topic, kind in sorted(bag.topics.items())
         if topic not in used
     ]
     head = f"# Topic map of {bag.path.name} (docs/recording.md)\n"
-    head += "".join(f"# {sentence}\n" for sentence in bag.notes)
+    head += "".join(f"# {' '.join(sentence.split())}\n" for sentence in bag.notes)
     tail = "# not used:\n" + "\n".join(rest) + "\n" if rest else ""
     return head + emit({"topics": [_told(one) for one in proposed.topics]}) + tail
+
+
+def _use(bag: Bag, topic: str) -> str:
+    """What a topic that gives no quantity may give."""
+    if is_tf(bag.topics[topic]):
+        return ", the mountings"
+    form = bag.forms.get(topic)
+    return ", not read" if form is None else f", may give {', '.join(form.gives)}"
 
 
 def _told(one: Topic) -> dict[str, Any]:

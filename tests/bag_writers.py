@@ -31,6 +31,10 @@ class Messages:
             if not one or "rcl_interfaces" not in text:
                 self.store.register(get_types_from_msg(text, name))
 
+    def define(self, type_: str, text: str) -> None:
+        """Add a message of another package; a nested one is named by its own `define`."""
+        self.store.register(get_types_from_msg(text, type_))
+
     def make(self, type_: str, **fields: Any) -> Any:
         """A message; fields that are not given are zero or empty, `header` is (ns, frame)."""
         if "header" in fields:
@@ -110,6 +114,28 @@ class Messages:
         """A std_msgs multi-array of Float32, UInt16, …"""
         name = bits.lower()
         return self.make(f"std_msgs/msg/{bits}MultiArray", data=np.ascontiguousarray(values, name))
+
+    def transforms(self, *known: tuple[str, str, Any, Any]) -> Any:
+        """A message of tf: (parent, child, p of the child in the parent, R of it) each."""
+        if "tf2_msgs/msg/TFMessage" not in self.store.fielddefs:
+            self.define("tf2_msgs/msg/TFMessage", "geometry_msgs/TransformStamped[] transforms")
+        found = []
+        for parent, child, p, R in known:
+            x, y, z, w = R.as_quat()
+            transform = self.make(
+                "geometry_msgs/msg/Transform",
+                translation=self.xyz("Vector3", p),
+                rotation=self.quaternion((w, x, y, z)),
+            )
+            found.append(
+                self.make(
+                    "geometry_msgs/msg/TransformStamped",
+                    header=(EPOCH_NS, parent),
+                    child_frame_id=child,
+                    transform=transform,
+                )
+            )
+        return self.make("tf2_msgs/msg/TFMessage", transforms=found)
 
     def write(self, path: Path, rows: Iterable[tuple[int, str, Any]], packed: str = "") -> Path:
         """Write (received in ns, topic, message) as a bag; returns what an import reads.

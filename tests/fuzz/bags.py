@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from bag_writers import EPOCH_NS, KINDS, Messages
 from log_writers import outputs, truth
+from scipy.spatial.transform import Rotation
 
 from spinndrift.models.recordings.summary import summarize
 from spinndrift.systems.logs.load import LogOptions, load_data
@@ -24,6 +25,21 @@ _MAP = """topics:
 - {topic: /pwm, gives: [pwm], scale: 1.0, channels: [1, 2, 3, 4, 5, 6, 7, 8]}
 - {topic: /mavros/state, gives: [state]}
 """
+_DVL = (
+    "own_msgs/msg/DVL",
+    """std_msgs/Header header
+geometry_msgs/Vector3 velocity
+float64[9] velocity_covariance
+float64 altitude
+bool velocity_valid
+""",
+)
+_SENSORS = """topics:
+- {topic: /imu, gives: [attitude, rates], rpy: [0.1, 0.2, 3.0], xyz: [0.1, 0, 0]}
+- {topic: /dvl, gives: [velocity], frame: ENU/FRD, xyz: [0.3, 0, -0.1]}
+- {topic: /depth, gives: [depth], scale: -1}
+- {topic: /t1, gives: [forces], thruster: 1, scale: 0.01, squared: true}
+"""
 _SINGLE = """topics:
 - {topic: /odom, gives: [attitude, position, velocity, rates]}
 - {topic: /t1, gives: [forces], thruster: 1, delay: 0.1}
@@ -37,6 +53,7 @@ def _rows(messages: Messages, rng: Rng | None) -> list[tuple[int, str, Any]]:
     Definitions and sizes stay sound, so that the numbers reach what follows the reader.
     """
     rows: list[tuple[int, str, Any]] = []
+    messages.define(*_DVL)
     for k, t in enumerate(100.0 + np.arange(0, 1.0, 0.05)):
         X, V, _ = (np.array(x) for x in truth(t))
         n, pwm = EPOCH_NS + round(t * 1e9), outputs(t)
@@ -52,13 +69,29 @@ def _rows(messages: Messages, rng: Rng | None) -> list[tuple[int, str, Any]]:
             array = messages.array("UInt16", pwm)
         rows += [
             (n, "/odom", messages.odometry(stamp, X[:4], X[4:], V[:3], V[3:])),
-            (n, "/imu", messages.imu(n, None, V[3:], V[:3] + np.array([0, 0, 9.81]))),
+            (n, "/imu", messages.imu(n, X[:4], V[3:], V[:3] + np.array([0, 0, 9.81]))),
             (n, "/pwm", array),
             (n, "/t1", messages.make("std_msgs/msg/Float64", data=float(pwm[0]))),
             (n, "/t2", messages.make("std_msgs/msg/Float64", data=float(pwm[1]))),
             (n, "/mavros/state", messages.make("mavros_msgs/msg/State", header=(n, ""), **state)),
         ]
+        if k % 4 == 0:
+            rows += _sensors(messages, k, n, stamp, X, V)
     return rows
+
+
+def _sensors(
+    messages: Messages, k: int, n: int, stamp: int, X: np.ndarray, V: np.ndarray
+) -> list[tuple[int, str, Any]]:
+    """A DVL of another package with its mounting, which may move, and a depth."""
+    dvl = {"velocity": messages.xyz("Vector3", V[:3]), "velocity_valid": k % 8 != 0}
+    turn = Rotation.from_rotvec(0.1 * np.nan_to_num(V[3:], posinf=1.0, neginf=1.0) % 7.0)
+    place = ("base_link", "dvl", X[4:], Rotation.identity() if k % 8 else turn)
+    return [
+        (n, "/dvl", messages.make(_DVL[0], header=(stamp, "dvl"), **dvl)),
+        (n, "/tf", messages.transforms(place)),
+        (n, "/depth", messages.make("std_msgs/msg/Float64", data=float(-X[6]))),
+    ]
 
 
 @cache
@@ -87,7 +120,7 @@ def _spoil(rng: Rng, folder: Path) -> Path:
             data = bytes_spoiled(rng, data)
         path.write_bytes(data)
     if rng.random() < 0.3:
-        text = pick(rng, (_MAP, _SINGLE))
+        text = pick(rng, (_MAP, _SINGLE, _SENSORS))
         text = yaml_spoiled(rng, text) if rng.random() < 0.6 else text
         text = text_spoiled(rng, text) if rng.random() < 0.3 else text
         text = text.encode("utf-8", "replace").decode()

@@ -1,7 +1,7 @@
 """Reads topics of a ROS 1 bag (.bag) or a ROS 2 bag (.db3, .mcap, or their folder) as columns."""
 
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,10 +12,11 @@ import numpy as np
 from ....models.config.errors import UserError
 from ..log_bytes import Progress, no_progress
 from ..table import numbers
+from .foreign import form_by_fields
 from .mavros import DEFINITIONS
-from .messages import FORMS
+from .messages import FORMS, Form
 
-Kind = Literal["ros1", "mcap", "sqlite3", "folder"]
+Kind = Literal["ros1", "mcap", "sqlite3", "folder", "packed"]
 METADATA = "metadata.yaml"
 """In the folder of every ROS 2 bag."""
 _MAGIC: dict[bytes, Kind] = {
@@ -23,6 +24,8 @@ _MAGIC: dict[bytes, Kind] = {
     b"\x89MCAP": "mcap",
     b"SQLite format 3\0": "sqlite3",
 }
+_PACKED = (b"\x1f\x8b", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd", b"PK\x03\x04", b"BZh")
+"""Magic of gzip, xz, zstd, zip and bzip2."""
 _STORAGE = (".db3", ".mcap")
 _REPAIR = {
     "ros1": "`rosbag reindex`",
@@ -30,6 +33,7 @@ _REPAIR = {
     "sqlite3": "`ros2 bag reindex`",
     "folder": "`ros2 bag reindex`",
 }
+_PUBLISHED = ""
 _NANOSECONDS = 1_000_000_000
 _LATEST_NS = 1 << 62
 
@@ -44,6 +48,8 @@ def bag_kind(path: Path) -> Kind | None:
             head = handle.read(16)
     except OSError:
         return None
+    if head.startswith(_PACKED) and {".bag", *_STORAGE} & {s.lower() for s in path.suffixes}:
+        return "packed"
     return next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), None)
 
 
@@ -54,7 +60,8 @@ class Column:
     Attributes:
         received: when each was recorded (ns since the epoch).
         stamps: time in each header (ns), None without one or where all are zero.
-        x: numbers of each (k, n), see `messages.FORMS`.
+        form: what its numbers are.
+        x: numbers of each (k, n), see `form`.
         text: word of each.
         frame: `frame_id` of the first header; `child` likewise `child_frame_id`.
         broken: number of messages that could not be read.
@@ -62,6 +69,7 @@ class Column:
 
     topic: str
     type: str
+    form: Form
     received: np.ndarray
     stamps: np.ndarray | None
     x: np.ndarray
@@ -75,6 +83,7 @@ class Column:
 class _Rows:
     """Messages of one topic while they are read."""
 
+    form: Form
     received: list[int] = field(default_factory=list)
     stamps: list[int] = field(default_factory=list)
     x: list[tuple[float, ...]] = field(default_factory=list)
@@ -83,10 +92,9 @@ class _Rows:
     child: str = ""
     broken: int = 0
 
-    def add(self, message: Any, received: int, type_: str) -> None:
+    def add(self, message: Any, received: int) -> None:
         """Take the numbers of one message; those of another length become NaN."""
-        form = FORMS[type_]
-        x = tuple(map(float, form.numbers(message)))
+        x = tuple(map(float, self.form.numbers(message)))
         if self.x and len(x) != len(self.x[0]):
             x = (np.nan,) * len(self.x[0])
         header = getattr(message, "header", None)
@@ -94,7 +102,7 @@ class _Rows:
             self.frame = str(getattr(header, "frame_id", ""))
             self.child = str(getattr(message, "child_frame_id", ""))
         stamp = 0 if header is None else header.stamp.sec * _NANOSECONDS + header.stamp.nanosec
-        at, text = min(max(int(received), -_LATEST_NS), _LATEST_NS), str(form.text(message))
+        at, text = min(max(int(received), -_LATEST_NS), _LATEST_NS), str(self.form.text(message))
         self.x.append(x)
         self.received.append(at)
         self.stamps.append(int(stamp))
@@ -102,18 +110,28 @@ class _Rows:
 
     def column(self, topic: str, type_: str) -> Column:
         """The rows as arrays."""
-        stamps = np.array(self.stamps, np.int64)
+        stamps, received = np.array(self.stamps, np.int64), np.array(self.received, np.int64)
         return Column(
             topic,
             type_,
-            np.array(self.received, np.int64),
-            stamps if stamps.any() else None,
+            self.form,
+            received,
+            _filled(stamps, received) if stamps.any() else None,
             numbers(np.array(self.x, float).reshape(len(self.x), -1).T),
             tuple(self.text),
             self.frame,
             self.child,
             self.broken,
         )
+
+
+def _filled(stamps: np.ndarray, received: np.ndarray) -> np.ndarray:
+    """The stamps, with those that are zero (never set) by the recorder's time less the latency."""
+    unset = stamps == 0
+    if not unset.any():
+        return stamps
+    latency = np.median((received - stamps)[~unset].astype(float))
+    return np.where(unset, received - int(latency), stamps)
 
 
 class Bag:
@@ -131,6 +149,26 @@ class Bag:
         for one in named:
             if self.topics.setdefault(one.topic, one.msgtype) == one.msgtype:
                 self.counts[one.topic] = self.counts.get(one.topic, 0) + one.msgcount
+        self.undefined: list[str] = []
+        """Topics of types that are neither in the bag nor published with ROS."""
+        self.forms: dict[str, Form] = {}
+        """What the messages of each topic give, of those that are read."""
+        for one in reader.connections:
+            if (form := self._form(one)) is not None:
+                self.forms.setdefault(one.topic, form)
+
+    def _form(self, connection: Any) -> Form | None:
+        if connection.msgtype != self.topics.get(connection.topic):
+            return None
+        if connection.msgtype in FORMS:
+            return FORMS[connection.msgtype]
+        try:
+            _, found = self._store_of(connection).fielddefs[connection.msgtype]
+        except self._broken:
+            if self.counts.get(connection.topic) and connection.topic not in self.undefined:
+                self.undefined.append(connection.topic)
+            return None
+        return form_by_fields(connection.msgtype, {name: _type_of(told) for name, told in found})
 
     def read(
         self, wanted: Sequence[str], progress: Progress = no_progress, most: int | None = None
@@ -143,12 +181,8 @@ class Bag:
             UserError: no message of a topic can be read.
         """
         types = {topic: self.topics[topic] for topic in wanted}
-        rows = {topic: _Rows() for topic in types}
-        chosen = [
-            c
-            for c in self._reader.connections
-            if c.topic in types and c.msgtype == types[c.topic] and c.msgcount
-        ]
+        rows = {topic: _Rows(self.forms[topic]) for topic in types}
+        chosen = self._connections(types)
         groups = [chosen] if most is None else [[c] for c in chosen]
         total, done = max(sum(c.msgcount for c in chosen), 1), 0
         for group in (g for g in groups if g):
@@ -159,7 +193,7 @@ class Bag:
                 if most is not None and len(into.x) + into.broken >= most:
                     break
                 try:
-                    into.add(self._decoded(connection, raw), received, connection.msgtype)
+                    into.add(self._decoded(connection, raw), received)
                 except self._broken:
                     into.broken += 1
                 done += 1
@@ -174,21 +208,41 @@ class Bag:
                 )
         return {topic: into.column(topic, types[topic]) for topic, into in rows.items() if into.x}
 
+    def decoded(self, topics: Sequence[str], most: int) -> Iterator[Any]:
+        """Messages of some topics as they are, of each publisher at most `most`."""
+        for connection in self._connections(topics):
+            for _, (one, _, raw) in zip(range(most), self._messages([connection]), strict=False):
+                with suppress(*self._broken):
+                    yield self._decoded(one, raw)
+
+    def _connections(self, topics: Container[str]) -> list[Any]:
+        return [
+            c
+            for c in self._reader.connections
+            if c.topic in topics and c.msgtype == self.topics[c.topic] and c.msgcount
+        ]
+
+    def note(self, sentence: str) -> None:
+        """Add a sentence for the report, once."""
+        if sentence not in self.notes:
+            self.notes.append(sentence)
+
     def _messages(self, connections: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
         try:
             yield from self._reader.messages(connections=connections)
         except self._broken:
-            told = "The bag is damaged; what precedes the damage was read."
-            self.notes = [told]
+            self.note("The bag is damaged; what precedes the damage was read.")
 
     def _decoded(self, connection: Any, raw: bytes) -> Any:
-        type_ = connection.msgtype
-        if type_ not in self._stores:
-            self._stores[type_] = self._store(connection)
-        store = self._stores[type_]
+        type_, store = connection.msgtype, self._store_of(connection)
         if self.kind == "ros1":
             return store.deserialize_ros1(raw, type_)
         return store.deserialize_cdr(raw, type_)
+
+    def _store_of(self, connection: Any) -> Any:
+        if connection.msgtype not in self._stores:
+            self._stores[connection.msgtype] = self._store(connection)
+        return self._stores[connection.msgtype]
 
     def _store(self, connection: Any) -> Any:
         """The definitions for one type: the bag's own, else the published ones."""
@@ -202,13 +256,26 @@ class Bag:
                 store.register(get_types_from_msg(definition.data, connection.msgtype))
                 store.get_msgdef(connection.msgtype)
                 return store
+        if _PUBLISHED in self._stores:
+            return self._stores[_PUBLISHED]
         store = get_typestore(Stores.ROS1_NOETIC if self.kind == "ros1" else Stores.ROS2_HUMBLE)
         types = {}
         for name, text in DEFINITIONS.items():
             if self.kind != "ros1" or "rcl_interfaces" not in text:
                 types.update(get_types_from_msg(text, name))
         store.register(types)
+        self._stores[_PUBLISHED] = store
         return store
+
+
+def _type_of(told: Any) -> str:
+    """Type of a field in words: a base type's or a message's name, with [] if it is an array."""
+    from rosbags.interfaces import Nodetype
+
+    kind, inner = told
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        return f"{_type_of(inner[0])}[]"
+    return str(inner if kind == Nodetype.NAME else inner[0])
 
 
 @contextmanager
@@ -222,6 +289,10 @@ def open_bag(path: Path) -> Iterator[Bag]:
     kind = bag_kind(path)
     if kind is None:
         raise UserError(f"{path}: no ROS bag; give a .bag, .db3 or .mcap file, or the bag's folder")
+    if kind == "packed":
+        raise UserError(
+            f"{path}: a packed bag; unpack it, or give the folder of a bag of compressed files"
+        )
     if kind == "folder" and not (path / METADATA).is_file():
         raise UserError(
             f"{path}: has no {METADATA}, so the bag was not closed after recording; repair it with "

@@ -59,6 +59,11 @@ def _two(pair: Any, names: tuple[str, str]) -> tuple[float, ...]:
     return *_xyz(getattr(pair, names[0])), *_xyz(getattr(pair, names[1]))
 
 
+def _vector(get: Callable[[Any], Any], *gives: Quantity) -> Form:
+    """Form of a message with one vector, which may be any of some quantities."""
+    return Form(lambda m: _xyz(get(m)), dict.fromkeys(gives, slice(0, 3)))
+
+
 def _twist(twist: Any) -> tuple[float, ...]:
     return _two(twist, ("linear", "angular"))
 
@@ -107,8 +112,13 @@ def _aided(m: Any) -> tuple[float]:
     return (float(m.velocity_horiz_status_flag and position and not m.const_pos_mode_status_flag),)
 
 
-_POSE: Mapping[Quantity, slice] = {"attitude": slice(0, 4), "position": slice(4, 7)}
+_POSE: Mapping[Quantity, slice] = {
+    "attitude": slice(0, 4),
+    "position": slice(4, 7),
+    "height": slice(6, 7),
+}
 _TWIST: Mapping[Quantity, slice] = {"velocity": slice(0, 3), "rates": slice(3, 6)}
+_VECTORS: tuple[Quantity, ...] = ("velocity", "rates", "acceleration")
 _NUMBER = Form(
     lambda m: (m.data,),
     {"depth": _ALL, "height": _ALL, "voltage": _ALL, "pwm": _ALL, "forces": _ALL},
@@ -117,8 +127,10 @@ NUMBERS = (
     "std_msgs/msg/Float32",
     "std_msgs/msg/Float64",
     "uuv_gazebo_ros_plugins_msgs/msg/FloatStamped",
+    *(f"std_msgs/msg/{sign}Int{bits}" for sign in ("U", "") for bits in (16, 32)),
 )
 """Types of a single number: of a sensor, or of one thruster."""
+_WHOLE = Form(lambda m: (m.data,), {"pwm": _ALL, "forces": _ALL})
 _ARRAY = Form(lambda m: m.data, {"pwm": _ALL, "forces": _ALL, "wrench": _ALL})
 
 FORMS: dict[str, Form] = {
@@ -134,6 +146,10 @@ FORMS: dict[str, Form] = {
     "geometry_msgs/msg/TwistStamped": Form(lambda m: _twist(m.twist), _TWIST),
     "geometry_msgs/msg/TwistWithCovariance": Form(lambda m: _twist(m.twist), _TWIST),
     "geometry_msgs/msg/TwistWithCovarianceStamped": Form(lambda m: _twist(m.twist.twist), _TWIST),
+    "geometry_msgs/msg/Vector3": _vector(lambda m: m, *_VECTORS),
+    "geometry_msgs/msg/Vector3Stamped": _vector(lambda m: m.vector, *_VECTORS),
+    "geometry_msgs/msg/Point": _vector(lambda m: m, "position"),
+    "geometry_msgs/msg/PointStamped": _vector(lambda m: m.point, "position"),
     "geometry_msgs/msg/Wrench": Form(_wrench, {"wrench": _ALL}),
     "geometry_msgs/msg/WrenchStamped": Form(lambda m: _wrench(m.wrench), {"wrench": _ALL}),
     "sensor_msgs/msg/Imu": Form(
@@ -151,7 +167,7 @@ FORMS: dict[str, Form] = {
     "mavros_msgs/msg/ParamEvent": Form(
         _parameter_event, {"parameters": _ALL}, lambda m: m.param_id
     ),
-    **dict.fromkeys(NUMBERS, _NUMBER),
+    **{t: _WHOLE if "Int" in t else _NUMBER for t in NUMBERS},
     **{f"std_msgs/msg/Float{bits}MultiArray": _ARRAY for bits in (32, 64)},
     **{
         f"std_msgs/msg/{sign}Int{bits}MultiArray": Form(lambda m: m.data, {"pwm": _ALL})

@@ -1,43 +1,40 @@
 """Proposes a topic map for a bag: by types, names, rates, and the first messages of each topic."""
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ....models.config.errors import UserError
 from ....models.config.yaml_text import emit
+from .adjust import adjusted
 from .bag import Bag, Column
-from .messages import COMMANDS, FORMS, NUMBERS, PRESSURE, Quantity
+from .depths import FIRST_BAROMETER, unit_of
+from .messages import COMMANDS, NUMBERS, PRESSURE, Quantity
+from .mounting import is_tf, read_mounts
+from .seen import Seen
+from .singles import NUMBERED, singles
 from .topics import Topic, TopicMap, frames_of
+from .vehicles import vehicles_of
 
 _LOOKED_AT, _COMMANDS_LOOKED_AT = 200, 5000
 _SHOWN = 12
-_ORDERED = re.compile(r"cmd|command|setpoint|desired|target|reference|goal|planned", re.I)
+_ORDERED = re.compile(
+    r"cmd|command|setpoint|desired|target|reference|goal|planned|waypoint|trajectory|initial|error"
+    r"|teleop|joy",
+    re.I,
+)
 """Names of topics that say what shall be, not what is."""
-_GRAVITY, _APART = 9.81, 5.0
-_PULSES_US = (800.0, 2200.0)
 _USUAL = re.compile(r"odom", re.I)
 """In the names of topics of the vehicle's own estimate (REP 105), before fixes of a GPS."""
 _FASTER = 3.0
-FIRST_BAROMETER = "/imu/static_pressure"
-"""End of mavros' topic of SCALED_PRESSURE: on a BlueROV2 the barometer in the hull."""
 _GLOBAL = re.compile(r"/global_position/(local|raw/[^/]+)$")
 """mavros' topics of a GPS: without one they stand still, or hold the climb alone."""
-_NUMBERED = re.compile(r"(?:thrust|motor|propeller)\D*(\d+)", re.I)
-"""In the name of a topic that drives one thruster."""
-_STICKS = "mavros_msgs/msg/OverrideRCIn"
-_NAMES: dict[Quantity, re.Pattern[str]] = {
-    "depth": re.compile(r"depth", re.I),
-    "height": re.compile(r"rel_alt|altitude|height", re.I),
-    "voltage": re.compile(r"volt|battery", re.I),
-    "pwm": re.compile(r"pwm|servo|rc/out|pulse|motor", re.I),
-    "forces": re.compile(r"thrust|force|motor", re.I),
-    "wrench": re.compile(r"wrench|tau|effort", re.I),
-}
-"""What a bare number or array is, by the name of its topic."""
+_CAMERA = re.compile(r"camera|(^|/)cam\d|zed|realsense|optical", re.I)
+_MOVING: tuple[Quantity, ...] = ("attitude", "position", "velocity")
+_IN_NEWTON = "{}: its numbers are taken as forces of the thrusters in N."
 _FRAMED = {"attitude", "position", "velocity", "rates", "acceleration", "wrench"}
 """Quantities with axes."""
 _ALONE: tuple[Quantity, ...] = ("height", "voltage", "rc", "state", "aiding")
@@ -53,87 +50,26 @@ _FIRST: dict[Quantity, tuple[str, ...]] = {
 """Types in the order in which they are preferred."""
 
 
-@dataclass(frozen=True)
-class Seen:
-    """A topic with the first of its messages."""
-
-    column: Column
-    rate: float
-    count: int
-
-    @property
-    def topic(self) -> str:
-        """Its name."""
-        return self.column.topic
-
-    def has(self, quantity: Quantity) -> bool:
-        """Whether its messages may hold a quantity, and do."""
-        form = FORMS[self.column.type]
-        if quantity not in form.gives or self.count < 2:
-            return False
-        if (quantity, self.column.type) == ("pwm", _STICKS):  # only a pass-through's, by a map
-            return False
-        x = self.column.x[form.gives[quantity]]
-        if not x.size or not np.isfinite(x).any():
-            return False
-        if quantity in COMMANDS and self.column.type in NUMBERS:  # one thruster's: `_singles`
-            return False
-        bare = self.column.type.startswith("std_msgs")
-        test: Callable[[np.ndarray], bool] | None = _TESTS.get(quantity)
-        if test is not None and (bare or quantity not in COMMANDS) and not test(x):
-            return False
-        named = _NAMES.get(quantity)
-        if not bare or named is None or named.search(self.topic):
-            return True
-        return quantity == "pwm" and _are_pulses(x)
-
-
-def _are_pulses(x: np.ndarray) -> bool:
-    """Whether numbers are pulse widths in µs; 0 is no pulse."""
-    known = x[np.isfinite(x) & (x != 0)]
-    return known.size > 0 and bool(np.all((known > _PULSES_US[0]) & (known < _PULSES_US[1])))
-
-
-def _are_normal(x: np.ndarray) -> bool:
-    """Whether numbers are likely parts of full thrust, not N: within ±1 but not all zero."""
-    known = np.abs(x[np.isfinite(x)])
-    return known.size > 0 and 0 < float(known.max()) <= 1
-
-
-def _is_turned(q: np.ndarray) -> bool:
-    return bool(np.any(np.abs(np.linalg.norm(q, axis=0) - 1) < 0.1))
-
-
-def _has_gravity(a: np.ndarray) -> bool:
-    """Whether accelerations are specific forces: those without gravity are not."""
-    sizes = np.linalg.norm(a[:, np.isfinite(a).all(axis=0)], axis=0)
-    return sizes.size > 0 and abs(float(np.median(sizes)) - _GRAVITY) < _APART
-
-
-_TESTS: dict[Quantity, Callable[[np.ndarray], bool]] = {
-    "attitude": _is_turned,
-    "acceleration": _has_gravity,
-    "pwm": _are_pulses,
-    "wrench": lambda x: x.shape[0] == 6,
-    "forces": lambda x: x.shape[0] > 1 and not _are_pulses(x) and not _are_normal(x),
-    "rates": lambda x: bool(np.any(x != 0)),
-}
-
-
 def inspect(bag: Bag) -> list[Seen]:
     """The topics of known types that hold messages, with the first of each.
 
     Raises:
         UserError: the bag holds none.
     """
-    known = [t for t, kind in sorted(bag.topics.items()) if kind in FORMS and bag.counts[t]]
+    known = [t for t in sorted(bag.topics) if t in bag.forms and bag.counts[t]]
+    if bag.undefined:
+        several = ", ".join(f"{t} {bag.topics[t]}" for t in sorted(bag.undefined)[:_SHOWN])
+        bag.note(f"The bag has no definition of {several}: not read (MCAP files have them).")
     found = []
     for topic in known:
         try:
-            array = bag.topics[topic].endswith("MultiArray") or bag.topics[topic] in NUMBERS
-            columns = bag.read([topic], most=_COMMANDS_LOOKED_AT if array else _LOOKED_AT)
+            columns = _looked_at(bag, topic)
         except UserError:
-            continue  # its messages can't be read, so it gives nothing
+            bag.note(
+                f"{topic}: its messages can't be read as {bag.topics[topic]} (their definition is "
+                "missing or another one); it was left out."
+            )
+            continue
         for one in columns.values():
             spans = np.diff(np.sort(one.received if one.stamps is None else one.stamps)) * 1e-9
             step = float(np.median(spans)) if spans.size else 0.0
@@ -146,6 +82,21 @@ def inspect(bag: Bag) -> list[Seen]:
     return found
 
 
+def _looked_at(bag: Bag, topic: str) -> dict[str, Column]:
+    """The first messages of a topic; more of commands and pressures, and if the vehicle rests."""
+    kind = bag.topics[topic]
+    if not (kind.endswith("MultiArray") or kind in (*NUMBERS, PRESSURE)):
+        found = bag.read([topic], most=_LOOKED_AT)
+        resting = {q for q in _MOVING for one in found.values() if _rests(one, q)}
+        if not resting or bag.counts[topic] <= _LOOKED_AT:
+            return found
+    return bag.read([topic], most=_COMMANDS_LOOKED_AT)
+
+
+def _rests(column: Column, quantity: Quantity) -> bool:
+    return quantity in column.form.gives and Seen(column, 0.0, 0).still(quantity)
+
+
 def listed(bag: Bag) -> str:
     """The topics of a bag, in words."""
     names = [f"{t} {kind} ×{bag.counts[t]}" for t, kind in sorted(bag.topics.items())]
@@ -154,65 +105,102 @@ def listed(bag: Bag) -> str:
 
 
 def propose(bag: Bag) -> TopicMap:
-    """The topic that gives each quantity, as far as the bag tells.
+    """The topic that gives each quantity, as far as the bag tells; its notes say what is not sure.
 
     Raises:
         UserError: the bag has no messages of known types.
     """
-    seen = inspect(bag)
+    seen = _of_one_vehicle(inspect(bag), bag)
     measured = [s for s in seen if not _ORDERED.search(s.topic)]
     moving = [s for s in measured if not _GLOBAL.search(s.topic)]
     chosen: dict[Quantity, Seen | None] = {"position": _best(moving, "position")}
     place = chosen["position"]
     alike = [s for s in measured if place is None or _space(s) == _space(place)]
-    chosen["attitude"] = _best(alike, "attitude") or _best(measured, "attitude")
+    chosen["attitude"] = _first(alike, measured, "attitude")
     own = [s for s in (place, chosen["attitude"]) if s is not None]
     mine = [s for s in own if s in moving]
-    chosen["velocity"] = _best(mine, "velocity") or _best(moving, "velocity")
+    chosen["velocity"] = _first(mine, moving, "velocity")
     chosen["rates"] = _rates(measured, own)
     chosen["acceleration"] = _best(own, "acceleration") or _best(measured, "acceleration")
-    pressures = [s for s in measured if s.column.type == PRESSURE and s.has("depth")]
-    outside = max(
-        pressures,
-        key=lambda s: (not s.topic.endswith(FIRST_BAROMETER), float(np.nanmax(s.column.x))),
-        default=None,
-    )
-    chosen["depth"] = outside or _best(measured, "depth")
+    if chosen["acceleration"] is None:
+        _say_accelerations(measured, bag)
+    chosen["depth"] = _outside(measured) or _best(measured, "depth")
     for alone in _ALONE:
         chosen[alone] = _best(measured, alone)
-    commands = {quantity: _best(seen, quantity) for quantity in COMMANDS}
-    first: Quantity | None = next((q for q in COMMANDS if commands[q] is not None), None)
-    if first is not None:
-        chosen[first] = commands[first]
-    singles = _singles(seen) if first is None else []
-    chosen["parameters"] = next(
-        (s for s in seen if "parameters" in FORMS[s.column.type].gives), None
-    )
+    chosen["parameters"] = next((s for s in seen if "parameters" in s.column.form.gives), None)
+    command, each = _driving(seen, bag)
+    chosen.update(command)
     gives: dict[str, list[Quantity]] = {}
     for quantity, one in chosen.items():
         if one is not None:
             gives.setdefault(one.topic, []).append(quantity)
     found = [_topic(s, gives[s.topic]) for s in seen if s.topic in gives]
-    pulses = all(_are_pulses(s.column.x) for _, s in singles)
-    alone: Quantity = "pwm" if pulses else "forces"
-    return TopicMap((*found, *(replace(_topic(s, [alone]), thruster=k) for k, s in singles)))
+    columns = {s.topic: s.column for s in seen}
+    return adjusted(TopicMap((*found, *each)), columns, bag, read_mounts(bag))
 
 
-def _singles(seen: Sequence[Seen]) -> list[tuple[int, Seen]]:
-    """Topics that drive one thruster each, by a number in their names; thrusters from 1.
-
-    Numbers within ±1 throughout are parts of full thrust, not N, and are left to the user.
-    """
-    numbered = [
-        (int(match[1]), s)
+def _of_one_vehicle(seen: Sequence[Seen], bag: Bag) -> Sequence[Seen]:
+    """The topics of one vehicle, and those of none, if the bag holds several."""
+    poses = [s.topic for s in seen if "position" in s.column.form.gives]
+    driving = [
+        s.topic
         for s in seen
-        if s.column.type in NUMBERS and (match := _NUMBERED.search(s.topic))
+        if set(COMMANDS) & s.column.form.gives.keys()
+        and (not s.single or NUMBERED.search(s.topic) is not None)
     ]
-    numbered.sort(key=lambda pair: pair[0])
-    alike = len({number for number, _ in numbered}) == len(numbered) > 1
-    if not alike or _are_normal(np.concatenate([s.column.x for _, s in numbered], axis=1)):
-        return []
-    return [(k, s) for k, (_, s) in enumerate(numbered, 1)]
+    found = vehicles_of(poses, driving)
+    if found is None:
+        return seen
+    first, *others = found.names
+    bag.note(
+        f"The bag holds several vehicles, and this is {first}; a topic map of each gives "
+        f"{', '.join(others)}."
+    )
+    return [s for s in seen if found.among(s.topic, first)]
+
+
+def _say_accelerations(measured: Sequence[Seen], bag: Bag) -> None:
+    """Note of an accelerometer that is left out."""
+    for one in measured:
+        part = one.column.form.gives.get("acceleration")
+        if part is not None and one.column.type.endswith("/Imu"):
+            size = np.median(np.linalg.norm(np.nan_to_num(one.column.x[part]), axis=0))
+            if size > 0:
+                bag.note(
+                    f"{one.topic}: its accelerations are of {size:.3g} m/s², without gravity or in "
+                    "another unit, and were left out (an entry with `scale` in a topic map)."
+                )
+
+
+def _outside(measured: Sequence[Seen]) -> Seen | None:
+    """The barometer under the greatest absolute pressure, but that of the hull last."""
+
+    def rank(one: Seen) -> tuple[bool, bool, float]:
+        unit = unit_of(one.column.x[0])
+        greatest = float(np.nanmax(one.column.x)) * (1.0 if unit is None else unit[0])
+        return unit is not None, not one.topic.endswith(FIRST_BAROMETER), greatest
+
+    pressures = [s for s in measured if s.column.type == PRESSURE and s.has("depth")]
+    return max(pressures, key=rank, default=None)
+
+
+def _driving(seen: Sequence[Seen], bag: Bag) -> tuple[dict[Quantity, Seen | None], list[Topic]]:
+    """What drives the vehicle: a topic by its quantity, or a topic of each thruster.
+
+    The most direct one: pulses, forces of thrusters, a wrench; numbers without a name come last.
+    """
+    found = {quantity: _best(seen, quantity) for quantity in COMMANDS}
+    alone, sure, each = singles(seen, bag.topics)
+    last = "forces" if each and sure else "wrench"
+    for quantity in COMMANDS[: COMMANDS.index(last) + 1]:
+        one = found[quantity]
+        if one is not None:
+            if quantity == "forces" and one.column.type.startswith("std_msgs"):
+                bag.note(_IN_NEWTON.format(one.topic))
+            return {quantity: one}, []
+    if each and alone == "forces" and not sure:
+        bag.note(_IN_NEWTON.format(f"{each[0][1].topic} and the like"))
+    return {}, [replace(_topic(s, [alone]), thruster=k) for k, s in each]
 
 
 def _rates(measured: Sequence[Seen], own: Sequence[Seen]) -> Seen | None:
@@ -224,19 +212,32 @@ def _rates(measured: Sequence[Seen], own: Sequence[Seen]) -> Seen | None:
     return gyro if gyro is not None and gyro.rate > _FASTER * mine.rate else mine
 
 
+def _first(some: Sequence[Seen], all_: Sequence[Seen], quantity: Quantity) -> Seen | None:
+    """The best of some, unless there is none or its numbers never change and others' do."""
+    one, other = _best(some, quantity), _best(all_, quantity)
+    if one is None or (other is not None and one.still(quantity) > other.still(quantity)):
+        return other
+    return one
+
+
 def _space(seen: Seen) -> str:
     return seen.topic.strip("/").split("/")[0]
 
 
 def _best(seen: Sequence[Seen], quantity: Quantity) -> Seen | None:
-    """The topic of the preferred type, of a usual name, with the highest rate."""
+    """The topic of the preferred type, of a usual name, with the highest rate.
+
+    Before all, one whose numbers change; of instruments not that of a camera.
+    """
     order = _FIRST.get(quantity, ())
 
-    def rank(one: Seen) -> tuple[int, bool, int]:
+    def rank(one: Seen) -> tuple[bool, bool, int, bool, int]:
         name = one.column.type.rsplit("/", 1)[-1]
         place = next((i for i, start in enumerate(order) if name.startswith(start)), len(order))
         unusual = quantity in ("position", "velocity") and _USUAL.search(one.topic) is None
-        return place, unusual, -round(one.rate)
+        still = quantity in _MOVING and one.still(quantity)
+        camera = quantity in _FRAMED and _CAMERA.search(one.topic) is not None
+        return still, camera, place, unusual, -round(one.rate)
 
     return min((s for s in seen if s.has(quantity)), key=rank, default=None)
 
@@ -251,14 +252,22 @@ def written(bag: Bag, proposed: TopicMap) -> str:
     """A proposal as YAML, with the topics that are not used as comments."""
     used = {one.topic for one in proposed.topics}
     rest = [
-        f"# {topic}: {kind}, {bag.counts[topic]} messages"
-        + (f", may give {', '.join(FORMS[kind].gives)}" if kind in FORMS else ", not read")
+        f"# {topic}: {kind}, {bag.counts[topic]} messages{_use(bag, topic)}"
         for topic, kind in sorted(bag.topics.items())
         if topic not in used
     ]
     head = f"# Topic map of {bag.path.name} (docs/recording.md)\n"
+    head += "".join(f"# {' '.join(sentence.split())}\n" for sentence in bag.notes)
     tail = "# not used:\n" + "\n".join(rest) + "\n" if rest else ""
     return head + emit({"topics": [_told(one) for one in proposed.topics]}) + tail
+
+
+def _use(bag: Bag, topic: str) -> str:
+    """What a topic that gives no quantity may give."""
+    if is_tf(bag.topics[topic]):
+        return ", the mountings"
+    form = bag.forms.get(topic)
+    return ", not read" if form is None else f", may give {', '.join(form.gives)}"
 
 
 def _told(one: Topic) -> dict[str, Any]:
@@ -268,5 +277,10 @@ def _told(one: Topic) -> dict[str, Any]:
         told["frame"] = one.frame
     if {"velocity", "rates"} & set(one.gives):
         told["expressed"] = one.expressed
+    for name in ("xyz", "rpy"):
+        if (value := getattr(one, name)) is not None:
+            told[name] = list(value)
+    told |= {"scale": one.scale} if one.scale != 1.0 else {}
+    told |= {"offset": one.offset} if one.offset else {}
     driven = {"thruster": one.thruster} if one.thruster else {}
     return {**told, "delay": one.delay, **driven}

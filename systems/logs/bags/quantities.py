@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ....models.frames import frd_to_flu, ned_to_enu, twist_frd_to_flu
+from ....models.frames import frd_to_flu, ned_to_enu
 from ....models.recordings.resample import linear, rotations, slerp
 from ..signals import Series, series
 from .bag import Column
 from .clocks import Clock
-from .messages import FORMS, Quantity
+from .messages import Quantity
 from .topics import Topic, TopicMap
 
 _NED = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -29,6 +29,11 @@ class Quantities:
     map: TopicMap
     clock: Clock
     notes: list[str] = field(default_factory=list)
+
+    def note(self, sentence: str) -> None:
+        """Add a sentence for the report, once."""
+        if sentence not in self.notes:
+            self.notes.append(sentence)
 
     def topic(self, quantity: Quantity) -> Topic | None:
         """The topic of a quantity, if its messages are there."""
@@ -60,10 +65,13 @@ class Quantities:
     def _numbers(self, quantity: Quantity, one: Topic) -> tuple[Topic, np.ndarray, np.ndarray]:
         column = self.columns[one.topic]
         t, told = self.clock.times(column)
-        self.notes.extend(note for note in told if note not in self.notes)
-        x = column.x[FORMS[column.type].gives[quantity]]
+        for sentence in told:
+            self.note(sentence)
+        x = column.x[column.form.gives[quantity]]
         if quantity in ("pwm", "forces") and one.channels:
             x = _chosen(x, one.channels, 0.0)
+        if one.squared:
+            x = x * np.abs(x)
         bare = quantity not in ("attitude", "state", "aiding", "parameters")
         return one, t - one.delay, x * one.scale + one.offset if bare else x
 
@@ -73,15 +81,16 @@ class Quantities:
         if found is None:
             return None
         one, t, q = found
-        return series(t, _attitude(q, one), one.topic, "attitude")
+        return series(t, attitude_of(q, one), one.topic, "attitude")
 
-    def position(self) -> Series | None:
+    def position(self, attitude: Series) -> Series | None:
         """p_WB (m)."""
         found = self.taken("position")
         if found is None:
             return None
         one, t, p = found
-        return series(t, ned_to_enu(p) if one.world_down else p, one.topic, "position")
+        p_WS = ned_to_enu(p) if one.world_down else p
+        return series(t, p_WS - _arm(one, t, attitude), one.topic, "position")
 
     def velocity(self, attitude: Series, topic: Topic | None = None) -> Series | None:
         """Velocity of Bo in W (m/s), turned by the message's own attitude if it has one.
@@ -93,28 +102,41 @@ class Quantities:
             return None
         one, t, v = found
         mapped, one = one, one if topic is None else topic
+        R_WB = rotations(self._own_attitude(mapped, t, attitude))
         if one.expressed == "world":
             v_W = ned_to_enu(v) if one.world_down else v
         else:
-            column = self.columns[one.topic]
-            own = FORMS[column.type].gives.get("attitude")
-            q = None if own is None else _attitude(column.x[own], mapped)
-            if q is None or not np.isfinite(q).all():
-                q = slerp(t, attitude.t, attitude.x)
-            v_W = rotations(q).apply((frd_to_flu(v) if one.body_down else v).T).T
+            v_W = R_WB.apply(_in_body(v, one).T).T
+        if one.place.any():
+            rates = self.rates(attitude)
+            w = turning(attitude) if rates is None else rates
+            v_W -= R_WB.apply(np.cross(linear(t, w.t, w.x).T, one.place)).T
         return series(t, v_W, one.topic, "velocity")
 
-    def rates(self, attitude: Series) -> Series | None:
-        """ω of B in W, in B (rad/s); the source begins with IMU if it is a bare gyro."""
+    def _own_attitude(self, one: Topic, t: np.ndarray, attitude: Series) -> np.ndarray:
+        """The attitude of a topic's messages, or that of the vehicle where nobody fills them."""
+        column = self.columns[one.topic]
+        own = column.form.gives.get("attitude")
+        q = None if own is None else attitude_of(column.x[own], one)
+        if q is None or not np.isfinite(q).all() or not np.ptp(q, axis=1).any():
+            return slerp(t, attitude.t, attitude.x)
+        return q
+
+    def rates(self, attitude: Series, topic: Topic | None = None) -> Series | None:
+        """ω of B in W, in B (rad/s); the source begins with IMU if it is a bare gyro.
+
+        `topic` has other axes than the map's.
+        """
         found = self.taken("rates")
         if found is None:
             return None
         one, t, w = found
+        one = one if topic is None else topic
         if one.expressed == "world":
             w_W = ned_to_enu(w) if one.world_down else w
             w = rotations(slerp(t, attitude.t, attitude.x)).inv().apply(w_W.T).T
-        elif one.body_down:
-            w = frd_to_flu(w)
+        else:
+            w = _in_body(w, one)
         gyro = self.columns[one.topic].type.endswith("/Imu") and "attitude" not in one.gives
         return series(t, w, f"IMU {one.topic}" if gyro else one.topic, "rate")
 
@@ -124,7 +146,7 @@ class Quantities:
         if found is None:
             return None
         one, t, a = found
-        return series(t, frd_to_flu(a) if one.body_down else a, one.topic, "specific force")
+        return series(t, _in_body(a, one), one.topic, "specific force")
 
     def wrench(self) -> Series | None:
         """F_Bo_B (N, N·m), as commanded."""
@@ -132,15 +154,26 @@ class Quantities:
         if found is None or found[2].shape[0] != 6:
             return None
         one, t, F = found
-        return series(t, twist_frd_to_flu(F) if one.body_down else F, one.topic, "force")
+        f, torque = _in_body(F[:3], one), _in_body(F[3:], one)
+        torque = torque + np.cross(one.place, f, axisb=0).T
+        return series(t, np.concatenate([f, torque]), one.topic, "force")
 
-    def scalar(self, quantity: Quantity, limits: str, sign: float = 1.0) -> Series | None:
-        """A single number over time."""
-        found = self.taken(quantity)
+    def depth(self, attitude: Series, scale: float = 1.0, offset: float = 0.0) -> Series | None:
+        """Depth of Bo (m, positive down): scale × (number + offset), less that of the sensor."""
+        found = self.taken("depth")
         if found is None:
             return None
         one, t, x = found
-        return series(t, sign * x[0], one.topic, limits)
+        down = scale * (x[0] + offset) + _arm(one, t, attitude)[2]
+        return series(t, down, one.topic, "depth")
+
+    def height(self) -> Series | None:
+        """Z of Bo (m, up)."""
+        found = self.taken("height")
+        if found is None:
+            return None
+        one, t, x = found
+        return series(t, -x[0] if one.world_down else x[0], one.topic, "position")
 
 
 def _in_order(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -154,13 +187,26 @@ def _chosen(x: np.ndarray, channels: tuple[int, ...], absent: float) -> np.ndarr
     return np.stack(there)
 
 
-def _attitude(q: Float[np.ndarray, "4 n"], topic: Topic) -> Float[np.ndarray, "4 n"]:
+def _in_body(v: Float[np.ndarray, "3 n"], topic: Topic) -> Float[np.ndarray, "3 n"]:
+    """A vector in B from one in the topic's axes, by their names and its mounting."""
+    flu = frd_to_flu(v) if topic.body_down else v
+    return flu if topic.rpy is None else topic.turn.apply(flu.T).T
+
+
+def _arm(topic: Topic, t: np.ndarray, attitude: Series) -> np.ndarray:
+    """p_BoS_W (m) of the topic's sensor at some times."""
+    if not topic.place.any():
+        return np.zeros((3, t.size))
+    return rotations(slerp(t, attitude.t, attitude.x)).apply(topic.place).T
+
+
+def attitude_of(q: Float[np.ndarray, "4 n"], topic: Topic) -> Float[np.ndarray, "4 n"]:
     """q_WB from a quaternion between the topic's axes; NaN where it is none."""
     norm = np.linalg.norm(q, axis=0)
     known = np.isfinite(norm) & (np.abs(norm - 1) < 0.1)
     R = rotations(np.where(known, q, np.array([[1.0], [0.0], [0.0], [0.0]])))
     R = (_NED if topic.world_down else Rotation.identity()) * R
-    R = R * (_FRD if topic.body_down else Rotation.identity())
+    R = R * (_FRD if topic.body_down else Rotation.identity()) * topic.turn.inv()
     return np.where(known, R.as_quat(scalar_first=True).T, np.nan)
 
 

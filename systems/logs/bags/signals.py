@@ -9,10 +9,8 @@ import numpy as np
 from ....models.config.errors import UserError
 from ....models.recordings.checks.finding import Finding
 from ....models.vehicles.vehicle import load_vehicle
-from ...mavlink import codec
 from ..depth import in_water
 from ..log_bytes import Progress, no_progress
-from ..pressure import Followed, followed
 from ..signals import (
     Parameter,
     Series,
@@ -28,11 +26,15 @@ from ..wiring import PRESETS, Wiring, direction_findings, thruster_outputs, wiri
 from .axes import axes_findings, velocity_axes
 from .bag import Bag, Column, open_bag
 from .clocks import Clock
-from .messages import COMMANDS, PRESSURE, SAMPLED, Quantity
-from .propose import FIRST_BAROMETER, listed, propose
+from .depths import checked, depth, may_be_the_hulls
+from .messages import COMMANDS, SAMPLED, Quantity
+from .mounting import mounted, read_mounts
+from .propose import listed, propose
 from .quantities import Quantities, derivative, turning
 from .topics import Topic, TopicMap, beside, load_map
 
+_TURNED, _MOVED_M = 0.2, 0.1
+"""rad and m of a motion that a field shows if anybody fills it."""
 _HOW = "name one in a topic map (`spinndrift import BAG --topics`)"
 
 
@@ -57,6 +59,9 @@ def read_bag(
         try:
             used = propose(bag) if given is None else given
             columns = bag.read([one.topic for one in used.topics], progress)
+            if given is not None:
+                used, mounts = mounted(used, columns, read_mounts(bag))
+                told += mounts
             found = _signals(bag, used, columns, vehicle, density, given is None)
         except UserError as error:
             raise UserError(f"{path}: {error}") from error
@@ -87,21 +92,23 @@ def _signals(
     outputs, command, wired, wire_notes, frame = _outputs(
         bag, taken, parameters, (first, last), vehicle
     )
+    place = _place(taken, attitude)
     if proposed:
-        taken = _by_motion(taken, attitude)
+        taken = _by_motion(taken, attitude, place)
     position, velocity, motion_notes = _motion(taken, attitude, proposed)
     rates = taken.rates(attitude)
     if rates is None:
         rates = turning(attitude)
         motion_notes.append(f"{attitude.source}: body rates are differences of the attitude.")
+    _check_turning(attitude, rates)
     rates, force, delays = _undelayed(taken, rates, known)
     if _same(taken.topic("parameters"), taken.topic("position")):
         position, velocity = in_water(position, velocity, known, density)
-    depth = _followed(taken, _pressure_depth(taken, known, density), position, proposed)
+    below, reversed_ = checked(taken, depth(taken, attitude, known, density), position, proposed)
     spans = {"wiring": wired.spans, **_states(taken), **_aiding(taken, velocity)}
     voltage = _voltage(taken)
     batteries = [one.topic for one in (taken.topic("voltage"),) if one is not None]
-    findings = frame + axes_findings(taken, attitude, taken.position(), force)
+    findings = [*frame, *axes_findings(taken, attitude, place, force), *reversed_]
     findings += [*missing_states(spans, voltage, batteries, "mavros_msgs/State"), *_broken(columns)]
     return Signals(
         attitude=attitude,
@@ -113,11 +120,11 @@ def _signals(
         position=position,
         velocity=velocity,
         specific_force=force,
-        pressure_depth=depth.depth,
+        pressure_depth=below.depth,
         voltage=voltage,
         rc=_rc(taken),
         spans=spans,
-        notes=(*taken.notes, *strange, *wire_notes, *motion_notes, *delays, *depth.told),
+        notes=(*taken.notes, *strange, *wire_notes, *motion_notes, *delays, *below.told),
         findings=(*findings, *direction_findings(wired)),
         turned=wired.turned,
     )
@@ -137,17 +144,50 @@ def _undelayed(
     return rates, force, delays
 
 
-def _by_motion(taken: Quantities, attitude: Series) -> Quantities:
+def _place(taken: Quantities, attitude: Series) -> Series | None:
+    """Position in W, or the height alone: what velocities are compared with."""
+    place = taken.position(attitude)
+    if place is not None:
+        return place
+    height = taken.height() or _height_by_depth(taken, attitude)
+    if height is None:
+        return None
+    unknown = np.full((2, height.t.size), np.nan)
+    return replace(height, x=np.concatenate([unknown, height.x[None]]))
+
+
+def _height_by_depth(taken: Quantities, attitude: Series) -> Series | None:
+    below = None if may_be_the_hulls(taken) else depth(taken, attitude, {}, None)
+    return None if below is None else replace(below, x=-below.x)
+
+
+def _check_turning(attitude: Series, rates: Series) -> None:
+    """Refuse a quaternion that nobody fills."""
+    turned = np.abs(np.cumsum(rates.x[:, 1:] * np.diff(rates.t), axis=1))
+    if not np.ptp(attitude.x, axis=1).any() and turned.max(initial=0.0) > _TURNED:
+        raise UserError(
+            f"{attitude.source}: its quaternion never changes, while {rates.source} turns; take "
+            "the attitude from another topic (`--topics`)"
+        )
+
+
+def _by_motion(taken: Quantities, attitude: Series, place: Series | None) -> Quantities:
     """The quantities, with a twist in the world's axes if only that fits the positions.
 
-    Some simulators publish so, against nav_msgs/Odometry. Other contradictions are findings.
+    Some simulators publish so, against nav_msgs/Odometry. An instrument's velocity may have z down
+    too: its own axes are seldom said. Other contradictions are findings.
     """
-    found, given = velocity_axes(taken, attitude, taken.position()), taken.topic("velocity")
-    if found is None or given is None or found[0].frame != given.frame:
+    found, given = velocity_axes(taken, attitude, place), taken.topic("velocity")
+    if found is None or given is None:
         return taken
     one = found[0]
-    taken.notes.append(
+    instrument = "attitude" not in taken.columns[one.topic].form.gives
+    if one.frame != given.frame and not (instrument and one.expressed == given.expressed):
+        return taken
+    taken.note(
         f"{one.topic}: its twist is expressed in the {one.expressed}, as the positions tell."
+        if one.frame == given.frame
+        else f"{one.topic}: its velocities are taken in {one.frame}, as the positions tell."
     )
     others = [one if t.topic == one.topic else t for t in taken.map.topics]
     return replace(taken, map=TopicMap(tuple(others)))
@@ -182,7 +222,7 @@ def _outputs(
         raise UserError(
             f"no topic tells what the thrusters did ({listed(bag)}); record mavros_msgs/RCOut or "
             f"the commands of the thrusters, or {_HOW}; numbers within ±1 need `scale` and "
-            "`offset` there"
+            "`offset` there, speeds of rotors `scale` and `squared`"
         )
     one, t, x = found
     if quantity == "wrench":
@@ -201,7 +241,7 @@ def _outputs(
         return _there(series(t, x, one.topic, "thrust"), one), "thruster_force", wired, [], []
     bare = taken.columns[one.topic].type.startswith("std_msgs")
     named = vehicle
-    counted = bare or bool(one.channels)
+    counted = bare or bool(one.channels) or one.thruster > 0
     if vehicle is None and counted and not any(p.name == "FRAME_CONFIG" for p in parameters):
         named = _by_count(one, x.shape[0])
     channels = np.zeros((32, t.size))
@@ -245,18 +285,25 @@ def _motion(
     taken: Quantities, attitude: Series, proposed: bool
 ) -> tuple[Series | None, Series | None, list[str]]:
     """Position and velocity in W; what one of them lacks is derived from the other topics."""
-    position, velocity = taken.position(), taken.velocity(attitude)
+    position, velocity = taken.position(attitude), taken.velocity(attitude)
+    told = []
+    if position is not None and velocity is not None:
+        if _moves(velocity) and not np.ptp(position.x, axis=1).any():
+            told = [f"{position.source}: its position never changes, and was left out."]
+            position = None
+        elif not velocity.x.any() and np.ptp(position.x, axis=1).max() > _MOVED_M:
+            velocity = None
     if position is not None and velocity is not None:
         return position, velocity, []
     if position is not None:
         said = f"{position.source}: velocities are differences of the positions."
         return position, derivative(position), [said]
-    z = taken.scalar("height", "position")
-    if z is None and not (proposed and _may_be_the_hulls(taken)):
-        depth = _pressure_depth(taken, {}, None)
-        z = None if depth is None else replace(depth, x=-depth.x)
+    z = taken.height()
+    if z is None and not (proposed and may_be_the_hulls(taken)):
+        below = depth(taken, attitude, {}, None)
+        z = None if below is None else replace(below, x=-below.x)
     if velocity is not None:
-        told = [] if z is None else [f"{velocity.source}: the height is that of {z.source}."]
+        told += [] if z is None else [f"{velocity.source}: the height is that of {z.source}."]
         height = np.full(velocity.t.size, np.nan) if z is None else _within(velocity.t, z)
         lacking = np.full(velocity.t.size, np.nan)
         p = np.stack([lacking, lacking, height])
@@ -271,6 +318,11 @@ def _motion(
         replace(climb, x=v),
         [f"{z.source}: climb is the difference of heights."],
     )
+
+
+def _moves(velocity: Series) -> bool:
+    way = np.cumsum(np.nan_to_num(velocity.x[:, 1:]) * np.diff(velocity.t), axis=1)
+    return float(np.abs(way).max(initial=0.0)) > _MOVED_M
 
 
 def _within(t: np.ndarray, one: Series) -> np.ndarray:
@@ -300,47 +352,6 @@ def _aiding(taken: Quantities, velocity: Series | None) -> dict[str, Spans]:
     order = np.argsort(t, kind="stable")
     labels = ["" if aided[0, i] else UNAIDED for i in order]
     return {"aiding": sampled_spans(t[order], labels)}
-
-
-def _pressure_depth(
-    taken: Quantities, known: Mapping[str, float], density: float | None
-) -> Series | None:
-    topic = taken.topic("depth")
-    found = taken.taken("depth")
-    if topic is None or found is None:
-        return None
-    if taken.columns[topic.topic].type != PRESSURE:
-        return taken.scalar("depth", "depth")
-    _, t, pascal = found
-    hPa = pascal[0] / 100.0
-    if np.nanmedian(hPa) < 500:  # not absolute
-        return None
-    names = ("BARO2_GND_PRESS", "BARO1_GND_PRESS")
-    surface = next((known[n] / 100.0 for n in names if known.get(n)), 0.0)
-    surface = surface if 800 < surface < 1200 else codec.SURFACE_PRESSURE_HPA
-    gradient = codec.pascal_per_metre(known.get("BARO_SPEC_GRAV", 1.0), density)
-    depth = codec.depth_from_pressure(hPa, surface, gradient)
-    return series(t, depth, topic.topic, "depth")
-
-
-def _may_be_the_hulls(taken: Quantities) -> bool:
-    """Whether the depth is of mavros' SCALED_PRESSURE, the autopilot's first barometer."""
-    topic = taken.topic("depth")
-    return topic is not None and topic.topic.endswith(FIRST_BAROMETER)
-
-
-def _followed(
-    taken: Quantities, depth: Series | None, position: Series | None, proposed: bool
-) -> Followed:
-    """The depth, unless it does not follow the height, or nothing tells that it is the water's."""
-    found = followed(depth, position)
-    if found.depth is None or found.sure or not (proposed and _may_be_the_hulls(taken)):
-        return found
-    said = (
-        f"{found.depth.source} may be of the barometer in the hull, and no height tells: it was "
-        "left out; name it in a topic map (`--topics`) if it is the water's."
-    )
-    return Followed(None, (said,))
 
 
 def _voltage(taken: Quantities) -> Series | None:

@@ -5,17 +5,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
 from ....models.config import typed_yaml
-from ....models.config.checks import require
+from ....models.config.checks import Vector3, require
 from ....models.config.errors import UserError
 from .bag import Bag
-from .messages import COMMANDS, FORMS, Quantity
+from .foreign import NAVIGATION, points_down
+from .messages import COMMANDS, Quantity
 
 SUFFIX = ".topics.yaml"
 """A map beside its bag, `dive.topics.yaml` of `dive.bag`, is used without being named."""
 Frames = Literal["ENU/FLU", "NED/FRD", "ENU/FRD", "NED/FLU"]
-_DOWN = re.compile(r"(^|[_/])(ned|frd)$")
-_WORLD = re.compile(r"(^|[_/])(map|odom|world|earth|local|local_origin|enu)(_ned|_enu)?$|^/?ned$")
+_DOWN = re.compile(r"(^|[_/])(ned|frd)$", re.I)
+_WORLD = re.compile(
+    r"(^|[_/])(map|odom|world|earth|local|local_origin|enu)(_ned|_enu)?$|^/?ned$", re.I
+)
 _FRAMES: dict[tuple[bool, bool], Frames] = {
     (False, False): "ENU/FLU",
     (False, True): "ENU/FRD",
@@ -23,7 +30,9 @@ _FRAMES: dict[tuple[bool, bool], Frames] = {
     (True, True): "NED/FRD",
 }
 """By whether z of world and body is down."""
-_LARGEST_DELAY_S = 10.0
+FARTHEST_M = 100.0
+"""Largest distance of a sensor from Bo."""
+_LARGEST_DELAY_S, _LARGEST_TURN = 10.0, 6.3
 
 
 @dataclass(frozen=True)
@@ -39,6 +48,10 @@ class Topic:
         delay: s by which its stamps are later than what it tells.
         scale: factor of its numbers, for units other than SI or PWM from −1 to 1.
         offset: added to its scaled numbers.
+        squared: its numbers n are speeds of a rotor, and n |n| is scaled.
+        xyz: place (m) of the sensor in the body, as `<origin xyz rpy>` of a URDF's joint; None
+            takes that of the bag's tf.
+        rpy: roll, pitch, yaw (rad) of the sensor's axes in the body's; both after REP 103.
         channels: number of the element, from 1, that drives each thruster; 0 for none.
         directions: 1 or −1 of each thruster, as MOT_n_DIRECTION.
         thruster: of a topic with a single number, the thruster (from 1) that it drives.
@@ -52,6 +65,9 @@ class Topic:
     delay: float = 0.0
     scale: float = 1.0
     offset: float = 0.0
+    squared: bool = False
+    xyz: Vector3 | None = None
+    rpy: Vector3 | None = None
     channels: tuple[int, ...] = ()
     directions: tuple[int, ...] = ()
     thruster: int = 0
@@ -60,6 +76,10 @@ class Topic:
         late = abs(self.delay) <= _LARGEST_DELAY_S
         require(late, self, "delay", f"give seconds, at most {_LARGEST_DELAY_S:g}")
         require(self.scale != 0, self, "scale", "give a number other than 0")
+        near = self.xyz is None or max(map(abs, self.xyz)) <= FARTHEST_M
+        require(near, self, "xyz", f"give m in the body, at most {FARTHEST_M:g}")
+        turn = self.rpy is None or max(map(abs, self.rpy)) <= _LARGEST_TURN
+        require(turn, self, "rpy", "give roll, pitch, yaw in rad")
         require(0 <= self.thruster <= 32, self, "thruster", "give a number from 1 to 32")
         require(len(self.gives) > 0, self, "gives", "name what the topic tells, or leave it out")
         channels = all(0 <= c <= 32 for c in self.channels)
@@ -77,6 +97,16 @@ class Topic:
     def body_down(self) -> bool:
         """Whether the body's axes are forward, right, down."""
         return self.frame.endswith("FRD")
+
+    @property
+    def turn(self) -> Rotation:
+        """R_BS, from the sensor's axes to the body's; the identity if it is not known."""
+        return Rotation.from_euler("xyz", self.rpy or (0.0, 0.0, 0.0))
+
+    @property
+    def place(self) -> Float[np.ndarray, "3"]:
+        """p_BoS_B (m); zero if it is not known."""
+        return np.array(self.xyz or (0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -116,15 +146,16 @@ def load_map(path: Path, bag: Bag) -> TopicMap:
         type_ = bag.topics[one.topic]
         if one.type not in ("", type_):
             raise UserError(f"{path}: {one.topic} is of type {type_}, not {one.type}; correct it")
-        if type_ not in FORMS:
+        form = bag.forms.get(one.topic)
+        if form is None:
             raise UserError(
                 f"{path}: {one.topic} is of type {type_}, which is not read; leave it out"
             )
         for quantity in one.gives:
-            if quantity not in FORMS[type_].gives:
+            if quantity not in form.gives:
                 raise UserError(
                     f"{path}: {one.topic} ({type_}) gives no {quantity}; "
-                    f"it may give {', '.join(FORMS[type_].gives)}"
+                    f"it may give {', '.join(form.gives)}"
                 )
         if not bag.counts[one.topic]:
             raise UserError(f"{path}: {one.topic} has no message in {bag.path}; leave it out")
@@ -145,10 +176,26 @@ def frames_of(type_: str, frame: str, child: str) -> tuple[Frames, Literal["body
     end in _ned or _frd have z down, all others are ENU and FLU. A twist whose frame is a world
     (map, odom) is expressed there.
     """
-    down = bool(_DOWN.search(frame))
+    down = is_down(frame)
     if type_.startswith(("nav_msgs/msg/Odometry", "geometry_msgs/msg/Pose")):
-        body_down = bool(_DOWN.search(child)) if child else down
+        body_down = is_down(child) if child else down
         return _FRAMES[down, body_down], "body"
+    if type_.endswith(NAVIGATION):
+        return "NED/FRD", "body"
     frames: Frames = "NED/FRD" if down else "ENU/FLU"
-    in_world = type_.startswith("geometry_msgs/msg/Twist") and bool(_WORLD.search(frame))
-    return frames, "world" if in_world else "body"
+    if type_.startswith("geometry_msgs/msg/Point"):
+        return frames, "body"
+    if points_down(type_):
+        frames = "ENU/FRD"
+    moving = type_.startswith(("geometry_msgs/msg/Twist", "geometry_msgs/msg/Vector3"))
+    return frames, "world" if moving and is_world(frame) else "body"
+
+
+def is_down(frame: str) -> bool:
+    """Whether a frame's name says that its z is down."""
+    return _DOWN.search(frame) is not None
+
+
+def is_world(frame: str) -> bool:
+    """Whether a frame's name is that of a world, after REP 105."""
+    return _WORLD.search(frame) is not None

@@ -5,6 +5,7 @@ import queue
 import threading
 import time
 from contextlib import suppress
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -85,13 +86,21 @@ class PlanningThread:
             self.error = error
 
 
+def with_free_core(planner: MppiPlanner) -> MppiPlanner:
+    """The planner with at most as many threads as leave a core to the loop."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    threads = min(planner.config.threads, max((cores or 1) - 1, 1))
+    return replace(planner, config=replace(planner.config, threads=threads))
+
+
 class MppiBeside(LeafSystem):
     """`systems.planning.mppi.Mppi` whose calls run in a thread: an event never waits for a plan.
 
     Every `planner.config.period` a state is given to the thread, and every `period` the newest
     plan, if there is one, becomes the output. It holds the time of the state that it started from,
     at which the tracking controller reads it: the age of a plan is compensated by its own
-    prediction. For a loop in real time only, as what comes when depends on the machine.
+    prediction. A core is left to the loop. For a loop in real time only, as what comes when depends
+    on the machine.
 
     .. pydrake_system::
 
@@ -111,6 +120,7 @@ class MppiBeside(LeafSystem):
     def __init__(self, planner: MppiPlanner, period: float = 0.02):
         """Look for a new plan every `period` (s)."""
         super().__init__()
+        planner = with_free_core(planner)
         self._mppi = mppi = Mppi(planner)
         self.planner, self.layout, self.samples = planner, mppi.layout, mppi.samples
         self._ports = [self.DeclareVectorInputPort(n, k) for n, k in (("X_WB", 7), ("V_WB_B", 6))]

@@ -24,7 +24,7 @@ from ...models.spinn import Spinn
 from ...models.vehicles.vehicle import load_vehicle
 from ..estimation.disturbance_observer import DisturbanceObserver, MomentumObserver
 from ..own import OwnSystem, check_ports, port_sizes
-from ..planning.beside import MppiBeside
+from ..planning.beside import MppiBeside, with_free_core
 from ..planning.mppi import Mppi
 from ..planning.mppi_config import MppiConfig
 from ..planning.mppi_core import MppiPlanner
@@ -246,7 +246,8 @@ class MppiImpedance(Controller):
         return Mppi(planner)
 
     def beside_the_loop(self) -> "MppiImpedance":
-        return _MppiBesideImpedance(**{f.name: getattr(self, f.name) for f in fields(self)})
+        given: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        return _MppiBesideImpedance(**given | {"planner": with_free_core(self.planner)})
 
 
 class _MppiBesideImpedance(MppiImpedance):

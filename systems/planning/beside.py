@@ -15,6 +15,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from ..drake import set_groups, value, value_or_zeros
 from .mppi import FIGURES, Mppi
+from .mppi_config import MppiConfig
 from .mppi_core import MppiPlanner
 
 _NICE = 10  # of the planning thread: the loop's thread goes first
@@ -86,11 +87,10 @@ class PlanningThread:
             self.error = error
 
 
-def with_free_core(planner: MppiPlanner) -> MppiPlanner:
-    """The planner with at most as many threads as leave a core to the loop."""
+def with_free_core(config: MppiConfig) -> MppiConfig:
+    """The settings with at most as many threads as leave a core to the loop."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    threads = min(planner.config.threads, max((cores or 1) - 1, 1))
-    return replace(planner, config=replace(planner.config, threads=threads))
+    return replace(config, threads=min(config.threads, max((cores or 1) - 1, 1)))
 
 
 class MppiBeside(LeafSystem):
@@ -99,8 +99,7 @@ class MppiBeside(LeafSystem):
     Every `planner.config.period` a state is given to the thread, and every `period` the newest
     plan, if there is one, becomes the output. It holds the time of the state that it started from,
     at which the tracking controller reads it: the age of a plan is compensated by its own
-    prediction. A core is left to the loop. For a loop in real time only, as what comes when depends
-    on the machine.
+    prediction. For a loop in real time only, as what comes when depends on the machine.
 
     .. pydrake_system::
 
@@ -120,7 +119,6 @@ class MppiBeside(LeafSystem):
     def __init__(self, planner: MppiPlanner, period: float = 0.02):
         """Look for a new plan every `period` (s)."""
         super().__init__()
-        planner = with_free_core(planner)
         self._mppi = mppi = Mppi(planner)
         self.planner, self.layout, self.samples = planner, mppi.layout, mppi.samples
         self._ports = [self.DeclareVectorInputPort(n, k) for n, k in (("X_WB", 7), ("V_WB_B", 6))]

@@ -247,7 +247,8 @@ class MppiImpedance(Controller):
 
     def beside_the_loop(self) -> "MppiImpedance":
         given: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        return _MppiBesideImpedance(**given | {"planner": with_free_core(self.planner)})
+        given["planner"] = with_free_core(self.planner)
+        return _MppiBesideImpedance(**given)
 
 
 class _MppiBesideImpedance(MppiImpedance):

@@ -45,7 +45,12 @@ def spread_of(zones: Sequence[DeadZone], run: int, length: int) -> Float[np.ndar
 
 
 def known_errors(spread: Float[np.ndarray, "M 6 R"]) -> Float[np.ndarray, "N 12 R"]:
-    """1 for one-step errors (pose, twist) on axes whose velocity was measured before and after."""
-    there = (spread == 0).astype(float)
-    twist = there[1:] * there[:-1]
-    return np.concatenate([twist, twist], axis=1)
+    """1 for one-step errors (pose, twist) without a lost velocity in them, else 0.
+
+    Those along an axis need its velocity before and after the step, those of rates all velocities
+    before it: moments are products of them (Munk's).
+    """
+    there = (spread[:, :3] == 0).astype(float)
+    along = there[1:] * there[:-1]
+    turning = np.repeat(there[:-1].min(axis=1, keepdims=True), 3, axis=1)
+    return np.concatenate([along, np.ones_like(along), along, turning], axis=1)

@@ -8,6 +8,7 @@ import scipy.linalg
 from jaxtyping import Float, Int
 
 from ..data.arrays import all_equal
+from ..data.lost import known_errors
 from .noise import Noise, process_covariance
 from .transition import Latent, Transition
 
@@ -230,9 +231,14 @@ def score_of(
     latent: Latent | None = None,
     spread: Float[np.ndarray, "M 6 R"] | None = None,
 ) -> Float[np.ndarray, " R"]:
-    """Log density of the innovations by piece (nats)."""
+    """Log density of the innovations by piece (nats), of those without a lost velocity in them."""
     kalman = make_filter(noise, transition, mass_inverse, dt, step, jacobian, latent, spread)
-    return log_density(filtered(error, jacobian, kalman, latent), kalman, weight)
+    z = filtered(error, jacobian, kalman, latent)
+    if spread is None:
+        return log_density(z, kalman, weight)
+    known = known_errors(spread)
+    of_lost = (np.log(np.einsum("niir->nir", kalman.whiten)) * (1 - known)).sum(axis=1)
+    return log_density(z * known, replace(kalman, log_det=kalman.log_det + of_lost), weight)
 
 
 def log_density(

@@ -11,7 +11,7 @@ Slow disturbances add Σ_j σ_j² φ_j^|n - m| g_j g_jᵀ, with g_j the error th
 linear in their variances too. Longer blocks thus separate a white level from coloured noise.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -177,20 +177,31 @@ def fit_with_slow_noise(
     return np.exp(x[12:18] / 2), lost
 
 
-def without_lost(
-    weight: Float[np.ndarray, "N R"], known: Float[np.ndarray, "N 12 R"]
-) -> tuple[Float[np.ndarray, "N R"], Bool[np.ndarray, "6"]]:
-    """Weight of the steps without lost velocities, and axes set apart because too many are lost.
+def likely_beside_lost(
+    error: Float[np.ndarray, "N 12 R"],
+    weight: Float[np.ndarray, "N R"],
+    known: Float[np.ndarray, "N 12 R"],
+    *given: Any,
+) -> tuple[Float[np.ndarray, "18"], Float[np.ndarray, "6"]]:
+    """`most_likely` of errors of which not all are known, with its further arguments.
 
-    Axes are set apart, the one with the fewest known errors first, until there are enough blocks.
+    Axes with the fewest known errors are set apart until the others have enough blocks without a
+    lost velocity. Each of those is then fitted alone, to its own blocks.
     """
-    apart = np.zeros(6, bool)
-    share = (known[:, 6:] * weight[:, None]).sum(axis=(0, 2))
-    while True:
-        clean = weight * known[:, 6:][:, ~apart].min(axis=1, initial=1.0)
-        if len(_blocks(known, clean, _BLOCK)) >= _ENOUGH_BLOCKS or np.all(known[:, 6:][:, ~apart]):
-            return clean, apart
-        apart[int(np.argmin(np.where(apart, np.inf, share)))] = True
+    there, apart = known[:, 6:], np.zeros(6, bool)
+    share = (there * weight[:, None]).sum(axis=(0, 2))
+    clean = weight * there.min(axis=1)
+    for i in np.argsort(share)[:-1]:
+        if len(_blocks(error, clean, _BLOCK)) >= _ENOUGH_BLOCKS:
+            break
+        apart[i] = True
+        clean = weight * there[:, ~apart].min(axis=1)
+    found, errors = (a.copy() for a in most_likely(error, clean, *given, apart))
+    for i in np.flatnonzero(apart):
+        alone = np.arange(6) != i
+        own, its = most_likely(error, weight * there[:, i], *given, alone)
+        found[[6 + i, 12 + i]], errors[i] = own[[6 + i, 12 + i]], its[i]
+    return found, errors
 
 
 def _blocks(error: np.ndarray, weight: np.ndarray, length: int) -> Float[np.ndarray, "K n 12"]:

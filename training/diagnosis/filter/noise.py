@@ -17,7 +17,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Bool, Float
 
-from .likely_noise import most_likely, without_lost
+from .likely_noise import likely_beside_lost, most_likely
 from .transition import Transition
 
 FLOOR = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4] * 3 + [1e-5] * 3)
@@ -170,8 +170,11 @@ def estimate(
     start, fixed = np.maximum(start, bounds), np.zeros(6, bool)
     for i, b in held.items():
         start[12 + i], fixed[i] = b**2, True
-    there, apart = (weight, np.zeros(6, bool)) if known is None else without_lost(weight, known)
-    found, errors = most_likely(error, there, transition, units, start, bounds, fixed, apart)
+    given = transition, units, start, bounds, fixed
+    if known is None:
+        found, errors = most_likely(error, weight, *given)
+    else:
+        found, errors = likely_beside_lost(error, weight, known, *given)
     b = np.sqrt(found[12:])
     record = np.maximum(np.sqrt(found[:12]), FLOOR)
     slip = slip_of(error if known is None else error * known, weight, dt)

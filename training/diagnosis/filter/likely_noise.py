@@ -196,10 +196,10 @@ def likely_beside_lost(
             break
         apart[i] = True
         clean = weight * there[:, ~apart].min(axis=1)
-    found, errors = (a.copy() for a in most_likely(error, clean, *given, apart))
+    found, errors = (a.copy() for a in most_likely(error, clean, *given, apart=apart))
     for i in np.flatnonzero(apart):
         alone = np.arange(6) != i
-        own, its = most_likely(error, weight * there[:, i], *given, alone)
+        own, its = most_likely(error, weight * there[:, i], *given, apart=alone)
         found[[6 + i, 12 + i]], errors[i] = own[[6 + i, 12 + i]], its[i]
     return found, errors
 

@@ -99,6 +99,6 @@ class DvlDeadZone(MeasurementEffect):
         if inverse:
             return V_WB_B
         w, v = self.column(V_WB_B), V_WB_B[:3]
-        speed = jnp.sqrt(jnp.sum(v * v, axis=0, keepdims=True))
-        shown = jnp.where((jnp.abs(v) < w[1:]) | (speed < w[:1]), 0.0, v)
+        square = jnp.sum(v * v, axis=0, keepdims=True)
+        shown = jnp.where((jnp.abs(v) < w[1:]) | (square < w[:1] ** 2), 0.0, v)
         return jnp.concatenate([shown, jnp.broadcast_to(V_WB_B[3:], shown.shape)])

@@ -143,7 +143,10 @@ def test_the_effect_shows_what_the_instrument_shows():
     np.testing.assert_array_equal(read(cls.neutral()), v)
 
 
-@pytest.mark.parametrize(("loop", "columns"), [("open", ("u",)), ("closed", UVW)])
+@pytest.mark.parametrize(
+    ("loop", "columns"),
+    [pytest.param("open", ("u",), marks=pytest.mark.slow), ("closed", UVW)],
+)
 def test_innovations_without_the_lost_samples_are_those_of_a_null(tmp_path, loop, columns):
     """Unit variances, no impacts; and the belief's noise levels come out as on whole data."""
     runs = [small_speeds(r, columns, 0.06) for r in logged(loop)]

@@ -1,4 +1,4 @@
-"""Errors of the DVL's mounting and scale."""
+"""Errors of the DVL: its mounting, its scale, and small speeds that it loses."""
 
 from typing import ClassVar
 
@@ -75,3 +75,30 @@ class DvlScale(MeasurementEffect):
     ) -> Float[Array, "6 *#batch"]:
         factor = self._factor(V_WB_B)
         return V_WB_B / factor if inverse else V_WB_B * factor
+
+
+class DvlDeadZone(MeasurementEffect):
+    """v_recorded = v where |v| ≥ w, else 0: a speed below w is lost.
+
+    At an axis the component decides, at `all` the norm of the three. The records themselves show
+    which samples are lost, and where speeds begin: the width is read off, and not fitted. Of a lost
+    sample nothing is known but the width, so `unmeasure` leaves it at zero.
+    """
+
+    name: ClassVar[str] = "dvl_dead_zone"
+    parameters: ClassVar = (Parameter("width", "m/s", (0.02,), 0.0, 1.0),)
+    places: ClassVar = ("all", *AXES[:3])
+    order: ClassVar[int] = 50
+    needs: ClassVar = frozenset({"velocity"})
+    observed: ClassVar[bool] = True
+    source: ClassVar[str] = "thresholds of receivers and drivers, 1 to 10 cm/s"
+
+    def twist(
+        self, V_WB_B: Float[Array, "6 *#batch"], inverse: bool = False
+    ) -> Float[Array, "6 *#batch"]:
+        if inverse:
+            return V_WB_B
+        w, v = self.column(V_WB_B), V_WB_B[:3]
+        square = jnp.sum(v * v, axis=0, keepdims=True)
+        shown = jnp.where((jnp.abs(v) < w[1:]) | (square < w[:1] ** 2), 0.0, v)
+        return jnp.concatenate([shown, jnp.broadcast_to(V_WB_B[3:], shown.shape)])

@@ -15,7 +15,7 @@ from .attitude import ClockOffset, GyroBias, HeadingError
 from .base import Effect, Parameter
 from .delay import ActuationDelay
 from .drag import CubicDrag, DragAsymmetry, DragCoupling, LinearDrag, QuadraticDrag
-from .dvl import DvlLeverArm, DvlMisalignment, DvlScale
+from .dvl import DvlDeadZone, DvlLeverArm, DvlMisalignment, DvlScale
 from .inflow import InflowThrustLoss
 from .lag import ThrusterLag
 from .lift import Lift
@@ -77,6 +77,7 @@ _EVERY: tuple[type[Effect], ...] = (
     DvlLeverArm,
     DvlMisalignment,
     DvlScale,
+    DvlDeadZone,
     GyroBias,
     ClockOffset,
     HeadingError,

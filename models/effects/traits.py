@@ -38,6 +38,7 @@ class Traits:
         absorber: whether it fits slow structure of any origin, and is therefore ranked last.
         random: whether it is drawn anew for each run: a law of the disturbance, no constant cause.
         slow: whether it is random and correlated over many samples, so that causes imitate it.
+        observed: whether the records themselves show it, so that it is read off and not fitted.
         timing: whether its parameters are lags or delays, which short steps only resolve.
         at_rest: whether it is identifiable without commands, though actuation or body.
         passive: whether the believed coefficient plus the change may not be negative.
@@ -54,6 +55,7 @@ class Traits:
     absorber: ClassVar[bool] = False
     random: ClassVar[bool] = False
     slow: ClassVar[bool] = False
+    observed: ClassVar[bool] = False
     timing: ClassVar[bool] = False
     at_rest: ClassVar[bool] = False
     passive: ClassVar[bool] = False

@@ -43,7 +43,7 @@ def in_one_noise(finding: Finding) -> Finding:
     jacobian = np.where(here[:, :, None], np.asarray(evaluation.predictions.jacobian), 0.0)
     steps = Transition.along(jacobian, d.weight, evaluation.predictions.late, latent)
     inverse = np.asarray(finding.extended.inertia().inverse)
-    kalman = make_filter(noise, steps, inverse, d.dt, d.step, jacobian, latent)
+    kalman = make_filter(noise, steps, inverse, d.dt, d.step, jacobian, latent, d.spread)
     z = filtered(error, jacobian, kalman, latent) * d.weight[:, None]
     return replace(finding, base=evaluation._replace(noise=noise, kalman=kalman, z=z))
 

@@ -96,6 +96,24 @@ def missing_cells(run: Run, rng: np.random.Generator) -> tuple[Run, Told]:
     return change(run, **{name: values}), {"columns": [name], "samples": [a, a + 4]}
 
 
+def small_speeds(
+    run: Run, columns: tuple[str, ...], width: float, holds: bool = False, speed: bool = False
+) -> Run:
+    """A DVL that loses speeds below a width: it tells zero, or what it told last (`holds`).
+
+    Each column for itself, or all of them by their common `speed`. Unlike the faults above it is a
+    setting of the instrument, so that it is the same in all runs.
+    """
+    values = np.stack([run.columns[name] for name in columns])
+    size = np.linalg.norm(values, axis=0) if speed else np.abs(values)
+    good = np.broadcast_to(size >= width, values.shape)
+    shown = np.where(good, values, 0.0)
+    if holds:
+        last = np.maximum.accumulate(np.where(good, np.arange(values.shape[1]), 0), axis=1)
+        shown = np.take_along_axis(shown, last, axis=1)
+    return change(run, **dict(zip(columns, shown, strict=True)))
+
+
 FAULTS: dict[str, Callable[[Run, np.random.Generator], tuple[Run, Told]]] = {
     "stuck": stuck,
     "lost_lock": lost_lock,

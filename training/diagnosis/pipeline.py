@@ -26,7 +26,7 @@ from .causes import (
 )
 from .config import DiagnoseConfig
 from .data.arrays import Data
-from .data.checks import limits, problems, require_enough, settled, unexcited
+from .data.checks import limits, problems, require_enough, settled, unexcited, without_faults
 from .data.readings import with_velocity
 from .disturbance.found import OF_OTHERS, all_laws, reported_laws
 from .disturbance.laws import Law
@@ -35,6 +35,7 @@ from .filter.problem import DiagnosisProblem, Evaluation
 from .findings import reported, result
 from .findings.conclusion import conclude
 from .findings.ratios import ratios
+from .findings.small_speeds import zone_causes
 from .selection.hypotheses import Fit
 from .selection.model_selection import Hypothesis, parameters_of
 from .selection.refit_all import identify, with_coefficients
@@ -99,6 +100,8 @@ class Diagnoser:
         self.report = progress
         recording, self.left_out = with_velocity(recording)
         self.faults, faulty = problems(recording)
+        if faulty and len(faulty) == (recording.lengths > 0).sum():
+            recording, faulty = without_faults(recording), []
         self.checked = [
             result.DataFinding(f.word, f.severity, f.place, f.text, f.remedy)
             for f in findings_of(recording.dataset)
@@ -157,6 +160,8 @@ class Diagnoser:
         gain, judged = self._validate(
             problem, found, fitted, rows, groups, random_effects, bool(causes)
         )
+        read_off, of_instruments = zone_causes(problem.data.zones, problem.library.effects)
+        causes += read_off
         residual = reported.residual(problem, final)
         left = reported.left_over(residual, causes, problem, final, least)
         if not self.driven:
@@ -185,7 +190,7 @@ class Diagnoser:
             alpha=config.alpha,
             seconds=time.monotonic() - started,
         )
-        effects = *problem.library.used(final.theta), *random_effects
+        effects = *problem.library.used(final.theta), *random_effects, *of_instruments
         extended = Extended.create(problem.model.base, effects, problem.vehicle.thrusters())
         return Finding(
             diagnosis, extended.for_steps_of(_FINEST), problem.library, final.theta, d, base, final,

@@ -11,7 +11,8 @@ from ..schema import UNEVEN
 from ..store import Recording
 from .commands import command_findings
 from .finding import Finding, check_accepted, enforce, findings_of, with_findings
-from .velocity import held_finding, lag_findings, unmeasured
+from .small_speeds import dead_zones
+from .velocity import held_finding, lag_findings, unmeasured, zone_finding
 
 _SHORTEST_S = 1.0
 """A shorter piece beside a cut is left out too."""
@@ -41,27 +42,34 @@ def examine(
 
 def _without_unmeasured(recording: Recording, source: str) -> tuple[Recording, list[Finding]]:
     """The recording without stretches in which the velocity was not measured."""
-    found: list[Finding] = []
+    runs = list(recording.trajectories())
+    zones = dead_zones(runs)
+    found = [zone_finding(zone) for zone in zones]
     pieces: list[Trajectory] = []
-    for run in recording.trajectories():
+    cut = False
+    for number, run in enumerate(runs):
+        lost = np.zeros((len(run), 3), bool)
+        for zone in zones:
+            lost[:, zone.axes] |= zone.lost[number][:, None]
         t = run.sensors.get(UNEVEN, recording.dt * np.arange(len(run)))
         bad = np.zeros(len(run), bool)
-        for word, columns, samples in unmeasured(run, t):
+        for word, columns, samples in unmeasured(run, t, lost):
             at = run.start + t[np.flatnonzero(samples)] - t[0]
             place = f"{run.scenario}, {at[0]:.1f} to {at[-1]:.1f} s, {columns}"
             found.append(held_finding(word, place, columns))
             bad |= samples
-        pieces += [run] if not bad.any() else _pieces(run, t, ~bad)
-    if not found:
-        return recording, []
+        cut |= bool(bad.any())
+        pieces += [run] if not bad.any() else good_pieces(run, t, ~bad)
+    if not cut:
+        return recording, found
     if not pieces:
-        raise UserError(f"{source}: {found[0]}, and nothing is left; record it with a DVL's lock")
+        raise UserError(f"{source}: {found[-1]}, and nothing is left; record it with a DVL's lock")
     attrs = recording.dataset.attrs
     kept = Recording.from_trajectories(pieces, recording.dt)
     return Recording(kept.dataset.assign_attrs(attrs)), found
 
 
-def _pieces(run: Trajectory, t: np.ndarray, good: np.ndarray) -> list[Trajectory]:
+def good_pieces(run: Trajectory, t: np.ndarray, good: np.ndarray) -> list[Trajectory]:
     """The stretches of good samples that are not too short."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]])))
     found = []

@@ -32,6 +32,7 @@ WORDS: dict[str, tuple[Severity, str]] = {
     "thruster-dead": ("note", "a thruster has no effect"),
     "axis-silent": ("note", "an axis does not answer its command"),
     "command-lag": ("note", "motion and commands are shifted in time"),
+    "velocity-dead-zone": ("note", "a DVL shows zero, or its last value, at small speeds"),
     "velocity-lag": ("note", "velocities and poses are shifted in time"),
     "armed-unknown": ("note", "the log does not tell when the vehicle was armed"),
     "no-voltage": ("note", "battery messages without a voltage"),

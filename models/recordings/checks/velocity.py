@@ -11,6 +11,7 @@ from ..kinematics import increments, integrals
 from ..resample import rotations
 from ..store import Recording
 from .finding import Finding
+from .small_speeds import DeadZone
 
 FASTEST = 15.0
 """m/s; above it a velocity is an instrument's mark of failure, such as -32.768 m/s."""
@@ -29,9 +30,12 @@ _SPREAD = 2
 
 
 def unmeasured(
-    run: Trajectory, t: Float[np.ndarray, " N"]
+    run: Trajectory, t: Float[np.ndarray, " N"], lost: Bool[np.ndarray, "N 3"]
 ) -> Iterator[tuple[str, str, Bool[np.ndarray, " N"]]]:
-    """Word, columns and samples of each stretch of a run whose velocity was not measured."""
+    """Word, columns and samples of each stretch of a run whose velocity was not measured.
+
+    Small speeds that the DVL has `lost` are measured: they are known to be small.
+    """
     V = run.V_WB_B[:, :3]
     known = np.asarray(np.isfinite(V).all(axis=0))
     for columns in ([0, 1, 2], [2]):
@@ -45,6 +49,8 @@ def unmeasured(
         return
     turned = rotations(run.X_WB[:, :4].T).apply(np.nan_to_num(V))
     for held in _held(run, t, V[:, :2], turned[:, :2]):
+        if lost[held, :2].all():
+            continue
         yield "velocity-held", _names([0, 1]), held
 
 
@@ -113,6 +119,12 @@ def lag_findings(recording: Recording) -> list[Finding]:
                 )
             )
     return found
+
+
+def zone_finding(zone: DeadZone) -> Finding:
+    """The sentence on a dead zone."""
+    remedy = "look for a threshold in the settings of the DVL and of its driver"
+    return Finding("velocity-dead-zone", ",".join("uvw"[i] for i in zone.axes), str(zone), remedy)
 
 
 def held_finding(word: str, place: str, columns: str) -> Finding:

@@ -10,10 +10,12 @@ from jaxtyping import Float, Int
 
 from ....models.config.errors import UserError
 from ....models.effects.traits import Need, Region
+from ....models.recordings.checks.small_speeds import DeadZone
 from ....models.recordings.kinematics import dead_reckoned
 from ....models.recordings.store import Recording
 from ....models.se3 import AXES, TWIST, XYZ
 from ....models.vehicles.vehicle import Vehicle
+from .lost import known_errors, with_lost_zero
 from .readings import sensors_of_latent
 
 SEGMENT = 256
@@ -64,6 +66,9 @@ class Data:
         began: time of each piece's first sample since the start of its run (s) (1, R).
         started: when each piece's run started, on the recorder's clock (s), if that is known (R,).
         labels: of the runs, by scenario.
+        zones: small speeds that an instrument lost.
+        spread: standard deviation that a lost velocity adds to its record, which is zero; 0 where
+            it was measured (m/s) (N + 1, 6, R). None where no zone was found.
     """
 
     X: Float[np.ndarray, "M 7 R"]
@@ -86,6 +91,18 @@ class Data:
     began: Float[np.ndarray, "1 R"] | None = None
     started: Float[np.ndarray, " R"] | None = None
     labels: tuple[str, ...] = ()
+    zones: tuple[DeadZone, ...] = ()
+    spread: Float[np.ndarray, "M 6 R"] | None = None
+
+    @property
+    def known(self) -> Float[np.ndarray, "N 12 R"] | None:
+        """1 for errors of a step that no lost velocity is in, else 0; None where none is lost."""
+        return None if self.spread is None else known_errors(self.spread)
+
+    @property
+    def clean(self) -> Float[np.ndarray, "N R"]:
+        """Weight of the steps that no lost velocity is in."""
+        return self.weight if self.known is None else self.weight * self.known.min(axis=1)
 
     @property
     def measured(self) -> Float[np.ndarray, "12"]:
@@ -219,20 +236,20 @@ def make_data(
     voltage; a wrench is allocated to the thrusters with the least effort. Runs `without` (by
     number, scenario by scenario) are left out, unless none would remain. Commands before a run are
     not known: its first `remembered` s (a tenth of it at most) only set the actuator states.
-    Positions that were not measured are dead-reckoned; velocities that were not are zero.
+    Positions that were not measured are dead-reckoned; velocities that were not, or lost, are zero.
 
     Raises:
         UserError: attitude or rates are missing, or no run has two samples.
     """
     unmeasured = unmeasured_channels(recording)
     latent = [i for i, name in enumerate(TWIST) if name in unmeasured]
-    extra = sensors_of_latent(recording, latent)
+    recording, zones, spread = with_lost_zero(recording)
+    extra = sensors_of_latent(recording, latent) | spread
     data, lengths = recording.dataset, recording.lengths
     thrust, volts = recording.thrust(vehicle)
     kept = _kept(lengths, without)
     behind = max(1, round(remembered / recording.dt))
-    if kept.sum() == 1:
-        segment = min(segment, max(int(lengths.max()) // _BLOCKS, _LEAST))
+    segment = min(segment, _longest_piece(kept, lengths))
     pieces: list[dict[str, np.ndarray]] = []
     scenario, run = [], []
     for number, (j, k) in enumerate(np.argwhere(kept).tolist()):
@@ -264,7 +281,14 @@ def make_data(
         unmeasured=unmeasured,
         started=_started(recording, kept, run),
         labels=_labels(recording, kept),
+        zones=zones,
     )
+
+
+def _longest_piece(kept: np.ndarray, lengths: np.ndarray) -> int:
+    """Samples of a piece at most: a single run is cut into several."""
+    longest = int(lengths.max())
+    return max(longest // _BLOCKS, _LEAST) if kept.sum() == 1 else longest
 
 
 def _steps(

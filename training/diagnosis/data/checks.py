@@ -2,37 +2,29 @@
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from ....models.config.errors import UserError
-from ....models.recordings.build import Trajectory
-from ....models.recordings.kinematics import spikes
+from ....models.recordings.checks.examine import good_pieces
+from ....models.recordings.checks.small_speeds import DeadZone, dead_zones
 from ....models.recordings.schema import UNEVEN
 from ....models.recordings.store import Recording
-from ....models.se3 import AXES, POSE, TWIST
+from ....models.se3 import AXES, TWIST
 from .arrays import Data
+from .faults import INSTRUMENTS, STUCK, Faults, faults_of
 
-_STUCK = 0.5  # s
-_FILLED = 3  # samples on a straight line
 _HELD = 0.25
 """Share of the samples that repeat the one before where an instrument is slower than the rows."""
-_INSTRUMENTS = {"x,y,z": (4, 5, 6), "u,v,w": (7, 8, 9), "p,q,r": (10, 11, 12)}
+_MOSTLY = 0.5
+"""Share of the samples that counts as most of them."""
 _LEAST_ROWS, _LEAST_SECONDS = 60, 3.0
 """Least data that a diagnosis needs."""
 _NAMED = 3
 """Most runs that a sentence names."""
-_EVEN_SHARE, _SURE = 0.9, 5.0
-"""Least share of even steps for a longer one to be suspect; multiple of noise that it exceeds."""
 _STILL = 0.02
 """Share of the strongest axis' command below which an axis counts as not driven."""
-_CHANNELS = {
-    "X_WB": POSE,
-    "V_WB_B": TWIST,
-}
 
 
 def problems(recording: Recording) -> tuple[list[str], list[int]]:
@@ -45,13 +37,16 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
     clock has jumped where a step is longer than others, but the motion is that of a usual step. An
     outlier is a single velocity far from both its neighbours, which agree: no impact is that short.
     Where a quarter of the samples repeat those before, an instrument is slower than the rows.
+    Where a DVL loses small speeds, repeated values are these, and no fault of a run.
 
     Raises:
         UserError: a velocity has the sign opposite to the motion of the pose.
     """
-    faults = [_faults_of(run, recording.dt) for run in recording.trajectories()]
-    names = [run.scenario for run in recording.trajectories()]
-    held = {name: [f.held[i] for f in faults] for i, name in enumerate(_INSTRUMENTS)}
+    runs = list(recording.trajectories())
+    zones = dead_zones(runs)
+    faults = [faults_of(run, recording.dt, zones, n) for n, run in enumerate(runs)]
+    names = [run.scenario for run in runs]
+    held = {name: [f.held[i] for f in faults] for i, name in enumerate(INSTRUMENTS)}
     _refuse_signs([f.agreeing for f in faults], int(recording.lengths.sum()))
     stuck = _stuck(faults)
     jumps, clock, spiked, filled = (
@@ -60,16 +55,11 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
     )
     which = partial(_listed, names)
     found = [
-        f"{channel} repeats one value for {_STUCK:g} s or more in {which(runs)}: stuck? Give the "
+        f"{channel} repeats one value for {STUCK:g} s or more in {which(runs)}: stuck? Give the "
         "column without it, or leave the run out"
         for channel, runs in stuck.items()
     ]
-    found += [
-        f"{name} repeat the sample before in {np.median(shares):.0%} of the rows: the instrument "
-        "is slower, and what is late by that is no cause; give rows at its rate"
-        for name, shares in held.items()
-        if np.median(shares) > _HELD and not any(c in channel for channel in stuck for c in name)
-    ]
+    found += _slower(held, stuck, zones)
     if jumps:
         found.append(f"the position jumps by far more than the velocity says in {which(jumps)}")
     if clock:
@@ -91,73 +81,55 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
         for note in recording.notes
         if "cut at" in note
     ]
+    found += [str(zone) for zone in zones]
     bad = sorted({*jumps, *clock, *filled, *spiked, *(n for runs in stuck.values() for n in runs)})
     if bad and len(bad) < len(names):
         found[0] += f" (left out: {len(bad)} of {len(names)} runs)"
     return found, bad
 
 
-class _Faults(NamedTuple):
-    """Faults of one run.
+def without_faults(recording: Recording) -> Recording:
+    """The recording without the faulty stretches of its runs, for one whose runs all have some.
 
-    Attributes:
-        stuck: channels that repeat one value.
-        held: share of the samples that repeat those before, by instrument.
-        jumps: whether the pose jumps.
-        late: time by which the clock jumps (s), or 0.
-        spiked: whether there are outliers.
-        filled: longest time filled in on a straight line (s), or 0.
-        agreeing: for `_refuse_signs`.
+    A channel that stands still in most of a run is one that does not move there. Pieces of a second
+    or more remain; the recording itself where these are less than half of it.
     """
-
-    stuck: list[str]
-    held: list[float]
-    jumps: bool
-    late: float
-    spiked: bool
-    filled: float
-    agreeing: Float[np.ndarray, "3 6"]
-
-
-def _faults_of(run: Trajectory, dt: float) -> _Faults:
-    stuck, held = [], []
-    for name, values in (("X_WB", run.X_WB), ("V_WB_B", run.V_WB_B)):
-        for label, column in zip(_CHANNELS[name], values.T, strict=True):
-            still = _longest(np.diff(column) == 0) * dt
-            if still > _STUCK and np.isfinite(column).all():
-                stuck.append(label)
-    state = np.concatenate([run.X_WB, run.V_WB_B], axis=1)
-    for columns in _INSTRUMENTS.values():
-        there = [c for c in columns if c < 7 or np.isfinite(state[:, c]).all()]
-        same = (np.diff(state[:, there], axis=0) == 0).all(axis=1) & bool(there)
-        held.append(float((same & run.V_WB_B[1:].any(axis=1)).mean()))
-    elapsed = run.sensors.get(UNEVEN)
-    step = np.full(len(state) - 1, dt) if elapsed is None else np.diff(elapsed)
-    moved = motion(run.X_WB)
-    expected = (run.V_WB_B[1:] + run.V_WB_B[:-1]) / 2
-    both = np.isfinite(moved + expected)
-    per = np.where(both, moved, 0.0) / step[:, None]
-    of = np.where(both, expected, 0.0)
-    agreeing = np.array([(per * of).sum(axis=0), (of**2).sum(axis=0), (per**2).sum(axis=0)])
-    distance = np.linalg.norm(moved[:, :3], axis=1)
-    excess = np.abs(distance - np.linalg.norm(run.V_WB_B[:-1, :3], axis=1) * step)
-    excess = excess[np.isfinite(excess)]
-    jumps = bool(excess.size and np.any(excess > 30 * np.median(excess) + 0.1))
-    late = 0.0 if jumps else clock_jump(moved, expected, step)
-    V = run.V_WB_B[:, np.isfinite(run.V_WB_B).all(axis=0)]
-    bend = np.abs(np.diff(V, 2, axis=0)).max(axis=1, initial=0.0)
-    line = _longest(bend < 1e-7 * np.nanstd(V))
-    filled = (line + 1) * dt if line >= _FILLED else 0.0
-    spiked = bool(spikes(run.V_WB_B.T).any())
-    return _Faults(stuck, held, jumps, late, spiked, filled, agreeing)
+    runs, dt = list(recording.trajectories()), recording.dt
+    zones = dead_zones(runs)
+    faults = [faults_of(run, dt, zones, n) for n, run in enumerate(runs)]
+    stuck, pieces = _stuck(faults), []
+    for run, f in zip(runs, faults, strict=True):
+        bad = f.samples.copy()
+        for channel, where in f.stuck.items():
+            if channel in stuck and where.mean() < _MOSTLY:
+                bad |= where
+        t = run.sensors.get(UNEVEN, dt * np.arange(len(run)))
+        pieces += good_pieces(run, t, ~bad)
+    if sum(map(len, pieces)) < _MOSTLY * recording.lengths.sum():
+        return recording
+    kept = Recording.from_trajectories(pieces, dt).dataset
+    return Recording(kept.assign_attrs(recording.dataset.attrs))
 
 
-def _stuck(faults: list[_Faults]) -> dict[str, list[int]]:
+def _slower(
+    held: dict[str, list[float]], stuck: dict[str, list[int]], zones: Sequence[DeadZone]
+) -> list[str]:
+    """Instruments that are slower than the rows."""
+    return [
+        f"{name} repeat the sample before in {np.median(shares):.0%} of the rows: the instrument "
+        "is slower, and what is late by that is no cause; give rows at its rate"
+        for name, shares in held.items()
+        if np.median(shares) > _HELD
+        and not any(c in channel for channel in stuck for c in name)
+        and not (name == "u,v,w" and zones)
+    ]
+
+
+def _stuck(faults: list[Faults]) -> dict[str, list[int]]:
     """Runs in which a channel is stuck; a pose that is so in all runs was held in place."""
     channels = dict.fromkeys(c for f in faults for c in f.stuck)
     runs = {c: [n for n, f in enumerate(faults) if c in f.stuck] for c in channels}
-    twist = _CHANNELS["V_WB_B"]
-    return {c: r for c, r in runs.items() if len(r) < len(faults) or c in twist}
+    return {c: r for c, r in runs.items() if len(r) < len(faults) or c in TWIST}
 
 
 def _listed(names: list[str], numbers: list[int]) -> str:
@@ -169,36 +141,6 @@ def _listed(names: list[str], numbers: list[int]) -> str:
         listed.append(names[number] + (f" (run {number - first + 1})" if several else ""))
     more = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
     return f"{', '.join(listed)}{more}"
-
-
-def motion(X_WB: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "M 6"]:
-    """Displacement and rotation vector from sample to sample, in B at mid-step."""
-    turns = Rotation.from_quat(np.nan_to_num(X_WB[:, [1, 2, 3, 0]], nan=1.0))
-    turn = (turns[:-1].inv() * turns[1:]).as_rotvec()
-    middle = turns[:-1] * Rotation.from_rotvec(turn / 2)
-    turn[~np.isfinite(np.diff(X_WB[:, :4], axis=0)).all(axis=1)] = np.nan
-    moved = np.diff(X_WB[:, 4:], axis=0)
-    return np.concatenate([middle.inv().apply(moved), turn], axis=1)
-
-
-def clock_jump(
-    moved: Float[np.ndarray, "M 6"], V: Float[np.ndarray, "M 6"], step: Float[np.ndarray, " M"]
-) -> float:
-    """Time (s) by which the longest step, among even ones, exceeds the motion in it; or 0."""
-    usual = float(np.median(step))
-    even = np.abs(step - usual) < 0.1 * usual
-    if even.mean() < _EVEN_SHARE:
-        return 0.0
-    longest = 0.0
-    for part in (slice(0, 3), slice(3, 6)):
-        off = np.linalg.norm(moved[:, part] - V[:, part] * step[:, None], axis=1)
-        as_usual = np.linalg.norm(moved[:, part] - V[:, part] * usual, axis=1)
-        if not np.isfinite(off[even]).any():
-            continue  # positions that were not measured
-        noise = np.nanmedian(off[even])
-        jumped = (step > 1.5 * usual) & (off > _SURE * noise) & (as_usual < off / 2)
-        longest = max(longest, float(step[jumped].max(initial=usual)) - usual)
-    return longest
 
 
 def _refuse_signs(agreeing: Sequence[Float[np.ndarray, "3 6"]], samples: int) -> None:
@@ -229,11 +171,6 @@ def require_enough(data: Data) -> None:
             f"all: too little for a diagnosis. Give runs of some seconds, at least "
             f"{_LEAST_SECONDS:g} s and {_LEAST_ROWS} samples together"
         )
-
-
-def _longest(holds: np.ndarray) -> int:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(int)))
-    return int((edges[1::2] - edges[::2]).max()) if edges.size else 0
 
 
 _ABOVE = 0.5

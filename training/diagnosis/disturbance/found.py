@@ -53,6 +53,7 @@ def laws_of(problem: DiagnosisProblem, evaluation: Evaluation) -> list[Law]:
         data.fold,
         data.dt,
         process_share(problem, evaluation),
+        data.known,
     )
     rows = problem.library.at(CurrentSteady.name, "W")
     evidence = evaluation.plain
@@ -183,7 +184,8 @@ def _grown(
     for law in levels:
         i, rest = AXES.index(law.where), 1 / (1 + law.parameters["change"])
         z = evaluation.z[:, 6 + i].astype(float)
-        won[law.where] = growth_alone(z, speed, data.weight, rest, share[i])
+        weight = data.weight if data.known is None else data.weight * data.known[:, 6 + i]
+        won[law.where] = growth_alone(z, speed, weight, rest, share[i])
     grows = {law.where for law in shaped}
     if sum(won.get(axis, 0.0) for axis in grows) <= 0:
         return list(shaped), list(levels)
@@ -211,7 +213,8 @@ def _without_impacts(problem: DiagnosisProblem, evaluation: Evaluation) -> Float
         jacobian, weight, evaluation.predictions.late, evaluation.predictions.latent
     )
     mass = problem.mass(evaluation.theta)
-    return estimate(error, weight, steps, mass, data.dt, estimated=False).diffusion
+    given = mass, data.dt, None, False, data.known
+    return estimate(error, weight, steps, *given).diffusion
 
 
 def _is_apart(law: Law, problem: DiagnosisProblem) -> bool:

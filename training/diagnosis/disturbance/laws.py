@@ -216,15 +216,23 @@ def find_laws(
     fold: Int[np.ndarray, " R"],
     dt: float,
     share: Float[np.ndarray, "6"],
+    known: Float[np.ndarray, "N 12 R"] | None = None,
 ) -> list[Law]:
-    """All laws on all axes, largest gain first; `share` as in `speed_dependence`, by axis."""
+    """All laws on all axes, largest gain first; `share` as in `speed_dependence`, by axis.
+
+    Innovations with lost velocities in them have no weight (`known`, `Data.known`).
+    """
     found = []
     for i, axis in enumerate(AXES):
-        own = z[:, 6 + i]
+        own, w = z[:, 6 + i], weight
+        if known is not None:
+            w = weight * known[:, 6 + i]
+            if not w.any():
+                continue
         for name, fitted in (
-            (DisturbanceImpacts.name, impacts(own, weight, fold)),
-            (DisturbanceStateDependence.name, speed_dependence(own, speed, weight, fold, share[i])),
-            (DisturbanceColour.name, colour(own, weight, fold, dt)),
+            (DisturbanceImpacts.name, impacts(own, w, fold)),
+            (DisturbanceStateDependence.name, speed_dependence(own, speed, w, fold, share[i])),
+            (DisturbanceColour.name, colour(own, w, fold, dt)),
         ):
             gain, values, loss = fitted
             found.append(Law(name, axis, values, gain, loss))

@@ -51,13 +51,15 @@ def find_levels(problem: DiagnosisProblem, evaluation: Evaluation, least: float)
     def score(own: np.ndarray, noise: Noise, steps: Transition) -> Float[np.ndarray, " r"]:
         given = data.dt, data.step[:, own], data.weight[:, own]
         some = None if latent is None else latent.of(own)
-        return score_of(error[:, :, own], jacobian[..., own], noise, steps, inverse, *given, some)
+        lost = None if data.spread is None else data.spread[..., own]
+        seen = error[:, :, own], jacobian[..., own]
+        return score_of(*seen, noise, steps, inverse, *given, some, lost)
 
     for k, label in enumerate(labels):
         own = data.fold == label
         rest = data.weight * (~own if not own.all() else 1)
         steps = Transition.along(jacobian, rest, evaluation.predictions.late, latent)
-        noise = estimate(error, rest, steps, mass, data.dt, estimated=False)
+        noise = estimate(error, rest, steps, mass, data.dt, estimated=False, known=data.known)
         levels[k] = noise.diffusion
         best = score(own, noise, steps)
         judged.append((own, rest, steps, best))
@@ -69,7 +71,8 @@ def find_levels(problem: DiagnosisProblem, evaluation: Evaluation, least: float)
         if gain[i].sum() > least:
             for own, rest, steps, best in judged:
                 held = {int(i): believed[i]}
-                other = estimate(error, rest, steps, mass, data.dt, held, estimated=False)
+                given = mass, data.dt, held, False, data.known
+                other = estimate(error, rest, steps, *given)
                 gain[i, own] = best - score(own, other, steps)
         spread = np.sqrt((n - 1) / n * np.sum((levels[:, i] - levels[:, i].mean()) ** 2))
         change = float(evaluation.noise.diffusion[i] / believed[i] - 1)
@@ -92,7 +95,7 @@ def levels_with_slow_noise(
     inverse = np.linalg.inv(problem.mass(evaluation.theta))
     left, lost = fit_with_slow_noise(
         np.asarray(p.error),
-        data.weight,
+        data.clean,
         steps,
         unit_processes(steps, inverse, data.dt),
         _pushed(steps, inverse, data.dt),

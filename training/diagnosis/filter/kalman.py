@@ -8,6 +8,7 @@ import scipy.linalg
 from jaxtyping import Float, Int
 
 from ..data.arrays import all_equal
+from ..data.lost import known_errors
 from .noise import Noise, process_covariance
 from .transition import Latent, Transition
 
@@ -52,19 +53,21 @@ def make_filter(
     step: Float[np.ndarray, "N R"],
     jacobian: Float[np.ndarray, "N 12 12 R"] | None = None,
     latent: Latent | None = None,
+    spread: Float[np.ndarray, "M 6 R"] | None = None,
 ) -> Filter:
     """The Kalman filter that starts from the first record: gains of every step.
 
     The transition is that of a step of `dt` s. Where all steps are equal, all pieces share one
-    filter, unless the spread of Jacobians adds much to the innovations: then each has its own.
+    filter, unless the spread of Jacobians adds much to the innovations, or velocities were lost
+    (`spread`, `Data.spread`): then each has its own.
     """
     process = _process(noise, transition, mass_inverse, dt, step)
-    if all_equal(step, dt):
+    if all_equal(step, dt) and spread is None:
         found, P = _filter(noise, process, step[:, :1], dt, transition)
         share = np.diag(transition.added(P)) / (np.diag(transition.of(P)) + noise.trusted**2)
         if jacobian is None or np.max(share[~noise.silent]) < _MUCH:
             return found
-    return _filter(noise, process, step, dt, transition, jacobian, latent)[0]
+    return _filter(noise, process, step, dt, transition, jacobian, latent, spread)[0]
 
 
 def judging_filter(
@@ -75,9 +78,10 @@ def judging_filter(
     step: Float[np.ndarray, "N R"],
     jacobian: Float[np.ndarray, "N 12 12 R"],
     latent: Latent | None = None,
+    spread: Float[np.ndarray, "M 6 R"] | None = None,
 ) -> Filter:
     """`make_filter` with correlated innovations weighted down by `Noise.memory`."""
-    kalman = make_filter(noise, transition, mass_inverse, dt, step, jacobian, latent)
+    kalman = make_filter(noise, transition, mass_inverse, dt, step, jacobian, latent, spread)
     less = kalman.whiten / np.sqrt(noise.memory)[:, None, None]
     return replace(kalman, whiten=less, memory=noise.memory)
 
@@ -94,20 +98,21 @@ def _filter(
     transition: Transition,
     jacobian: Float[np.ndarray, "N 12 12 R"] | None = None,
     latent: Latent | None = None,
+    spread: Float[np.ndarray, "M 6 R"] | None = None,
 ) -> tuple[Filter, Float[np.ndarray, "12 12"]]:
     """A filter for each column of `step`, and the first one's last covariance.
 
     With `Transition.latent` an innovation is that of the state after a step less `carried` times
     the state before it.
     """
-    R, eye = np.diag(noise.trusted**2), np.eye(12)
-    count = step.shape[1]
-    first = R if noise.first is None else np.diag(noise.first**2)
-    P = np.repeat(first[None], count, 0)
+    records, eye = np.repeat(np.diag(noise.trusted**2)[None], step.shape[1], 0), np.eye(12)
+    R = records if spread is None else _with_lost(records, spread[0])
+    first = R if noise.first is None else R - records + np.diag(noise.first**2)
+    P = first.copy()
     latent = transition.latent if latent is None else latent
     variance = np.zeros(12)
     gap = np.zeros_like(P)  # I - K: the filter starts at the first record
-    keep, whiten = np.zeros((2, len(step), count, 12, 12))
+    keep, whiten = np.zeros((2, len(step), step.shape[1], 12, 12))
     log_det = np.zeros(step.shape)
     for n in range(len(step)):
         keep[n] = gap
@@ -118,6 +123,8 @@ def _filter(
         else:
             own = np.moveaxis(jacobian[n], -1, 0).astype(float)
             A = np.where(np.isfinite(own), own, A)  # a piece without samples has none
+        if spread is not None:
+            R = _with_lost(records, spread[n + 1])
         own_noise = prior
         prior = A @ P @ A.swapaxes(1, 2) + prior
         S, cross, M = prior + R, prior, A
@@ -140,6 +147,16 @@ def _filter(
             P = P + K @ R @ K.swapaxes(1, 2)
     moved = np.moveaxis(keep, 1, -1), np.moveaxis(whiten, 1, -1)
     return Filter(*moved, log_det, state=np.sqrt(variance)), P[0]
+
+
+def _with_lost(
+    records: Float[np.ndarray, "R 12 12"], spread: Float[np.ndarray, "6 R"]
+) -> Float[np.ndarray, "R 12 12"]:
+    """Covariances of the records of a sample, with those of velocities that were lost there."""
+    found = records.copy()
+    axes = np.arange(6, 12)
+    found[:, axes, axes] += spread.T**2
+    return found
 
 
 def _process(
@@ -212,10 +229,16 @@ def score_of(
     step: Float[np.ndarray, "N R"],
     weight: Float[np.ndarray, "N R"],
     latent: Latent | None = None,
+    spread: Float[np.ndarray, "M 6 R"] | None = None,
 ) -> Float[np.ndarray, " R"]:
-    """Log density of the innovations by piece (nats)."""
-    kalman = make_filter(noise, transition, mass_inverse, dt, step, jacobian, latent)
-    return log_density(filtered(error, jacobian, kalman, latent), kalman, weight)
+    """Log density of the innovations by piece (nats), of those without a lost velocity in them."""
+    kalman = make_filter(noise, transition, mass_inverse, dt, step, jacobian, latent, spread)
+    z = filtered(error, jacobian, kalman, latent)
+    if spread is None:
+        return log_density(z, kalman, weight)
+    known = known_errors(spread)
+    of_lost = (np.log(np.einsum("niir->nir", kalman.whiten)) * (1 - known)).sum(axis=1)
+    return log_density(z * known, replace(kalman, log_det=kalman.log_det + of_lost), weight)
 
 
 def log_density(

@@ -11,7 +11,7 @@ Slow disturbances add Σ_j σ_j² φ_j^|n - m| g_j g_jᵀ, with g_j the error th
 linear in their variances too. Longer blocks thus separate a white level from coloured noise.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -22,6 +22,9 @@ from .transition import Transition
 
 _BLOCK, _LEAST = 12, 8
 """Samples of a block, and blocks at least."""
+_ENOUGH_BLOCKS = 40
+"""Blocks at least where an axis with lost velocities is used: they overlap by half, so that they
+have about 220 degrees of freedom, which give a variance to a tenth."""
 _LONGER = 24
 """Samples of a block where slow disturbances are separated from a white level."""
 _TIMES = (0.3, 1.0, 4.0)
@@ -93,6 +96,7 @@ def most_likely(
     start: Float[np.ndarray, "18"],
     least: Float[np.ndarray, "18"],
     held: Bool[np.ndarray, "6"] | None = None,
+    apart: Bool[np.ndarray, "6"] | None = None,
 ) -> tuple[Float[np.ndarray, "18"], Float[np.ndarray, "6"]]:
     """Variances of the twelve records and the six b², and standard errors of the six.
 
@@ -109,13 +113,15 @@ def most_likely(
         start: first guess.
         least: lower bounds.
         held: axes whose b² stays as in `start`.
+        apart: axes whose errors are not used, and whose variances stay as in `start`.
     """
     blocks = _blocks(error, weight, _BLOCK)
     if len(blocks) < _LEAST:
         return start, start[12:]
-    used = _used_axes(blocks, units, start)
+    apart = np.zeros(6, bool) if apart is None else apart
+    used = _used_axes(blocks, units, start) & ~np.tile(apart, 2)
     model = _likelihood(blocks, transition, units, used)
-    held = np.zeros(6, bool) if held is None else held
+    held = apart if held is None else held | apart
     moved = np.concatenate([used, ~held])
     x = model.likeliest(np.log(start), np.log(least), moved)
     found = np.exp(x)
@@ -169,6 +175,33 @@ def fit_with_slow_noise(
         other = model.likeliest(other, low, free)
         lost[i] = (model.loss(other)[0] - best) * len(blocks) / 2
     return np.exp(x[12:18] / 2), lost
+
+
+def likely_beside_lost(
+    error: Float[np.ndarray, "N 12 R"],
+    weight: Float[np.ndarray, "N R"],
+    known: Float[np.ndarray, "N 12 R"],
+    *given: Any,
+) -> tuple[Float[np.ndarray, "18"], Float[np.ndarray, "6"]]:
+    """`most_likely` of errors of which not all are known, with its further arguments.
+
+    Axes with the fewest known errors are set apart until the others have enough blocks without a
+    lost velocity. Each of those is then fitted alone, to its own blocks.
+    """
+    there, apart = known[:, 6:], np.zeros(6, bool)
+    share = (there * weight[:, None]).sum(axis=(0, 2))
+    clean = weight * there.min(axis=1)
+    for i in np.argsort(share)[:-1]:
+        if len(_blocks(error, clean, _BLOCK)) >= _ENOUGH_BLOCKS:
+            break
+        apart[i] = True
+        clean = weight * there[:, ~apart].min(axis=1)
+    found, errors = (a.copy() for a in most_likely(error, clean, *given, apart=apart))
+    for i in np.flatnonzero(apart):
+        alone = np.arange(6) != i
+        own, its = most_likely(error, weight * there[:, i], *given, apart=alone)
+        found[[6 + i, 12 + i]], errors[i] = own[[6 + i, 12 + i]], its[i]
+    return found, errors
 
 
 def _blocks(error: np.ndarray, weight: np.ndarray, length: int) -> Float[np.ndarray, "K n 12"]:

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Bool, Float
 
-from .likely_noise import most_likely
+from .likely_noise import likely_beside_lost, most_likely
 from .transition import Transition
 
 FLOOR = np.array([1e-4] * 3 + [1e-5] * 3 + [1e-4] * 3 + [1e-5] * 3)
@@ -130,11 +130,13 @@ def estimate(
     dt: float,
     held: Mapping[int, float] | None = None,
     estimated: bool | None = None,
+    known: Float[np.ndarray, "N 12 R"] | None = None,
 ) -> Noise:
     """Maximum likelihood noise of records and process, from a first guess by moments.
 
     The diffusion b of some axes may be `held`. Whether the records are states that a filter has
-    `estimated` is decided from the errors unless it is given.
+    `estimated` is decided from the errors unless it is given. Errors with lost velocities in them
+    are left out (`known`, `Data.known`).
     """
     held, latent = {} if held is None else held, transition.latent
     silent = np.zeros(12, bool)
@@ -142,11 +144,7 @@ def estimate(
     if latent is not None:
         silent[[6 + i for i in latent.silent]] = True
         held = {i: latent.levels[i] for i in latent.silent} | dict(held)
-    C = []
-    for lag in range(3):
-        w = weight[lag:] * weight[: len(weight) - lag]
-        a, b = error[lag:] * w[:, None], error[: len(error) - lag]
-        C.append(np.einsum("nir,njr->ij", a, b) / max(w.sum(), 1.0))
+    C = [_autocovariance(error, weight, lag, known) for lag in range(3)]
     A, inverse = transition.mean, np.linalg.inv(mass)
     R = np.diag(-np.linalg.solve(A, C[1] - C[2]))
     variance = np.maximum(R, FLOOR**2)
@@ -172,14 +170,34 @@ def estimate(
     start, fixed = np.maximum(start, bounds), np.zeros(6, bool)
     for i, b in held.items():
         start[12 + i], fixed[i] = b**2, True
-    found, errors = most_likely(error, weight, transition, units, start, bounds, fixed)
+    given = transition, units, start, bounds, fixed
+    if known is None:
+        found, errors = most_likely(error, weight, *given)
+    else:
+        found, errors = likely_beside_lost(error, weight, known, *given)
     b = np.sqrt(found[12:])
     record = np.maximum(np.sqrt(found[:12]), FLOOR)
-    slip = slip_of(error, weight, dt)
+    slip = slip_of(error if known is None else error * known, weight, dt)
     if not (np.any(record[6:] > _NEAR * FLOOR[6:]) or np.any(slip[3:] > _DRIFTS)):
         slip = np.zeros(6)  # exact states
     noise = Noise(record, b, slip, error=errors / (2 * b), silent=silent)
     return _with_latent(noise, transition, inverse, unit, dt, C)
+
+
+def _autocovariance(
+    error: Float[np.ndarray, "N 12 R"],
+    weight: Float[np.ndarray, "N R"],
+    lag: int,
+    known: Float[np.ndarray, "N 12 R"] | None,
+) -> Float[np.ndarray, "12 12"]:
+    """Mean of r_(n+lag) r_nᵀ, element by element over the errors that are known."""
+    w = weight[lag:] * weight[: len(weight) - lag]
+    a, b = error[lag:] * w[:, None], error[: len(error) - lag]
+    if known is None:
+        return np.einsum("nir,njr->ij", a, b) / max(w.sum(), 1.0)
+    after, before = known[lag:] * w[:, None], known[: len(known) - lag]
+    count = np.einsum("nir,njr->ij", after, before)
+    return np.einsum("nir,njr->ij", a * known[lag:], b * before) / np.maximum(count, 1.0)
 
 
 def _with_latent(

@@ -180,7 +180,8 @@ class DiagnosisProblem:
             raise FloatingPointError("predictions diverge")
         jacobian = np.asarray(p.jacobian)
         steps = Transition.along(jacobian, weight, p.late, p.latent)
-        noise = estimate(error, weight, steps, self.mass(theta), self.data.dt)
+        mass, known = self.mass(theta), self.data.known
+        noise = estimate(error, weight, steps, mass, self.data.dt, known=known)
         return p, noise, self.filter_in(noise, theta, p) if kalman is None else kalman
 
     def filter_in(self, noise: Noise, theta: Float[np.ndarray, " p"], p: Predictions) -> Filter:
@@ -188,12 +189,16 @@ class DiagnosisProblem:
         data, jacobian = self.data, np.asarray(p.jacobian)
         steps = Transition.along(jacobian, data.weight, p.late, p.latent)
         inverse = np.linalg.inv(self.mass(theta))
-        return judging_filter(noise, steps, inverse, data.dt, data.step, jacobian, p.latent)
+        given = data.dt, data.step, jacobian, p.latent, data.spread
+        return judging_filter(noise, steps, inverse, *given)
 
     def errors(self, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, "N 12 R"]:
-        """Errors of one-step predictions, zero where a piece has no sample."""
-        p = predict(self.model, self.library, theta, self.data)
-        return np.asarray(p.error) * self.data.weight[:, None]
+        """Errors of one-step predictions, zero where a piece has no sample or lost a velocity."""
+        return self._there(predict(self.model, self.library, theta, self.data))
+
+    def _there(self, p: Predictions) -> Float[np.ndarray, "N 12 R"]:
+        error = np.asarray(p.error) * self.data.weight[:, None]
+        return error if self.data.known is None else error * self.data.known
 
     def evaluate(
         self,
@@ -297,7 +302,7 @@ class DiagnosisProblem:
 
         It needs no filter, whose noise levels would change with the fit.
         """
-        error = np.asarray(seen.predictions.error) * self.data.weight[:, None]
+        error = self._there(seen.predictions)
         return self.merit(self.covariance(error, seen.noise.estimated))
 
     def loss(self, theta: Float[np.ndarray, " p"]) -> float:
@@ -384,7 +389,7 @@ def _key(entry: tuple) -> tuple[str, str, str]:
 
 
 def _library(data: Data, effects: Sequence[Effect], region: Region) -> tuple[Library, np.ndarray]:
-    kinds = [k for k in KINDS.values() if not k.random and k.needs <= data.offers]
+    kinds = [k for k in KINDS.values() if not (k.random or k.observed) and k.needs <= data.offers]
     own = [e for e in effects if e.name not in {k.name for k in kinds}]
     n = data.u.shape[1]
     library = Library([*(k.neutral(thrusters=n, **k.options_for(region)) for k in kinds), *own])

@@ -111,12 +111,14 @@ def _rows(problem: DiagnosisProblem, b: Hypothesis | None, taken: Sequence[int])
 def _opponents(choice: Choice, named: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Ties that were not accepted themselves, or else the closest rival that was not.
 
-    Rivals in which the cause is nested are left out: they explain it in any maneuver.
+    Rivals in which the cause is nested, which have more parameters, are left out: they explain it
+    in any maneuver.
     """
     own = choice.hypothesis[0]
 
     def apart(h: Hypothesis) -> bool:
-        return h not in named and h[0] != own and own not in kind(h[0]).simpler
+        more = len(kind(h[0]).parameters) > len(kind(own).parameters)
+        return h not in named and h[0] != own and not (more and own in kind(h[0]).simpler)
 
     ties = [h for h in choice.ties if apart(h)]
     return ties[:_MOST] or [h for h, _ in choice.rivals if apart(h)][:1]

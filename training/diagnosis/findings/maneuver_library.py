@@ -219,4 +219,5 @@ def _flown(model: Extended, data: Data) -> Data:
     at = np.minimum(np.arange(len(X))[:, None], last)[:, None]
     X, V = (np.take_along_axis(states, at, axis=0) for states in (X, V))
     force = None if data.specific_force is None else specific_force(X, V, data.step)
-    return replace(data, X=X, V=V, weight=data.weight * there[1:], specific_force=force, climb=None)
+    weight = data.weight * there[1:]
+    return replace(data, X=X, V=V, weight=weight, specific_force=force, climb=None, spread=None)

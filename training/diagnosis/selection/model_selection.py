@@ -73,6 +73,24 @@ def margin(gain: float) -> float:
     return max(MARGIN_NATS, MARGIN_SHARE * gain)
 
 
+def clearly_beaten(
+    library: Library,
+    simple: Hypothesis,
+    other: Hypothesis,
+    won: Float[np.ndarray, " R"],
+    gain: float,
+) -> bool:
+    """Whether a simpler cause loses to another one, which wins `won` more nats on each run.
+
+    With more parameters, the other one also fits what is neither's: it must win `margin`. With as
+    many it can't: what counts is whether the data distinguish the two, by `MARGIN_NATS` and by two
+    standard errors between runs.
+    """
+    if len(library.at(*other)) > len(library.at(*simple)):
+        return bool(won.sum() >= margin(gain))
+    return bool(won.sum() >= max(MARGIN_NATS, 2 * _error_of_sum(won)))
+
+
 def choose(
     library: Library,
     theta: Float[np.ndarray, " p"],
@@ -117,7 +135,9 @@ def choose(
     simpler = [
         h
         for h in order
-        if h != top and _is_simpler(h, top) and passing[h].heldout_gain > best - margin(best)
+        if h != top
+        and _is_simpler(h, top)
+        and not clearly_beaten(library, h, top, passing[top].heldout - passing[h].heldout, best)
     ]
     if simpler:
         top = simpler[0]
@@ -141,8 +161,12 @@ def _is_simpler(a: Hypothesis, b: Hypothesis) -> bool:
 
 def _tied(a: Fit, b: Fit) -> bool:
     difference = a.heldout - b.heldout
-    error = np.sqrt(len(difference)) * difference.std()
-    return bool(difference.sum() < min(2 * error, MARGIN_NATS))
+    return bool(difference.sum() < min(2 * _error_of_sum(difference), MARGIN_NATS))
+
+
+def _error_of_sum(by_run: Float[np.ndarray, " R"]) -> float:
+    """Standard error of a sum over runs."""
+    return float(np.sqrt(len(by_run)) * by_run.std())
 
 
 def parameters_of(library: Library, hypotheses: Sequence[Hypothesis]) -> list[int]:

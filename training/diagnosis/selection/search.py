@@ -24,8 +24,8 @@ from .model_selection import (
     acts_unseen,
     admissible,
     choose,
+    clearly_beaten,
     is_itself,
-    margin,
     p_value,
     parameters_of,
 )
@@ -289,25 +289,31 @@ class Search:
         if not close:
             return choice, theta
         best = problem.polish(theta, [*library.at(*top), *free], seen.kalman, 2)[1]
-        start_loss = best.loss
+        start_loss, back = best.loss, []
         for h in close:
-            if h[0] in kind(top[0]).simpler:
+            simpler = h[0] in kind(top[0]).simpler
+            more = len(library.at(*top)) - len(library.at(*h))
+            if simpler and more > 0:
                 continue
             other, rival, alone = self._fitted(state, h, fits, seen.kalman)
             named = library, np.zeros_like(other), alone
-            within = admissible(*named) and is_itself(*named)
-            # a cause nested in the rival stays unless clearly beaten; parameters cost a nat each
-            least = 2.0 if best.loss == start_loss else 0.0
-            least += max(len(library.at(*h)) - len(library.at(*top)), 0)
-            if top[0] in kind(h[0]).simpler:
-                least = margin(choice.fit.heldout_gain)
-            if within and rival.loss < best.loss - least:
+            won = _lost_by_run(best) - _lost_by_run(rival)
+            if simpler:
+                beats = not clearly_beaten(library, h, top, -won, choice.fit.heldout_gain)
+            elif top[0] in kind(h[0]).simpler:
+                beats = clearly_beaten(library, top, h, won, choice.fit.heldout_gain)
+            else:
+                # a cause nested in the rival stays unless clearly beaten; parameters cost a nat
+                least = (2.0 if best.loss == start_loss else 0.0) + max(-more, 0)
+                beats = rival.loss < best.loss - least
+            if beats and admissible(*named) and is_itself(*named):
+                back += [top] if simpler else []
                 top, theta, best = h, other, rival
         if top == choice.hypothesis:
             return choice, theta
         rivals = ((choice.hypothesis, choice.fit.heldout_gain), *choice.rivals)
         others = tuple(rival for rival in rivals if rival[0] != top)
-        ties = tuple(h for h in choice.ties if h != top)
+        ties = tuple(h for h in dict.fromkeys((*back, *choice.ties)) if h != top)
         return Choice(top, fits[top], ties, others), theta
 
     def without_redundant(self, state: Selection) -> Selection:
@@ -334,6 +340,11 @@ class Search:
         rest = [*self.nuisance, *parameters_of(library, state.hypotheses)]
         theta = problem.polish(theta, rest)[0] if rest else theta
         return state.at(problem.evaluate(theta))
+
+
+def _lost_by_run(seen: Evaluation) -> Float[np.ndarray, " R"]:
+    """Negative log likelihood of each run, up to a constant (nats)."""
+    return seen.evidence.runs[:, 0, 0] / 2
 
 
 def _halves(state: Selection, choice: Choice) -> bool:

@@ -80,7 +80,7 @@ def train(
     """
     arrays = arguments(data)
     s = np.asarray(inputs(*arrays))  # (s, N, R)
-    exists = data.weight > 0
+    exists = data.clean > 0
     centre, scale = s[:, exists].mean(axis=1), s[:, exists].std(axis=1) + 1e-6
     widths = np.repeat(_WIDTHS, count // len(_WIDTHS))
     box = BlackBox(
@@ -90,8 +90,8 @@ def train(
         jnp.asarray(rng.uniform(0, 2 * np.pi, len(widths))),
         jnp.zeros((1 + len(s) + len(widths), 6, 1)),
     )
-    phi = np.asarray(box.features(*arrays)) * data.weight  # (D, N, R)
-    target = np.asarray(predictions.error)[:, 6:].swapaxes(0, 1) / data.step * data.weight
+    phi = np.asarray(box.features(*arrays)) * data.clean  # (D, N, R)
+    target = np.asarray(predictions.error)[:, 6:].swapaxes(0, 1) / data.step * data.clean
     labels = np.unique(data.fold)
     H, g, square = [], [], []
     for label in labels:

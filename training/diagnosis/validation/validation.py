@@ -57,8 +57,9 @@ class Scores(NamedTuple):
         density: log density of the innovations (nats) (R,).
         record, diffusion, slip: noise of the records, of the disturbance, and slip of the poses
             (12, R), (6, R), (6, R).
-        latent: filtered velocities that were not measured, in all records of the twist; None where
-            all were measured. Their `record` is the standard deviation of the filter.
+        latent: filtered velocities that were not measured, or lost, in all records of the twist;
+            None where all were measured. The `record` of an axis that was not measured is the
+            standard deviation of the filter.
     """
 
     density: Float[np.ndarray, " R"]
@@ -81,24 +82,29 @@ def scores(problem: DiagnosisProblem, contender: Contender, estimated: bool) -> 
     density = np.zeros(len(data.fold))
     record = np.zeros((12, len(density)))
     diffusion, slip = np.zeros((2, 6, len(density)))
-    own_V = data.V.copy() if data.latent else None
+    own_V = data.V.copy() if data.latent or data.spread is not None else None
+    spread = data.spread
     for label in np.unique(data.fold):
         own = data.fold == label
         rest = data.weight * (~own if not own.all() else 1)
         steps = Transition.along(jacobian, rest, p.late, p.latent)
-        noise = estimate(error, rest, steps, mass, data.dt, estimated=estimated)
+        given = mass, data.dt, None, estimated, data.known
+        noise = estimate(error, rest, steps, *given)
         record[:, own], diffusion[:, own] = noise.record[:, None], noise.diffusion[:, None]
         slip[:, own] = noise.slip[:, None]
         latent = None if p.latent is None else p.latent.of(own)
         given = np.linalg.inv(mass), data.dt, data.step[:, own], jacobian[..., own], latent
-        kalman = make_filter(noise, steps, *given)
+        kalman = make_filter(noise, steps, *given, None if spread is None else spread[..., own])
         z, states = with_states(error[:, :, own], jacobian[..., own], kalman, latent)
         density[own] = log_density(z, kalman, data.weight[:, own])
         if own_V is not None:
-            at = 6 + np.array(data.latent)
+            at = 6 + np.array(data.latent, int)
             start = np.asarray(p.start[1])[..., own] - states[:, 6:]
             for i in data.latent:
                 own_V[:-1, i, own] = start[:, i]
+            if spread is not None:
+                lost = spread[:-1, :, own] > 0
+                own_V[:-1, :, own] = np.where(lost, start, own_V[:-1, :, own])
             record[at[:, None], own] = kalman.state[at, None]
     return Scores(density, record, diffusion, slip, own_V)
 

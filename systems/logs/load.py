@@ -10,6 +10,7 @@ import numpy as np
 from ...models.config.errors import UserError
 from ...models.recordings.checks.finding import enforce, with_findings
 from ...models.recordings.csv import METADATA, read_csv
+from ...models.recordings.outputs import with_outputs
 from ...models.recordings.schema import check_plausible
 from ...models.recordings.store import Recording
 from ...models.vehicles.vehicle import load_vehicle
@@ -118,7 +119,8 @@ def import_log(  # long: a third of it says what it takes and refuses
         raise UserError(f"{path}: {error}") from error
     period = 1.0 / signals.outputs.rate
     progress(1.0)
-    recording, settled_ = settled(recording, signals.turned)
+    recording = Recording(with_outputs(recording.dataset, signals.channels))
+    recording, settled_ = settled(recording, signals.turned, signals.turned_since)
     dataset = with_findings(recording.dataset, [*signals.findings, *settled_])
     return Recording(dataset.assign_attrs(command_period=period)), report
 

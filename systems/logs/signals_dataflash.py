@@ -25,7 +25,7 @@ from .signals import (
 )
 from .streams import UNAIDED, aid_spans, missing_states
 from .table import Table, whole
-from .wiring import DIRECTION_CHANGED, Wiring, direction_findings, thruster_outputs, wiring
+from .wiring import Wiring, direction_findings, thruster_outputs, wiring
 
 _FILTERS = {
     3: {"XKF1": "XKF1", "XKF4": "XKF4", "XKQ": "XKQ", "XKQ1": "XKQ"},
@@ -110,7 +110,6 @@ def signals_from_bin(
         attitude=attitude,
         rates=rates,
         outputs=outputs,
-        vehicle=wired.vehicle,
         position=position,
         velocity=velocity,
         specific_force=force,
@@ -118,12 +117,12 @@ def signals_from_bin(
         voltage=voltage,
         rc=_rc(tables),
         spans={**spans, **no_aid},
-        cuts=tuple((t, DIRECTION_CHANGED) for t in wired.changes),
+        cuts=wired.cuts,
         has=(f"Horizontal aid: {', '.join(aids)}.",) if aids else (),
         lacks=() if aids else ("No DVL, odometry or vision record in the log.",),
         notes=(*log.notes, *strange, *wired.notes, *notes, *rate_notes, *depth.told),
         findings=tuple(findings),
-        turned=wired.turned,
+        **wired.of_signals(),
     )
 
 

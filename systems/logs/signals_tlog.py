@@ -24,7 +24,7 @@ from .signals import (
 from .streams import aid_spans, missing_states
 from .table import Table
 from .tlog import TlogLog
-from .wiring import DIRECTION_CHANGED, Wiring, direction_findings, thruster_outputs, wiring
+from .wiring import Wiring, direction_findings, thruster_outputs, wiring
 
 WANTED = (
     "ATTITUDE",
@@ -92,7 +92,6 @@ def signals_from_tlog(
         attitude=attitude,
         rates=rates,
         outputs=outputs,
-        vehicle=wired.vehicle,
         position=position,
         velocity=velocity,
         specific_force=force,
@@ -102,13 +101,13 @@ def signals_from_tlog(
         spans=spans,
         cuts=(
             *((t, "reboot of the autopilot") for t in log.boots),
-            *((t, DIRECTION_CHANGED) for t in wired.changes),
+            *wired.cuts,
         ),
         has=tuple(has),
         lacks=() if aids else ("No DVL, odometry, vision or GPS message in the log.",),
         notes=(*log.notes, *strange, *wired.notes, *notes, *motion_notes, *told),
         findings=(*findings, *direction_findings(wired)),
-        turned=wired.turned,
+        **wired.of_signals(),
     )
 
 
@@ -192,9 +191,9 @@ def _outputs(table: Table, wired: Wiring, named: bool) -> tuple[Series, list[str
     tell which.
     """
     ports = {int(port): table.rows(table["port"] == port) for port in np.unique(table["port"])}
-    first = 17 if any(channel > 16 for channel in wired.channels) else 9
+    wanted = wired.outputs
+    first = 17 if any(channel > 16 for channel in wanted) else 9
     starts = {0: 1, 1: first}
-    wanted = {channel for channel in wired.channels if channel}
     driving = [p for p, start in starts.items() if wanted & set(range(start, start + 16))]
     main = max(
         (p for p in ports if p in starts),

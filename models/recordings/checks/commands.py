@@ -13,19 +13,29 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ...se3 import AXES, WRENCH
+from ...se3 import WRENCH
 from ...vehicles.vehicle import Vehicle
 from ..commands import voltage_of
+from ..outputs import outputs_of
 from ..store import Recording
+from .command_words import (
+    dead_thruster,
+    exchanged_columns,
+    exchanged_thrusters,
+    no_answer,
+    no_commands,
+    reversed_axes,
+    reversed_thruster,
+    shifted,
+    shifted_apart,
+    silent,
+    turned_heading,
+)
 from .finding import Finding
-from .hypotheses import ALL, CAUSAL, PLAUSIBLE, Driven
+from .heading import heading_offset
+from .hypotheses import ALL, CAUSAL, EVIDENCE, MOST, PLAUSIBLE, Driven, named
 from .response import LAGS_S, AxisResponse, responses
 
-_EVIDENCE = 12.0
-"""Nats by which a named hypothesis is more likely than the recorded order: 6e-6 by chance, some
-hundred hypotheses together 1e-3."""
-_MOST = 0.5
-"""Share that a named hypothesis accounts for, and most of the rest that it leaves."""
 _HARDLY, _SURE = 10.0, 0.9
 """Commanded force over the force that the motion shows, above which no vehicle's numbers explain
 it; the largest share of a force that a command is expected to make up."""
@@ -35,11 +45,12 @@ _NO_FORCE = 1e-3
 _FACTORS = np.round(np.arange(-1.5, 1.51, 0.05), 2)
 _LEAST_COUNT = 20.0
 """Independent windows below which nothing is said of an axis."""
-_ORDERS = {
-    "in ArduSub's order of RC channels (pitch, roll, heave, yaw, surge, sway)": (4, 3, 2, 5, 0, 1),
-    "torque first (K,M,N,X,Y,Z), as Drake's spatial forces": (3, 4, 5, 0, 1, 2),
-}
-_RIGHT_DOWN = np.array([1, -1, -1, 1, -1, -1])
+_MAIN = 0.7
+"""Share of the largest lever on an axis from which on a thruster mainly drives it."""
+_LINEAR, _ANGULAR = (0, 1, 2), (3, 4, 5)
+_APART_S = 0.25
+"""s by which the answers of velocities and of rates may differ: thrusters give both the same lag,
+which is known to a step of `LAGS_S` in each."""
 
 
 def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Finding]:
@@ -50,13 +61,14 @@ def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Find
     forces, weights, names = columns
     mask = recording.mask
     if not np.abs(forces[mask]).max(initial=0.0) > _NO_FORCE:
-        return [_no_commands(recording)]
+        return [no_commands(recording)]
     axes = {
         i: r
         for i, r in responses(recording, forces, recording.command_period).items()
         if r.count >= _LEAST_COUNT
     }
     data = _data(axes, weights, names, vehicle)
+    data = replace(data, outputs=outputs_of(recording.dataset))
     # an axis without a command tells nothing of the order of columns
     driven = replace(data, axes={i: r for i, r in axes.items() if data.given[i] > 0})
     if not driven.axes:
@@ -65,13 +77,16 @@ def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Find
     nats, found = _orders(driven, wrench)
     if not wrench:
         more, thrusters = _thrusters(driven)
-        found = thrusters if more > nats else found
+        nats, found = (more, thrusters) if more > nats else (nats, found)
+    offset = heading_offset(recording, forces, driven)
+    if offset is not None and offset[0] > nats:
+        found = [turned_heading(offset[1])]
     if found:
         return found
-    silent = [i for i in driven.axes if _unanswered(data, i)]
-    if silent and not any(_answered(data, i) for i in driven.axes):
-        return [_no_answer(data, silent)]
-    return [_silent(data, i) for i in silent] + _lag(driven)
+    unanswered = [i for i in driven.axes if _unanswered(data, i)]
+    if unanswered and not any(_answered(data, i) for i in driven.axes):
+        return [no_answer(data, unanswered)]
+    return [silent(data, i) for i in unanswered] + _lags(driven)
 
 
 def _columns(
@@ -128,7 +143,7 @@ def _nats(data: Driven, axis: int) -> float:
 
 
 def _answered(data: Driven, axis: int) -> bool:
-    return _nats(data, axis) > _EVIDENCE and data.given[axis] < _HARDLY * data.needed[axis]
+    return _nats(data, axis) > EVIDENCE and data.given[axis] < _HARDLY * data.needed[axis]
 
 
 def _unanswered(data: Driven, axis: int) -> bool:
@@ -138,13 +153,13 @@ def _unanswered(data: Driven, axis: int) -> bool:
     """
     times = data.given[axis] / max(data.needed[axis], 1e-12)
     expected = -0.5 * data.axes[axis].count * np.log1p(-min(times**2, _SURE))
-    return times > _HARDLY or bool(expected > 3 * _EVIDENCE and _nats(data, axis) < _EVIDENCE)
+    return times > _HARDLY or bool(expected > 3 * EVIDENCE and _nats(data, axis) < EVIDENCE)
 
 
 def _orders(data: Driven, wrench: bool) -> tuple[float, list[Finding]]:
     """Columns of a wrench in another order, and axes whose command has the other sign.
 
-    Returns the evidence for it, less `_EVIDENCE` for each change, and the findings.
+    Returns the evidence for it, less `EVIDENCE` for each change, and the findings.
     """
     pairs = np.moveaxis(np.stack([data.weights, -data.weights], axis=-1), 1, 0)  # m, column, sign
     own = sorted(data.axes)
@@ -168,42 +183,33 @@ def _orders(data: Driven, wrench: bool) -> tuple[float, list[Finding]]:
     moved = [
         (i, j, int(sign))
         for i, j, sign, share in moves
-        if (i, 1) != (j, sign) and _named(float(kept[i][0]), float(share), data.axes[i].count)
+        if (i, 1) != (j, sign) and named(float(kept[i][0]), float(share), data.axes[i].count)
     ]
-    worth = best - float(usual[0]) - _EVIDENCE * len(moved)
+    worth = best - float(usual[0]) - EVIDENCE * len(moved)
     if not moved or worth < 0:
         return 0.0, []
     if any(i != j for i, j, _ in moved):
-        return worth, [_exchanged(moved)]
-    return worth, [_reversed_axes(data, moved, wrench)]
-
-
-def _named(usual: float, share: float, count: float) -> bool:
-    """Whether a hypothesis on one axis is clearly better than the recorded order."""
-    rest = (1 - share) / (1 - usual)
-    return share >= _MOST and rest < _MOST and bool(-0.5 * count * np.log(rest) > _EVIDENCE)
+        return worth, [exchanged_columns(moved)]
+    return worth, [reversed_axes(data, moved, wrench)]
 
 
 def _thrusters(data: Driven) -> tuple[float, list[Finding]]:
     """Thrusters that push the other way, are exchanged or dead; as `_orders` returns them."""
     m = len(data.columns)
     flips = [("reversed", k, k) for k in range(m)]
+    flips += [("reversed", a, b) for a, b in combinations(range(m), 2)]
     swaps = [("exchanged", a, b) for a, b in combinations(range(m), 2)]
-    usual, first, _ = data.best(data.weights[..., None], PLAUSIBLE)
+    usual, _, _ = data.best(data.weights[..., None], PLAUSIBLE)
     chains = [_chain(data, options) for options in (flips, swaps, flips + swaps)]
     worth, weights, changes = max(chains, key=lambda chain: chain[0])
     _, last, lags = data.best(weights[..., None], PLAUSIBLE)
-    if not any(
-        _named(float(first[i][0]), float(last[i][0]), r.count) for i, r in data.axes.items()
-    ):
-        worth, weights, changes, last = float(usual[0]), data.weights, [], first
     dead = [k for k in range(m) if _is_dead(data, weights, k, last, int(lags[0]))]
+    turned = {k for kind, a, b in changes if kind == "reversed" for k in (a, b)}
     found = [
-        _reversed_thruster(data, a) if kind == "reversed" else _swapped(data, a, b)
-        for kind, a, b in sorted(changes)
-        if a not in dead
+        exchanged_thrusters(data, a, b) for kind, a, b in sorted(changes) if kind != "reversed"
     ]
-    found += [_dead(data, k) for k in dead]
+    found += [reversed_thruster(data, k) for k in sorted(turned.difference(dead))]
+    found += [dead_thruster(data, k) for k in dead]
     return (worth - float(usual[0]) if changes else 0.5 * bool(dead)), found
 
 
@@ -211,26 +217,57 @@ _Change = tuple[str, int, int]
 
 
 def _chain(data: Driven, options: Sequence[_Change]) -> tuple[float, np.ndarray, list[_Change]]:
-    """The best change, then the next best, …: evidence less `_EVIDENCE` each, weights, changes."""
-    nats, _, _ = data.best(data.weights[..., None], PLAUSIBLE)
-    now, weights, changes = float(nats[0]), data.weights, []
+    """The best change, then the next best, …: evidence less `EVIDENCE` each, weights, changes."""
+    worth, changes = _worth(data, []), []
     while len(changes) < len(data.columns):
-        tried = np.stack([_changed(weights, *option) for option in options], axis=-1)
+        tried = np.stack([_changed(data, [*changes, one]) for one in options], axis=-1)
         nats, _, _ = data.best(tried, CAUSAL, strict=True)
-        at = int(nats.argmax())
-        if nats[at] - _EVIDENCE < now:
+        net = nats - EVIDENCE * np.array([_cost([*changes, one]) for one in options])
+        at = int(net.argmax())
+        if net[at] < worth:
             break
-        now, weights = float(nats[at]) - _EVIDENCE, tried[..., at]
+        worth = float(net[at])
         changes.append(options[at])
-    return now, weights, changes
+    changes = _needed(data, changes)
+    return _worth(data, changes), _changed(data, changes), changes
 
 
-def _changed(weights: np.ndarray, kind: str, a: int, b: int) -> np.ndarray:
-    changed = weights.copy()
-    if kind == "reversed":
-        changed[:, a] *= -1
-    else:
-        changed[:, [a, b]] = changed[:, [b, a]]
+def _needed(data: Driven, changes: list[_Change]) -> list[_Change]:
+    """The changes without any of which some axis would be left with twice as much, or more.
+
+    The axis must be one that a changed thruster mainly drives. Small improvements of several axes
+    together, and moments of small lever arms, tell of errors in the vehicle's file.
+    """
+    arms = np.abs(data.weights) / np.maximum(np.abs(data.weights).max(axis=1), 1e-9)[:, None]
+    for one in reversed(changes):
+        rest = [other for other in changes if other is not one]
+        both = np.stack([_changed(data, rest), _changed(data, changes)], axis=-1)
+        _, shares, _ = data.best(both, PLAUSIBLE)
+        main = [i for i in data.axes if max(arms[i, one[1]], arms[i, one[2]]) >= _MAIN]
+        if not any(named(*map(float, shares[i]), data.axes[i].count) for i in main):
+            return _needed(data, rest)
+    return changes
+
+
+def _worth(data: Driven, changes: Sequence[_Change]) -> float:
+    weights = _changed(data, changes)[..., None]
+    nats, _, _ = data.best(weights, CAUSAL if changes else PLAUSIBLE, strict=bool(changes))
+    return float(nats[0]) - EVIDENCE * _cost(changes)
+
+
+def _cost(changes: Sequence[_Change]) -> int:
+    """Changes; two thrusters that are reversed together are two: one alone may explain nothing."""
+    return sum(2 if kind == "reversed" and a != b else 1 for kind, a, b in changes)
+
+
+def _changed(data: Driven, changes: Sequence[_Change]) -> np.ndarray:
+    """The weights after changes, one after another."""
+    changed = data.weights.copy()
+    for kind, a, b in changes:
+        if kind == "reversed":
+            changed[:, list({a, b})] *= -1
+        else:
+            changed[:, [a, b]] = changed[:, [b, a]]
     return changed
 
 
@@ -243,118 +280,47 @@ def _is_dead(
     shares = data.shares(tried, lag)
     at = int(data.evidence(shares).argmax())
     return bool(abs(_FACTORS[at]) <= _DEAD) and any(
-        _named(float(usual[i][0]), float(shares[i][at]), r.count) for i, r in data.axes.items()
+        named(float(usual[i][0]), float(shares[i][at]), r.count) for i, r in data.axes.items()
     )
 
 
-def _lag(data: Driven) -> list[Finding]:
-    weights = data.weights[..., None]
-    nats, shares, lag = data.best(weights, ALL)
-    usual, _, _ = data.best(weights, PLAUSIBLE)
-    strong = [i for i in data.axes if shares[i][0] >= _MOST]
-    if nats[0] - usual[0] < _EVIDENCE or not strong:
+def _lags(data: Driven) -> list[Finding]:
+    """Lags that neither thrusters nor clocks have: of all axes, or of velocities or rates alone."""
+    groups = [_group(data, axes) for axes in (_LINEAR, _ANGULAR)]
+    found = [one for group in groups if (one := _lag(group)) is not None]
+    if len(found) == 2 and found[0][1] == found[1][1]:
+        return [shifted(found[0][0] + found[1][0], found[0][1])]
+    if found or not all(group.axes for group in groups):
+        return [shifted(axes, seconds) for axes, seconds in found]
+    best = [group.best(group.weights[..., None], PLAUSIBLE) for group in groups]
+    at = [int(lags[0]) for _, _, lags in best]
+    apart = float(LAGS_S[at[0]] - LAGS_S[at[1]])
+    strong = all(any(s[0] >= MOST for s in shares.values()) for _, shares, _ in best)
+    if abs(apart) < _APART_S or not strong:
         return []
-    seconds = float(LAGS_S[lag[0]])
-    how = "after" if seconds > 0 else "before"
-    return [
-        Finding(
-            "command-lag",
-            f"commands of {', '.join(AXES[i] for i in strong)}",
-            f"the motion comes {abs(seconds):.1f} s {how} its command",
-            "align the clocks of commands and motion",
-        )
-    ]
-
-
-# sentences
-
-
-def _no_commands(recording: Recording) -> Finding:
-    rates = recording.dataset["V_WB_B"].to_numpy()[recording.mask][:, 3:]
-    turned = bool(np.nanmax(np.abs(rates), initial=0.0) > 0.2)
-    told = "the vehicle was turned by hand or drifted" if turned else "nothing was driven"
-    return Finding(
-        "no-commands",
-        ", ".join(recording.commands),
-        f"no command ever differs from zero: {told}, and nothing tells how it answers thrusters",
-        "record a dive with the thrusters driven",
+    common = max(
+        sum(float(g.best(g.weights[..., None], [one])[0][0]) for g in groups) for one in PLAUSIBLE
     )
+    if sum(float(nats[0]) for nats, _, _ in best) - common < EVIDENCE:
+        return []
+    return [shifted_apart(apart)]
 
 
-def _no_answer(data: Driven, silent: Sequence[int]) -> Finding:
-    axes = ", ".join(AXES[i] for i in silent)
-    times = min(data.given[i] / max(data.needed[i], 1e-12) for i in silent)
-    return Finding(
-        "no-answer",
-        axes,
-        f"the motion follows no command, though those of {axes} are {times:.1g} times the force "
-        "that the motion shows: a bench test, thrusters without power, or commands of another run",
-        "give a dive, with the commands that made it",
-    )
+def _group(data: Driven, axes: Sequence[int]) -> Driven:
+    return replace(data, axes={i: r for i, r in data.axes.items() if i in axes})
 
 
-def _silent(data: Driven, axis: int) -> Finding:
-    times = data.given[axis] / max(data.needed[axis], 1e-12)
-    return Finding(
-        "axis-silent",
-        AXES[axis],
-        f"{AXES[axis]} never or hardly answers its command, which is {times:.1g} times the force "
-        "that the motion shows",
-        f"check the thrusters that act in {AXES[axis]}",
-    )
+_Lag = tuple[tuple[int, ...], float]
 
 
-def _exchanged(moved: Sequence[tuple[int, int, int]]) -> Finding:
-    names = [n for n, order in _ORDERS.items() if all(order[j] == i for i, j, _ in moved)]
-    parts = [f"`{WRENCH[j]}` drives {AXES[i]}{' backwards' * (s < 0)}" for i, j, s in moved]
-    look = f": columns X…N stand {names[0]}" if names else ""
-    return Finding(
-        "columns-exchanged",
-        "columns X,Y,Z,K,M,N",
-        f"the motion says that {', '.join(parts)}{look}",
-        "give X,Y,Z,K,M,N in this order, forces first",
-    )
-
-
-def _reversed_axes(data: Driven, moved: Sequence[tuple[int, int, int]], wrench: bool) -> Finding:
-    axes = [i for i, _, _ in moved]
-    right_down = [i for i in data.axes if _RIGHT_DOWN[i] < 0]
-    frd = wrench and set(axes) == set(right_down)
-    told = ": they look like forward-right-down" if frd else ""
-    names = ", ".join(WRENCH[i] if wrench else AXES[i] for i in axes)
-    return Finding(
-        "axis-reversed",
-        f"column{'s' * (len(axes) > 1)} {names}" if wrench else names,
-        f"the motion goes against the command of {', '.join(AXES[i] for i in axes)}{told}",
-        "give forward, left and up as positive, or `frames: NED/FRD` for all of the files"
-        if wrench
-        else "check the directions of the thrusters (MOT_n_DIRECTION) and the vehicle's file",
-    )
-
-
-def _reversed_thruster(data: Driven, k: int) -> Finding:
-    return Finding(
-        "thruster-reversed",
-        f"column {data.columns[k]}",
-        f"thruster {k + 1} pushes the other way: MOT_{k + 1}_DIRECTION, or SERVOn_REVERSED of the "
-        "output n that drives it",
-        f"correct the parameter, or the sign of {data.columns[k]}",
-    )
-
-
-def _swapped(data: Driven, a: int, b: int) -> Finding:
-    return Finding(
-        "thruster-exchanged",
-        f"columns {data.columns[a]}, {data.columns[b]}",
-        f"thrusters {a + 1} and {b + 1} look exchanged",
-        "give the columns in the order of the vehicle's file",
-    )
-
-
-def _dead(data: Driven, k: int) -> Finding:
-    return Finding(
-        "thruster-dead",
-        f"column {data.columns[k]}",
-        f"thruster {k + 1} has no effect on the motion",
-        "check its power and propeller",
-    )
+def _lag(data: Driven) -> _Lag | None:
+    """Axes with a strong answer, and the lag (s) at which it is, if that is not plausible."""
+    if not data.axes:
+        return None
+    weights = data.weights[..., None]
+    nats, shares, at = data.best(weights, ALL)
+    usual, _, _ = data.best(weights, PLAUSIBLE)
+    strong = tuple(i for i in data.axes if shares[i][0] >= MOST)
+    if nats[0] - usual[0] < EVIDENCE or not strong:
+        return None
+    return strong, float(LAGS_S[at[0]])

@@ -16,6 +16,7 @@ from ...models.recordings.store import Recording
 from ...models.vehicles.vehicle import load_vehicle
 from .bags.bag import bag_kind
 from .bags.signals import read_bag
+from .consistency import motion_findings
 from .dataflash import read_bin
 from .frame import settled
 from .fuse import fuse
@@ -26,6 +27,7 @@ from .signals_dataflash import WANTED as BIN_WANTED
 from .signals_dataflash import signals_from_bin
 from .signals_tlog import AIDS, signals_from_tlog
 from .signals_tlog import WANTED as TLOG_WANTED
+from .sound import sound
 from .tlog import read_tlog
 
 RATES = (50.0, 40.0, 25.0, 20.0)
@@ -86,6 +88,7 @@ def import_log(  # long: a third of it says what it takes and refuses
     if vehicle is not None:
         load_vehicle(vehicle)
     damage, signals = _signals(path, vehicle, options, progress)
+    signals = sound(signals)
     enforce(str(path), signals.findings, accept)
     try:
         rate = own_rate(signals) if rate is None else rate
@@ -118,10 +121,12 @@ def import_log(  # long: a third of it says what it takes and refuses
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
     period = 1.0 / signals.outputs.rate
+    moved = motion_findings(signals, trajectories, recording)
+    enforce(str(path), moved, accept)
     progress(1.0)
     recording = Recording(with_outputs(recording.dataset, signals.channels))
     recording, settled_ = settled(recording, signals.turned, signals.turned_since)
-    dataset = with_findings(recording.dataset, [*signals.findings, *settled_])
+    dataset = with_findings(recording.dataset, [*signals.findings, *moved, *settled_])
     return Recording(dataset.assign_attrs(command_period=period)), report
 
 

@@ -301,7 +301,7 @@ def thruster_outputs(
         )
     dead = (raw == 0).all(axis=1) & (index > 0).all(axis=1)
     if dead.any():
-        which = ", ".join(in_words(i + 1, wired.channels)[9:] for i in np.flatnonzero(dead))
+        which = ", ".join(in_words(int(i) + 1, wired.channels)[9:] for i in np.flatnonzero(dead))
         notes.append(f"Thrusters {which} never got a pulse; they are taken as stopped.")
     if any(c not in (0, k) for k, c in enumerate(wired.channels, 1)):
         which = ", ".join(in_words(k, wired.channels)[9:] for k in range(1, len(index) + 1))

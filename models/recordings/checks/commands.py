@@ -244,7 +244,9 @@ def _needed(data: Driven, changes: list[_Change]) -> list[_Change]:
         both = np.stack([_changed(data, rest), _changed(data, changes)], axis=-1)
         _, shares, _ = data.best(both, PLAUSIBLE)
         main = [i for i in data.axes if max(arms[i, one[1]], arms[i, one[2]]) >= _MAIN]
-        if not any(named(*map(float, shares[i]), data.axes[i].count) for i in main):
+        if not any(
+            named(float(shares[i][0]), float(shares[i][1]), data.axes[i].count) for i in main
+        ):
             return _needed(data, rest)
     return changes
 

@@ -202,7 +202,9 @@ def dataflash(start=100.0, duration=20.0, *, bias=0.01, aided=True, disarm=None)
     for t, (_, _, _, rates) in zip(fast, ned(fast), strict=True):
         w = rates + bias
         for instance in (0, 1):
-            events.append((t, "IMU", (instance, *(w if instance else 9 * w), 0.0, 0.0, -codec.G)))
+            noise = 1e-6 * (round(100 * t) % 7)  # a working sensor never gives one value for long
+            force = (noise, 0.0, -codec.G)
+            events.append((t, "IMU", (instance, *(w if instance else 9 * w), *force)))
     for t in start + np.arange(0, duration, 0.1):
         events.append((t, "RCOU", tuple(int(x) for x in outputs(t))))
         events.append((t, "BAT", (0, 15.5)))

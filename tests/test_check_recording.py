@@ -30,6 +30,9 @@ def dive() -> Recording:
     return import_log(ROOT / "sims/data/sitl_dive.tlog.xz")[0].cut(0.0, 20.0)
 
 
+SEVERE = [word for word, (severity, _) in WORDS.items() if severity == "severe"]
+
+
 def words(recording):
     return [finding.word for finding in findings_of(recording.dataset)]
 
@@ -63,6 +66,27 @@ def test_a_velocity_that_stands_still_in_the_world_is_left_out(dive, level):
     starts = seen.dataset["start_time"].to_numpy()
     np.testing.assert_allclose(starts[:, 1] - starts[:, 0], 14.0)
     assert seen.command_period == dive.command_period
+
+
+def test_attitudes_and_rates_that_stand_still_are_left_out(dive):
+    """From 8 to 14 s: the rates at a value, then attitude and rates, while commands go on."""
+    held = slice(160, 280)
+
+    def freeze(rows):
+        def change(values):
+            values = values.copy()
+            values[:, :, held, rows] = values[:, :, 160:161, rows]
+            return values
+
+        return change
+
+    rates = changed(dive, "V_WB_B", freeze(slice(3, 6)))
+    both = changed(rates, "X_WB", freeze(slice(0, 4)))
+    for seen, what in ((rates, "p,q,r"), (both, "attitude")):
+        seen = examine(seen, HEAVY, "dive.nc", accept=SEVERE)
+        found = [f for f in findings_of(seen.dataset) if f.word == "attitude-held"]
+        assert [f.place.rsplit("s, ", 1)[1] for f in found] == [what] * 2
+        np.testing.assert_array_equal(seen.lengths[:, 0], [160, 160])
 
 
 def test_a_vehicle_at_rest_is_no_lost_lock(dive):

@@ -61,7 +61,7 @@ def test_the_motion_decides_on_outputs_that_are_reversed_together(recorded, turn
     np.testing.assert_allclose(
         restored.dataset["pwm"].to_numpy(), recorded.dataset["pwm"].to_numpy()
     )
-    assert [f.place for f in found] == [f"SERVOn_REVERSED of thruster {k}" for k in turned]
+    assert [f.place for f in found] == [f"SERVO{k}_REVERSED of thruster {k}" for k in turned]
     assert all("the motion says that it is not" in f.text for f in found)
 
 

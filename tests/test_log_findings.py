@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from log_writers import PARAMETERS, dataflash, dialect, dive, heartbeat, outputs
+from log_writers import PARAMETERS, dataflash, dialect, dive, heartbeat, outputs, parameter
 from recordings_changed import changed
 
 from helpers import ROOT, shared_data
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.recordings.checks.finding import findings_of
+from spinndrift.models.recordings.outputs import outputs_of
 from spinndrift.systems.logs.frame import settled
 from spinndrift.systems.logs.load import import_log
 
@@ -112,6 +113,39 @@ def test_a_direction_that_changes_in_the_log_cuts_there(tmp_path):
         expected = 1500 + sign * (outputs(t)[2] - 1500)
         assert np.abs(run.commands["pwm"][:, 2] - expected).max() < 2.0
     assert any("change of a thruster's direction" in line for line in report.dropped)
+
+
+def test_outputs_that_exchange_motors_in_the_log_cut_there(tmp_path):
+    """The first report of a parameter holds before it, and a new function within 1.3 s."""
+    changes = [(110.0, "SERVO3_FUNCTION", 37.0), (110.2, "SERVO5_FUNCTION", 35.0)]
+    recording, found, _ = imported(tmp_path, dive(duration=20.0, changes=changes).bytes())
+    assert {word for word, _ in found} == {"output-direction"}
+    assert outputs_of(recording.dataset) == ()
+    columns = ([2, 4], [4, 2])
+    for run, own in zip(recording.trajectories(), columns, strict=True):
+        t = run.start + recording.dt * (np.arange(len(run)) + 0.5)
+        assert np.abs(run.commands["pwm"][:, [2, 4]].T - outputs(t)[own]).max() < 2.0
+    second = run.start
+    assert 111.3 < second < 112.0
+
+
+def test_an_output_that_is_reversed_in_the_log_is_so_from_then_on(tmp_path):
+    """Nothing moves in these logs as thrusters say, so the parameter decides."""
+    log = dive(duration=20.0, changes=[(110.0, "SERVO4_REVERSED", 1.0)])
+    log.send(100.3, parameter("SERVO4_REVERSED", 0.0))
+    recording, found, _ = imported(tmp_path, log.bytes())
+    assert [word for word, _ in found] == ["output-direction", "output-reversed"]
+    for run, sign in zip(recording.trajectories(), (1, -1), strict=True):
+        t = run.start + recording.dt * (np.arange(len(run)) + 0.5)
+        expected = 1500 + sign * (outputs(t)[3] - 1500)
+        assert np.abs(run.commands["pwm"][:, 3] - expected).max() < 2.0
+
+
+def test_a_recording_keeps_the_outputs_of_the_thrusters(tmp_path):
+    swapped = PARAMETERS | {"SERVO3_FUNCTION": 37.0, "SERVO5_FUNCTION": 35.0}
+    recording, _, report = imported(tmp_path, dive(duration=8.0, parameters=swapped).bytes())
+    assert outputs_of(recording.dataset) == (1, 2, 5, 4, 3, 6, 7, 8)
+    assert "Thrusters by output: 1 (output 1), 2 (output 2), 3 (output 5)" in str(report)
 
 
 def test_a_silent_aid_is_set_apart_as_dead_reckoning(tmp_path):

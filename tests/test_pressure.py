@@ -64,6 +64,7 @@ def autopilots_own(monkeypatch, names, parameters):
         water = LAKE_PA + 9800.0 * 1.02 * float(p[2])
         for name, pascal in zip(names, (103000.0, water), strict=False):
             log.write(name, round(t * 1e6), 0.0, pascal, 25.0, 0.0, 0, 0.0, 25.0)
+    log.parts.sort(key=lambda part: 0 if part[2] == 128 else int.from_bytes(part[3:11], "little"))
     return log
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.recordings.build import Trajectory
+from spinndrift.models.recordings.outputs import outputs_of, with_outputs
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.recordings.summary import summarize
 
@@ -250,3 +251,34 @@ def test_broken_files_are_told_in_one_sentence(tmp_path):
     bad.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(UserError, match=r"bad\.nc"):
         Recording.load(bad)
+
+
+def driven(outputs):
+    pwm = {"pwm": np.full((40, 8), 1500.0)}
+    made = Recording.from_trajectories([trajectory(commands=pwm)], DT, vehicle="test")
+    return Recording(with_outputs(made.dataset, outputs))
+
+
+def test_outputs_of_the_thrusters_are_kept(tmp_path):
+    outputs = (1, 2, 5, 4, 3, 6, 0, 32)
+    made = driven(outputs)
+    made.save(tmp_path / "run.nc")
+    read = Recording.load(tmp_path / "run.nc")
+    assert outputs_of(read.dataset) == outputs_of(read.cut(0.5, 1.0).dataset) == outputs
+    assert outputs_of(Recording.concat([read, made]).dataset) == outputs
+    assert outputs_of(Recording.concat([read, driven(range(1, 9))]).dataset) == ()
+    driven(()).save(tmp_path / "old.nc")
+    assert outputs_of(Recording.load(tmp_path / "old.nc").dataset) == ()
+
+
+@pytest.mark.parametrize("outputs", [(1, 2, 3), (1, 2, 3, 4, 5, 6, 7, 33), (-1,) * 8])
+def test_outputs_that_can_not_be_are_refused(outputs):
+    with pytest.raises(ValueError, match="thruster_outputs: "):
+        driven(outputs)
+
+
+@pytest.mark.parametrize("outputs", ["1 2 3 4 5 6 7 8", np.arange(8.0), np.ones((2, 4), int)])
+def test_outputs_of_another_kind_are_refused(outputs):
+    dataset = driven(()).dataset.assign_attrs(thruster_outputs=outputs)
+    with pytest.raises(ValueError, match="thruster_outputs: must be whole numbers"):
+        Recording(dataset)

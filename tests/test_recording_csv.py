@@ -12,6 +12,7 @@ from spinndrift.models.config.errors import UserError
 from spinndrift.models.recordings.build import Trajectory
 from spinndrift.models.recordings.checks.finding import findings_of
 from spinndrift.models.recordings.csv import read_csv, write_csv
+from spinndrift.models.recordings.outputs import outputs_of, with_outputs
 from spinndrift.models.recordings.store import Recording
 from spinndrift.training.data.windows import make_windows
 
@@ -386,3 +387,16 @@ def test_files_beside_are_told_and_the_vehicle_is_found_beside(tmp_path):
         ("unlisted-file", "run_2.csv")
     ]
     assert recording.vehicle == str(folder / "mine.yaml")
+
+
+def test_outputs_of_the_thrusters_are_kept(tmp_path):
+    outputs = (1, 2, 5, 4, 3, 6, 0, 12)
+    made = Recording.from_trajectories([run(command="pwm")], 0.05)
+    write_csv(Recording(with_outputs(made.dataset, outputs)), tmp_path / "runs")
+    assert outputs_of(read_csv(tmp_path / "runs").dataset) == outputs
+    write_csv(made, tmp_path / "plain")
+    assert outputs_of(read_csv(tmp_path / "plain").dataset) == ()
+    yaml = tmp_path / "runs" / "recording.yaml"
+    yaml.write_text(yaml.read_text().replace("- 12\n", "").replace(", 12]", "]"))
+    with pytest.raises(UserError, match="thruster_outputs: 7 outputs for 8 thrusters"):
+        read_csv(tmp_path / "runs")

@@ -47,7 +47,7 @@ def test_the_outputs_that_move_tell_the_thrusters(tmp_path, monkeypatch, kind, p
     assert recording.vehicle == "bluerov2"
     told = [line for line in report.done if line.startswith("Frame not in the log: read as")]
     assert len(told) == 1
-    assert "read as bluerov2, as outputs 7 and 8 stand still" in told[0]
+    assert "read as bluerov2, as outputs 7 and 8 do not both move" in told[0]
     named, report = imported(
         tmp_path, written(kind, parameters, monkeypatch), kind, vehicle="bluerov2_heavy"
     )
@@ -85,5 +85,6 @@ def test_thrusters_that_move():
     moving, still = np.array([1500.0, 1600.0]), np.array([1500.0, 1500.0])
     assert moving_thrusters(np.stack([moving] * 6 + [still] * 2)) == 6
     assert moving_thrusters(np.stack([moving] * 6)) == 6
+    assert moving_thrusters(np.stack([*[moving] * 6, still, moving])) == 6  # a camera's tilt
     assert moving_thrusters(np.stack([moving] * 8)) == 8
     assert moving_thrusters(np.stack([moving] * 5 + [still] * 3)) == 8  # not all were used

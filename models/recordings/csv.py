@@ -25,6 +25,7 @@ from .csv_columns import METADATA, STATE, STEMS, checked_groups, unit_quaternion
 from .csv_runs import Run, as_recorded, common_step, cut, on_grid
 from .csv_table import Table, read_table
 from .kinematics import contradictions
+from .outputs import outputs_of, with_outputs
 from .resample import continuous
 from .schema import COMMANDS, UNEVEN
 from .store import Recording
@@ -43,6 +44,8 @@ class CsvFolder:
         rate: rate of the recording (Hz); by default that of the files.
         ignore: columns to leave out.
         check: compare poses with velocities, and refuse contradictions.
+        outputs: output of the autopilot (n of SERVOn) that drives each thruster, 0 for none;
+            findings name it.
         source, notes: free text.
     """
 
@@ -52,6 +55,7 @@ class CsvFolder:
     rate: float | None = None
     ignore: list[str] = field(default_factory=list)
     check: bool = True
+    outputs: list[int] = field(default_factory=list)
     source: str = ""
     notes: list[str] = field(default_factory=list)
 
@@ -102,7 +106,8 @@ def read_csv(
             source=meta.source or folder.name,
             notes=notes,
         )
-        return Recording(with_findings(recording.dataset, findings))
+        dataset = with_outputs(recording.dataset, meta.outputs)
+        return Recording(with_findings(dataset, findings))
     except UserError:
         raise
     except ValueError as error:
@@ -176,6 +181,7 @@ def write_csv(
             recording.vehicle,
             files,
             rate=1.0 / recording.dt,
+            outputs=list(outputs_of(recording.dataset)),
             source=str(recording.dataset.attrs.get("source", "")),
             notes=list(recording.notes),
         )

@@ -21,6 +21,8 @@ _MOST = 0.5  # share of the windows that must contradict; fewer are faults of an
 _LONG_STEP_S = 1.0
 _SPIKE, _FEW = 20.0, 8  # factor on the median second difference; samples needed for a median
 _SEVERAL = 4  # windows needed to separate noise from an unnamed wrong convention
+UNNAMED = "check units, frames and the order of the quaternion"
+"""What an error says where no known convention makes poses and twists agree."""
 _BETTER = 0.3  # a convention that leaves less than this share of the residual is the right one
 
 Arrays = tuple[np.ndarray, np.ndarray]
@@ -111,6 +113,14 @@ def _world(X: np.ndarray, V: np.ndarray, part: slice) -> Arrays:
     return X, turned
 
 
+def _mirrored(X: np.ndarray, V: np.ndarray, row: int) -> Arrays:
+    """Velocities with the other sign along one of the world's axes."""
+    R = rotations(X[:4])
+    turned = V.copy()
+    turned[:3] = R.inv().apply(_flip(R.apply(V[:3].T).T, (row,)).T).T
+    return X, turned
+
+
 _LINEAR: list[tuple[str, Callable[[np.ndarray, np.ndarray], Arrays]]] = [
     (
         "u,v,w look like velocities along the world's axes; rotate them into the body",
@@ -129,6 +139,14 @@ _LINEAR: list[tuple[str, Callable[[np.ndarray, np.ndarray], Arrays]]] = [
     ),
     ("u seems to have the wrong sign; give forward as positive", lambda X, V: (X, _flip(V, (0,)))),
     ("v seems to have the wrong sign; give left as positive", lambda X, V: (X, _flip(V, (1,)))),
+    (
+        "the velocity along the world's x has the wrong sign; give all in one convention",
+        lambda X, V: _mirrored(X, V, 0),
+    ),
+    (
+        "the velocity along the world's y has the wrong sign; give all in one convention",
+        lambda X, V: _mirrored(X, V, 1),
+    ),
     (
         "z seems to have the wrong sign against w; give all in one convention",
         lambda X, V: (_flip(X, (6,)), V),
@@ -243,7 +261,7 @@ def contradictions(
         longer = (agreement(t, X_WB, V_WB_B, s)[part].explained for s in _LONGER_S)
         explained = [now.explained, _mostly(t, X_WB, V_WB_B, rows), *longer]
         if np.nanmax(explained) < _CONTRADICTED and t[-1] - t[0] > _SEVERAL * _WINDOW_S:
-            errors.append(f"{found}: check units, frames and the order of the quaternion")
+            errors.append(f"{found}: {UNNAMED}")
             break
         if now.explained < _DOUBTFUL:
             doubts.append(

@@ -10,6 +10,7 @@ import xarray as xr
 from jaxtyping import Bool, Float
 
 from ..se3 import POSE, TWIST, WRENCH, XYZ
+from .outputs import check_outputs
 
 FORMAT = "spinndrift recording 1"
 FRAMES = "W: ENU z-up; B: FLU"
@@ -125,6 +126,7 @@ def check(dataset: xr.Dataset) -> None:
     _check_quaternions(dataset, mask)
     if UNEVEN in dataset:
         _check_elapsed(dataset, mask)
+    check_outputs(dataset)
 
 
 def check_plausible(dataset: xr.Dataset) -> None:

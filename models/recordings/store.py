@@ -19,6 +19,7 @@ from ..files.netcdf import load_netcdf, save_netcdf
 from ..se3 import WRENCH
 from .build import Trajectory, assemble, window
 from .commands import forces_of, thrusters_of, voltage_of
+from .outputs import common_outputs, with_outputs
 from .schema import (
     COMMANDS,
     FORMAT,
@@ -314,7 +315,7 @@ class Recording:
     def concat(cls, recordings: "Sequence[Recording]") -> "Recording":
         """Join recordings of equal step; runs of equal scenario names become repetitions.
 
-        Commands that some recording lacks are dropped; other variables are NaN where missing.
+        Commands that some lack and outputs that differ are dropped; other variables are NaN there.
 
         Raises:
             UserError: for unequal steps, thruster counts or vehicles, or no command in common.
@@ -349,7 +350,8 @@ class Recording:
             notes=list(notes),
         )
         sampled = [r.command_period for r in recordings if r.commands_sampled]
-        return cls(joined.dataset.assign_attrs({_PERIOD: max(sampled)} if sampled else {}))
+        dataset = with_outputs(joined.dataset, common_outputs([r.dataset for r in recordings]))
+        return cls(dataset.assign_attrs({_PERIOD: max(sampled)} if sampled else {}))
 
     # files
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...models.config.errors import UserError
+from .clock import epochs, in_words
 from .log_bytes import Progress, no_progress
 from .table import Table, numbers
 
@@ -48,10 +49,15 @@ _NO_NUMBER = "anNZ"
 
 @dataclass(frozen=True)
 class BinLog:
-    """Tables of a DataFlash log by message name, each with `t` (s since boot) and its fields."""
+    """Tables of a DataFlash log by message name, each with `t` (s since boot) and its fields.
+
+    `boots` are the times at which the clock stepped back; `shift` of a table is what was added to
+    its times, so that later parts follow earlier ones.
+    """
 
     tables: Mapping[str, Table]
     notes: tuple[str, ...]
+    boots: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -102,7 +108,7 @@ def read_bin(data: bytes, wanted: Collection[str], progress: Progress = no_progr
             unreadable.append(layout.name)
             continue
         tables[layout.name] = _decode(data, np.asarray(found), layout, dtype)
-    notes = []
+    boots, notes = _in_order(tables, {formats[n].name: np.asarray(o) for n, o in offsets.items()})
     if skipped:
         notes.append(f"{skipped} of {len(data)} bytes of the log are damaged and were skipped.")
     lost = {number: count for number, count in unknown.items() if count >= _RECURRING}
@@ -113,7 +119,26 @@ def read_bin(data: bytes, wanted: Collection[str], progress: Progress = no_progr
         )
     if unreadable:
         notes.append(f"Records of unknown layout were left out: {', '.join(sorted(unreadable))}.")
-    return BinLog(tables, tuple(notes))
+    return BinLog(tables, tuple(notes), boots)
+
+
+def _in_order(
+    tables: Mapping[str, Table], offsets: Mapping[str, np.ndarray]
+) -> tuple[tuple[float, ...], list[str]]:
+    """Add the column `shift` to every table; return the steps back of the clock, also in words."""
+    known = {name: np.isfinite(table["t"]) for name, table in tables.items() if table["t"].size}
+    if not known:
+        return (), []
+    at = np.concatenate([offsets[name][good] for name, good in known.items()])
+    raw = np.concatenate([tables[name]["t"][good] for name, good in known.items()])
+    order = np.argsort(at, kind="stable")
+    at = at[order]
+    shift, boots, steps = epochs(raw[order])
+    for name, table in tables.items():
+        i = np.clip(np.searchsorted(at, offsets[name], side="right") - 1, 0, None)
+        table["shift"] = shift[i] if at.size else np.zeros(table["t"].size)
+        table["t"] = table["t"] + table["shift"]
+    return boots, in_words(boots, steps)
 
 
 def _scan(

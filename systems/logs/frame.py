@@ -1,13 +1,14 @@
 """What kind of vehicle a log is of, and whether its frame fits its outputs."""
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
 from ...models.recordings.checks.commands import command_findings
 from ...models.recordings.checks.finding import Finding
+from ...models.recordings.outputs import in_words, outputs_of
 from ...models.recordings.store import Recording
 from ...models.vehicles.vehicle import load_vehicle
 from ..mavlink.codec import FRAME_THRUSTERS, NEUTRAL_US
@@ -146,10 +147,15 @@ def moves(pulses: np.ndarray) -> bool:
     return known.size > 0 and bool(np.ptp(known) > _MOVES_US)
 
 
-def settled(recording: Recording, turned: Collection[int]) -> tuple[Recording, list[Finding]]:
+def settled(
+    recording: Recording,
+    turned: Collection[int],
+    since: Sequence[tuple[float, tuple[int, ...]]] = (),
+) -> tuple[Recording, list[Finding]]:
     """Decide by the motion whether outputs with SERVOn_REVERSED are mirrored.
 
-    `turned` are the thrusters (from 1) whose PWM was mirrored for it. ArduSub's mixer writes
+    `turned` are the thrusters (from 1) whose PWM was mirrored for it, and where the parameters
+    changed, `since` are those that were from each time (s) on. ArduSub's mixer writes
     pulses that the parameter does not touch, pass-through and other firmware do. Where the
     mirrored outputs together contradict the motion and the recorded ones do not, these are
     restored; else each of which the motion says so.
@@ -158,24 +164,25 @@ def settled(recording: Recording, turned: Collection[int]) -> tuple[Recording, l
         return recording, []
     against = set(turned)
     severe = _severe(recording)
-    if not severe or _severe(_unmirrored(recording, turned)):
+    if not severe or _severe(_unmirrored(recording, turned, since)):
         reversed_ = [f.place for f in severe if f.word == "thruster-reversed"]
         against &= {int(place.rsplit("pwm", 1)[1]) for place in reversed_}
-    found = []
+    found, outputs = [], outputs_of(recording.dataset)
     for k in sorted(turned):
         told = (
             "but the motion says that it is not"
             if k in against
             else "and its PWM is mirrored about 1500"
         )
+        n = outputs[k - 1] if outputs else "n"
         found.append(
             Finding(
                 "output-reversed",
-                f"SERVOn_REVERSED of thruster {k}",
-                f"the output of thruster {k} is set to be reversed, {told}",
+                f"SERVO{n}_REVERSED of thruster {k}",
+                f"the output of {in_words(k, outputs)} is set to be reversed, {told}",
             )
         )
-    return _unmirrored(recording, against), found
+    return _unmirrored(recording, against, since), found
 
 
 def _severe(recording: Recording) -> list[Finding]:
@@ -184,10 +191,17 @@ def _severe(recording: Recording) -> list[Finding]:
     return [f for f in found if f.severity == "severe"]
 
 
-def _unmirrored(recording: Recording, thrusters: Collection[int]) -> Recording:
-    """The recording with the PWM of some thrusters (from 1) mirrored back."""
-    columns = [k - 1 for k in thrusters]
+def _unmirrored(
+    recording: Recording,
+    thrusters: Collection[int],
+    since: Sequence[tuple[float, tuple[int, ...]]],
+) -> Recording:
+    """The recording with the PWM of some thrusters (from 1) mirrored back where it was mirrored."""
     pwm = recording.dataset["pwm"]
     values = pwm.to_numpy().copy()
-    values[..., columns] = 2 * NEUTRAL_US - values[..., columns]
+    starts = recording.dataset["start_time"].to_numpy()
+    for j, k in np.argwhere(recording.lengths > 0).tolist():
+        own = [mirrored for t, mirrored in since if t <= starts[j, k] + recording.dt]
+        columns = [n - 1 for n in thrusters if not own or n in own[-1]]
+        values[j, k][:, columns] = 2 * NEUTRAL_US - values[j, k][:, columns]
     return Recording(recording.dataset.assign(pwm=(pwm.dims, values, pwm.attrs)))

@@ -10,12 +10,14 @@ import numpy as np
 from ...models.config.errors import UserError
 from ...models.recordings.checks.finding import enforce, with_findings
 from ...models.recordings.csv import METADATA, read_csv
+from ...models.recordings.outputs import with_outputs
 from ...models.recordings.schema import check_plausible
 from ...models.recordings.store import Recording
 from ...models.vehicles.vehicle import load_vehicle
 from .align import aligned, reference
 from .bags.bag import bag_kind
 from .bags.signals import read_bag
+from .consistency import motion_findings
 from .dataflash import read_bin
 from .frame import settled
 from .fuse import fuse
@@ -26,6 +28,7 @@ from .signals_dataflash import WANTED as BIN_WANTED
 from .signals_dataflash import signals_from_bin
 from .signals_tlog import AIDS, signals_from_tlog
 from .signals_tlog import WANTED as TLOG_WANTED
+from .sound import sound
 from .tlog import read_tlog
 
 RATES = (50.0, 40.0, 25.0, 20.0)
@@ -90,6 +93,7 @@ def import_log(  # long: a third of it says what it takes and refuses
         load_vehicle(vehicle)
     other = None if options.align is None else reference(options.align)
     damage, signals = _signals(path, vehicle, options, progress)
+    signals = sound(signals)
     enforce(str(path), signals.findings, accept)
     try:
         if other is not None:
@@ -129,9 +133,13 @@ def import_log(  # long: a third of it says what it takes and refuses
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
     period = 1.0 / signals.outputs.rate
+    bag = bag_kind(path) is not None  # its reader compares the axes of topics with the motion
+    moved = [] if bag else motion_findings(signals, trajectories, recording)
+    enforce(str(path), moved, accept)
     progress(1.0)
-    recording, settled_ = settled(recording, signals.turned)
-    dataset = with_findings(recording.dataset, [*signals.findings, *settled_])
+    recording = Recording(with_outputs(recording.dataset, signals.channels))
+    recording, settled_ = settled(recording, signals.turned, signals.turned_since)
+    dataset = with_findings(recording.dataset, [*signals.findings, *moved, *settled_])
     return Recording(dataset.assign_attrs(command_period=period)), report
 
 

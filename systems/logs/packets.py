@@ -18,6 +18,7 @@ _V2, _V1 = 0xFD, 0xFE
 _MAGICS = (_V2, _V1)
 _MAGIC = re.compile(rb"[\xfd\xfe]")
 _SIGNATURE = 13
+_COPY_S = 2.0
 _CODES = {
     "b": "i1",
     "B": "u1",
@@ -138,6 +139,22 @@ def _resync(data: bytes, start: int, size: int) -> int:
         if packet is not None and _sound(data, at, packet):
             return at - 8
     return size
+
+
+def repeated(data: bytes, packets: Packets, which: np.ndarray) -> np.ndarray:
+    """Which of the chosen packets came before, byte for byte with number and checksum.
+
+    A vehicle's packets are numbered from 0 to 255, so such copies within two seconds are not new.
+    """
+    stamps = packets.stamps(data)
+    seen: dict[bytes, float] = {}
+    found = np.zeros(which.size, bool)
+    for i in np.flatnonzero(which).tolist():
+        packet = data[packets.record[i] + 8 : packets.end[i]]
+        before = seen.get(packet)
+        found[i] = before is not None and abs(stamps[i] - before) < _COPY_S
+        seen[packet] = float(stamps[i])
+    return found
 
 
 @cache

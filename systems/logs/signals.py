@@ -61,6 +61,8 @@ class Signals:
         cuts: times at which a segment must end: resets, reboots.
         findings: what is wrong with the log.
         turned: thrusters (from 1) whose output was mirrored for SERVOn_REVERSED.
+        turned_since: those of them from each time (s) on, where it changed.
+        channels: output (from 1) of each thruster, 0 where none drives it; empty if unknown.
     """
 
     attitude: Series
@@ -82,6 +84,8 @@ class Signals:
     notes: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
     turned: tuple[int, ...] = ()
+    turned_since: tuple[tuple[float, tuple[int, ...]], ...] = ()
+    channels: tuple[int, ...] = ()
 
 
 def series(t: np.ndarray, x: ArrayLike, source: str, quantity: str) -> Series | None:
@@ -190,3 +194,14 @@ def parameters_of(
             strange.append(f"{name} {value:g}")
     said = [f"Parameters that can't be were left out: {', '.join(strange)}."] if strange else []
     return found, said
+
+
+def values_at(
+    parameters: Sequence[Parameter], name: str, t: np.ndarray, otherwise: float
+) -> np.ndarray:
+    """A parameter at times t: each value from its report on, the first one before it too."""
+    found = [(p.t, p.value) for p in parameters if p.name == name]
+    if not found:
+        return np.full(t.shape, otherwise)
+    times, values = (np.array(column) for column in zip(*found, strict=True))
+    return values[np.clip(np.searchsorted(times, t, side="right") - 1, 0, None)]

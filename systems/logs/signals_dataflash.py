@@ -12,8 +12,9 @@ from ..mavlink import codec
 from .dataflash import BinLog
 from .depth import in_water
 from .frame import firmware_findings, frame_said
-from .pressure import followed
+from .pressure import Followed, depth_series, followed, outside
 from .signals import (
+    Parameter,
     Series,
     Signals,
     Spans,
@@ -25,7 +26,7 @@ from .signals import (
 )
 from .streams import UNAIDED, aid_spans, missing_states
 from .table import Table, whole
-from .wiring import DIRECTION_CHANGED, Wiring, direction_findings, thruster_outputs, wiring
+from .wiring import Wiring, direction_findings, thruster_outputs, wiring
 
 _FILTERS = {
     3: {"XKF1": "XKF1", "XKF4": "XKF4", "XKQ": "XKQ", "XKQ1": "XKQ"},
@@ -50,6 +51,8 @@ WANTED = (
     "PARM",
     "RATE",
     "RCIN",
+    "RCO2",
+    "RCO3",
     "RCOU",
     "VISO",
     "VISP",
@@ -90,7 +93,7 @@ def signals_from_bin(
     wired = wiring(parameters, first, last, vehicle, frame_said(texts), channels)
     outputs, notes, frame = _outputs(tables["RCOU"], channels, wired, vehicle is not None)
     position, velocity = _motion(tables, core, known, density)
-    depth = followed(_pressure_depth(tables, known, density), position)
+    depth = _pressure_depth(tables, parameters, density, position)
     rates, rate_notes = _rates(tables, core)
     force = _imu(tables, core, "ACC", ("AccX", "AccY", "AccZ"), "specific force")
     if not rates.source.startswith("GYR"):  # GYR and ACC are the sensors before the filters
@@ -106,11 +109,11 @@ def signals_from_bin(
     batteries = [name for name in ("BAT",) if name in tables]
     findings = [*firmware_findings("MSG", texts), *frame, *stops]
     findings += [*missing_states(spans, voltage, batteries), *direction_findings(wired)]
+    findings += depth.findings
     return Signals(
         attitude=attitude,
         rates=rates,
         outputs=outputs,
-        vehicle=wired.vehicle,
         position=position,
         velocity=velocity,
         specific_force=force,
@@ -118,12 +121,12 @@ def signals_from_bin(
         voltage=voltage,
         rc=_rc(tables),
         spans={**spans, **no_aid},
-        cuts=tuple((t, DIRECTION_CHANGED) for t in wired.changes),
+        cuts=(*((t, "step back of the clock") for t in log.boots), *wired.cuts),
         has=(f"Horizontal aid: {', '.join(aids)}.",) if aids else (),
         lacks=() if aids else ("No DVL, odometry or vision record in the log.",),
         notes=(*log.notes, *strange, *wired.notes, *notes, *rate_notes, *depth.told),
         findings=tuple(findings),
-        turned=wired.turned,
+        **wired.of_signals(),
     )
 
 
@@ -161,6 +164,8 @@ def _usable(table: Table) -> Table:
         if values.ndim == 1 and values.dtype.kind == ("S" if text else "f"):
             kept[column] = values
     kept["t"] = kept["SampleUS" if "SampleUS" in kept else "TimeUS"] * 1e-6
+    if "shift" in kept:
+        kept["t"] = kept["t"] + kept["shift"]
     order = np.argsort(kept["t"], kind="stable")
     return kept.rows(order[(kept["t"][order] >= 0) & (kept["t"][order] < _LATEST_S)])
 
@@ -290,9 +295,11 @@ def _channels(tables: Mapping[str, Table]) -> np.ndarray:
         )
     table = tables["RCOU"]
     channels = np.zeros((32, table["t"].size))
-    for n in range(1, 15):
-        if f"C{n}" in table:
-            channels[n - 1] = table[f"C{n}"]
+    for rows in (tables[name] for name in ("RCOU", "RCO2", "RCO3") if name in tables):
+        at = np.clip(np.searchsorted(rows["t"], table["t"], side="right") - 1, 0, None)
+        for n in range(1, 33):
+            if f"C{n}" in rows:
+                channels[n - 1] = rows[f"C{n}"][at]
     return channels
 
 
@@ -306,31 +313,40 @@ def _outputs(
 
 
 def _pressure_depth(
-    tables: Mapping[str, Table], known: Mapping[str, float], density: float | None
-) -> Series | None:
+    tables: Mapping[str, Table],
+    parameters: Sequence[Parameter],
+    density: float | None,
+    position: Series | None,
+) -> Followed:
     """Depth by the second barometer, which is outside the hull, or else by the first there is.
 
     Up to ArduSub 4.0 each has records of its own name, later those of one name have an instance.
     """
     found = next((n for n in ("BAR2", "BARO", "BAR3") if n in tables), None)
     if found is None:
-        return None
-    gradient = codec.pascal_per_metre(known.get("BARO_SPEC_GRAV", 1.0), density)
+        return Followed(None)
     baro = _of(tables[found], "I", 1)
-    instance = int(whole(baro["I"])[0]) if "I" in baro else _BAROMETERS[found]
-    surface = known.get(f"BARO{instance + 1}_GND_PRESS", 0.0) / 100
-    surface = surface if 800 < surface < 1200 else codec.SURFACE_PRESSURE_HPA
-    depth = codec.depth_from_pressure(baro["Press"] / 100.0, surface, gradient)
-    return series(baro["t"], depth, found, "depth")
+    number = 1 + (int(whole(baro["I"])[0]) if "I" in baro else _BAROMETERS[found])
+    depth, wrong = depth_series(baro["t"], baro["Press"] / 100, found, parameters, number, density)
+    compared = followed(depth, position)
+    compared = outside(compared, "the second barometer") if number == 1 else compared
+    return replace(compared, findings=(*wrong, *compared.findings))
 
 
 def _voltage(tables: Mapping[str, Table]) -> Series | None:
+    """Voltage of the first monitor that has one."""
     if "BAT" not in tables:
         return None
-    column = "Inst" if "Inst" in tables["BAT"] else "Instance"
-    battery = _of(tables["BAT"], column, 0)
-    known = battery["Volt"] > 0
-    return series(battery["t"][known], battery["Volt"][known], "BAT", "voltage")
+    table = tables["BAT"]
+    column = next((name for name in ("Inst", "Instance") if name in table), None)
+    numbers = [0.0] if column is None else np.unique(table[column][np.isfinite(table[column])])
+    for number in numbers:
+        battery = table if column is None else table.rows(table[column] == number)
+        known = battery["Volt"] > 0
+        found = series(battery["t"][known], battery["Volt"][known], "BAT", "voltage")
+        if found is not None:
+            return found
+    return None
 
 
 def _rc(tables: Mapping[str, Table]) -> Series | None:

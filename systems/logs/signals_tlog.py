@@ -1,6 +1,7 @@
 """From telemetry messages to signals."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from ..mavlink import codec
 from .depth import in_water
 from .frame import firmware_findings, frame_said, kind_findings
 from .motion_tlog import motion
-from .pressure import followed
+from .pressure import Followed, depth_series, followed, outside
 from .signals import (
     Parameter,
     Series,
@@ -24,7 +25,7 @@ from .signals import (
 from .streams import aid_spans, missing_states
 from .table import Table
 from .tlog import TlogLog
-from .wiring import DIRECTION_CHANGED, Wiring, direction_findings, thruster_outputs, wiring
+from .wiring import Wiring, direction_findings, thruster_outputs, wiring
 
 WANTED = (
     "ATTITUDE",
@@ -51,7 +52,7 @@ AIDS = ("VISION_POSITION_DELTA", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIM
 _FIX_3D = 3
 
 
-def signals_from_tlog(
+def signals_from_tlog(  # long: a line for each stream of a log
     log: TlogLog, vehicle: str | None = None, density: float | None = None
 ) -> Signals:
     """Convert a vehicle's messages; `vehicle` and `density` as in `import_log`.
@@ -75,7 +76,7 @@ def signals_from_tlog(
     outputs, notes, frame = _outputs(outputs_table, wired, vehicle is not None)
     moved, aiding, motion_notes = motion(tables)
     position, velocity = in_water(*moved, known, density)
-    depth = followed(_pressure_depth(tables, known, density), position)
+    depth = _pressure_depth(tables, parameters, density, position)
     rates, bias_note = _rates(tables, attitude)
     rates, rate_delay = undelayed(rates, known, "INS_GYRO_FILTER")
     force, force_delay = _specific_force(tables, known)
@@ -86,13 +87,18 @@ def signals_from_tlog(
     voltage = _voltage(tables)
     batteries = [name for name in ("BATTERY_STATUS", "SYS_STATUS") if name in tables]
     findings = kind_findings(*log.kind) or firmware_findings("STATUSTEXT", texts, log.kind[1])
-    findings += [*frame, *stops, *missing_states(spans, voltage, batteries)]
+    findings += [
+        *log.findings,
+        *frame,
+        *stops,
+        *missing_states(spans, voltage, batteries),
+        *depth.findings,
+    ]
     has = [f"Horizontal aid: {', '.join(aids)}."] if aids else []
     return Signals(
         attitude=attitude,
         rates=rates,
         outputs=outputs,
-        vehicle=wired.vehicle,
         position=position,
         velocity=velocity,
         specific_force=force,
@@ -102,13 +108,13 @@ def signals_from_tlog(
         spans=spans,
         cuts=(
             *((t, "reboot of the autopilot") for t in log.boots),
-            *((t, DIRECTION_CHANGED) for t in wired.changes),
+            *wired.cuts,
         ),
         has=tuple(has),
         lacks=() if aids else ("No DVL, odometry, vision or GPS message in the log.",),
         notes=(*log.notes, *strange, *wired.notes, *notes, *motion_notes, *told),
         findings=(*findings, *direction_findings(wired)),
-        turned=wired.turned,
+        **wired.of_signals(),
     )
 
 
@@ -192,9 +198,9 @@ def _outputs(table: Table, wired: Wiring, named: bool) -> tuple[Series, list[str
     tell which.
     """
     ports = {int(port): table.rows(table["port"] == port) for port in np.unique(table["port"])}
-    first = 17 if any(channel > 16 for channel in wired.channels) else 9
+    wanted = wired.outputs
+    first = 17 if any(channel > 16 for channel in wanted) else 9
     starts = {0: 1, 1: first}
-    wanted = {channel for channel in wired.channels if channel}
     driving = [p for p, start in starts.items() if wanted & set(range(start, start + 16))]
     main = max(
         (p for p in ports if p in starts),
@@ -235,31 +241,37 @@ def _silent(rows: Table, wanted: set[int]) -> bool:
 
 
 def _pressure_depth(
-    tables: Mapping[str, Table], known: Mapping[str, float], density: float | None
-) -> Series | None:
-    gradient = codec.pascal_per_metre(known.get("BARO_SPEC_GRAV", 1.0), density)
-    for name, parameter in (
-        ("SCALED_PRESSURE2", "BARO2_GND_PRESS"),
-        ("SCALED_PRESSURE", "BARO1_GND_PRESS"),
-    ):
-        table = tables.get(name)
-        if table is None or np.median(table["press_abs"]) < 500:
+    tables: Mapping[str, Table],
+    parameters: Sequence[Parameter],
+    density: float | None,
+    position: Series | None,
+) -> Followed:
+    """Depth by the second barometer, which is outside the hull, or else by the first."""
+    findings: list[Finding] = []
+    for name, number in (("SCALED_PRESSURE2", 2), ("SCALED_PRESSURE", 1)):
+        if (table := tables.get(name)) is None:
             continue
-        surface = known.get(parameter, 0.0) / 100.0
-        surface = surface if 800 < surface < 1200 else codec.SURFACE_PRESSURE_HPA
-        depth = codec.depth_from_pressure(table["press_abs"], surface, gradient)
-        return series(table["t"], depth, name, "depth")
-    return None
+        depth, wrong = depth_series(
+            table["t"], table["press_abs"], name, parameters, number, density
+        )
+        findings += wrong
+        if depth is not None:
+            found = followed(depth, position)
+            found = outside(found, "SCALED_PRESSURE2") if number == 1 else found
+            return replace(found, findings=(*findings, *found.findings))
+    return Followed(None, findings=tuple(findings))
 
 
 def _voltage(tables: Mapping[str, Table]) -> Series | None:
+    """Voltage of the first monitor that has one: 0 unless that is unknown, or has a number."""
     if (battery := tables.get("BATTERY_STATUS")) is not None:
-        main = battery["id"] == battery["id"].min()  # 0, unless the monitor has another number
-        volts = np.asarray(codec.pack_voltage(battery["voltages"][main].T.astype(float)))
-        known = np.isfinite(volts)
-        found = series(battery["t"][main][known], volts[known], "BATTERY_STATUS", "voltage")
-        if found is not None:
-            return found
+        for number in np.unique(battery["id"]).tolist():
+            rows = battery.rows(battery["id"] == number)
+            volts = np.asarray(codec.pack_voltage(rows["voltages"].T.astype(float)))
+            known = np.isfinite(volts)
+            found = series(rows["t"][known], volts[known], "BATTERY_STATUS", "voltage")
+            if found is not None:
+                return found
     if (status := tables.get("SYS_STATUS")) is not None:
         volts = np.asarray(codec.volts(status["voltage_battery"]))
         known = np.isfinite(volts)

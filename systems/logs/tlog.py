@@ -16,16 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...models.config.errors import UserError
+from ...models.recordings.checks.finding import Finding
+from .clock import REBOOT_S, epochs, in_words, rate_findings
 from .log_bytes import Progress, no_progress
-from .packets import Packets, message_id, message_name, rows_of, scan
+from .packets import Packets, message_id, message_name, repeated, rows_of, scan
 from .table import Table, numbers
 
 _GROUND_STATION, _NO_AUTOPILOT, _SUBMARINE = 6, 8, 12
 _CLOCKS = ("ATTITUDE", "ATTITUDE_QUATERNION", "SYSTEM_TIME")
-_REBOOT_S = 5.0
-_BETWEEN_BOOTS_S = 10.0
 _WRAP_US_S = 2**32 * 1e-6
-_WRAP_MS_S = 2**32 * 1e-3
 
 System = tuple[int, int]
 
@@ -35,7 +34,7 @@ class TlogLog:
     """Tables of one vehicle's messages by name, each with `t` (s since first boot) and its fields.
 
     `kind` are MAV_TYPE and MAV_AUTOPILOT of its heartbeat, -1 without one.
-    `boots` are the times at which a later boot starts (none for a log of one boot), `heard` counts
+    `boots` are the times at which a later boot starts, or the clock stepped back, `heard` counts
     all messages of all systems by (name, system, component).
     """
 
@@ -45,6 +44,7 @@ class TlogLog:
     boots: tuple[float, ...]
     heard: Mapping[tuple[str, int, int], int]
     notes: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
 
 
 def read_tlog(
@@ -65,6 +65,8 @@ def read_tlog(
     heard = _heard(packets)
     chosen, kind, notes = _choose(data, packets, heard, system)
     own = (packets.system == chosen[0]) & (packets.component == chosen[1])
+    twice = repeated(data, packets, own)
+    own &= ~twice
     tables: dict[str, Table] = {}
     index: dict[str, np.ndarray] = {}
     broken = 0
@@ -81,13 +83,17 @@ def read_tlog(
                 clean = {f: numbers(x) if x.dtype.kind == "f" else x for f, x in columns.items()}
                 tables[name] = Table(name, clean)
         progress(0.7 + 0.1 * n / len(names))
-    boots, clock_note = _put_on_vehicle_clock(tables, index, packets.stamps(data))
+    boots, clock_note, findings = _put_on_vehicle_clock(tables, index, packets.stamps(data))
+    if twice.any():
+        notes.append(
+            f"{np.count_nonzero(twice)} messages came twice, as by two links, and were read once."
+        )
     if packets.skipped:
         notes.append(f"{packets.skipped} of {len(data)} bytes are damaged and were skipped.")
     if broken:
         notes.append(f"{broken} messages with a wrong checksum were left out.")
     notes.extend(clock_note)
-    return TlogLog(tables, chosen, kind, boots, heard, tuple(notes))
+    return TlogLog(tables, chosen, kind, boots, heard, tuple(notes), tuple(findings))
 
 
 def _heard(packets: Packets) -> dict[tuple[str, int, int], int]:
@@ -142,7 +148,7 @@ def _choose(
 
 def _put_on_vehicle_clock(
     tables: dict[str, Table], index: dict[str, np.ndarray], stamps: np.ndarray
-) -> tuple[tuple[float, ...], list[str]]:
+) -> tuple[tuple[float, ...], list[str], list[Finding]]:
     """Add the column `t` to every table and sort by it; see the module's docstring."""
     timed = [name for name in tables if "time_boot_ms" in tables[name]]
     if not timed:
@@ -154,12 +160,14 @@ def _put_on_vehicle_clock(
     raw = np.concatenate([tables[name]["time_boot_ms"] * 1e-3 for name in timed])
     order = np.argsort(at, kind="stable")
     at, raw = at[order], raw[order]
-    shift, boots = _epochs(raw)
+    shift, boots, steps = epochs(raw)
     base = raw + shift
-    notes = _clock_notes(base, stamps[at], boots)
+    notes = [*in_words(boots, steps), *_clock_notes(base, stamps[at], boots)]
+    newest = np.maximum.accumulate(base)  # a message that came late tells no time to others
+    latest = np.maximum.accumulate(np.where(base == newest, np.arange(base.size), 0))
     for name, table in tables.items():
         i = np.clip(np.searchsorted(at, index[name], side="right") - 1, 0, at.size - 1)
-        elapsed = np.clip(stamps[index[name]] - stamps[at[i]], -1.0, 1.0)
+        elapsed = np.clip(stamps[index[name]] - stamps[at[latest[i]]], -1.0, 1.0)
         if "time_boot_ms" in table:
             t = table["time_boot_ms"] * 1e-3 + shift[i]
         elif "time_usec" in table:
@@ -167,34 +175,18 @@ def _put_on_vehicle_clock(
             usec = table["time_usec"] * 1e-6
             if table["time_usec"].dtype.itemsize == 4:
                 usec = usec + _WRAP_US_S * np.round((near - usec) / _WRAP_US_S)
-            t = np.where(np.abs(usec - near) < _REBOOT_S, usec, near) + shift[i]
+            t = np.where(np.abs(usec - near) < REBOOT_S, usec, near) + shift[i]
         else:
-            t = base[i] + elapsed
+            t = newest[i] + elapsed
         table["t"] = t
         sorting = np.argsort(t, kind="stable")
         tables[name] = table.rows(sorting)
-    return boots, notes
-
-
-def _epochs(raw: np.ndarray) -> tuple[np.ndarray, tuple[float, ...]]:
-    """Offset of each boot time so that later boots follow earlier ones, and the boots' starts."""
-    back = np.flatnonzero(np.diff(raw) < -_REBOOT_S) + 1
-    shift = np.zeros_like(raw)
-    boots = []
-    for start in back:
-        before = raw[start - 1] + shift[start - 1]
-        if raw[start - 1] - raw[start] > _WRAP_MS_S / 2:  # the 32-bit ms counter wrapped (49.7 d)
-            shift[start:] = shift[start - 1] + _WRAP_MS_S
-            continue
-        shift[start:] = before + _BETWEEN_BOOTS_S - raw[start]
-        boots.append(float(before + _BETWEEN_BOOTS_S / 2))
-    return shift, tuple(boots)
+    order = np.argsort(base, kind="stable")
+    return boots, notes, rate_findings(base[order], stamps[at][order])
 
 
 def _clock_notes(base: np.ndarray, stamps: np.ndarray, boots: tuple[float, ...]) -> list[str]:
     notes = []
-    if boots:
-        notes.append(f"The autopilot booted {len(boots)} more time{'s' * (len(boots) > 1)} in it.")
     lag = stamps - base
     jumps = np.abs(np.diff(lag)) > 2.0
     jumps &= ~np.isin(np.searchsorted(boots, base[1:]) - np.searchsorted(boots, base[:-1]), (1,))

@@ -3,12 +3,14 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from ...models.config.errors import UserError
 from ...models.recordings.checks.finding import Finding
+from ...models.recordings.outputs import in_words
 from ...models.vehicles.vehicle import load_vehicle
 from ..mavlink.codec import (
     FRAME_THRUSTERS,
@@ -17,6 +19,7 @@ from ..mavlink.codec import (
     THRUSTER_INPUTS,
     thruster_pwm,
 )
+from .drives import CHANGED, SETTLING_S, Drive, drive_findings, drives
 from .frame import frame_findings, frame_in_words, moves
 from .signals import Parameter, Series, Spans, series
 
@@ -30,41 +33,57 @@ class Wiring:
 
     Attributes:
         vehicle: preset or file.
-        channels: output of each thruster (1-based), 0 where none drives it.
-        mirrored: those that turn the other way than in the vehicle's file, by time: from each
-            time on (s).
+        drives: output and direction of each thruster, by time.
         spans: of reassigned outputs.
         frame: FRAME_CONFIG, if the log has it, or the frame that the autopilot named.
         frame_source: where the log has the frame, in words.
         said: the frame that the autopilot named, by its FRAME_CONFIG.
         motors: motor of each output channel (from 1) that has one.
-        turned: thrusters (from 1) whose output has SERVOn_REVERSED.
     """
 
     vehicle: str
-    channels: tuple[int, ...]
-    mirrored: tuple[tuple[float, tuple[bool, ...]], ...]
+    drives: tuple[Drive, ...]
     spans: Spans
     notes: tuple[str, ...]
     frame: int | None = None
     frame_source: str = ""
     said: int | None = None
     motors: Mapping[int, int] = field(default_factory=dict)
-    turned: tuple[int, ...] = ()
 
     @property
-    def changes(self) -> tuple[float, ...]:
-        """Times (s) at which a thruster's direction changed."""
-        return tuple(t for t, _ in self.mirrored[1:])
+    def cuts(self) -> tuple[tuple[float, str], ...]:
+        """Times (s) at which an output or a direction changed, and what it was."""
+        return tuple((t, CHANGED) for drive in self.drives for t in drive.cuts)
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """Output (from 1) of each thruster, 0 where none drives it; empty if it changed."""
+        every = {drive.channels for drive in self.drives}
+        return self.drives[0].channels if len(every) == 1 else ()
+
+    @property
+    def outputs(self) -> set[int]:
+        """All outputs that ever drove a thruster."""
+        return {channel for drive in self.drives for channel in drive.channels if channel}
+
+    @property
+    def turned(self) -> tuple[int, ...]:
+        """Thrusters (from 1) whose output ever had SERVOn_REVERSED."""
+        return tuple(sorted({k for drive in self.drives for k in drive.turned}))
+
+    def of_signals(self) -> dict[str, Any]:
+        """The attributes of `Signals` that the wiring determines."""
+        return {
+            "vehicle": self.vehicle,
+            "turned": self.turned,
+            "turned_since": tuple((drive.since, drive.turned) for drive in self.drives),
+            "channels": self.channels,
+        }
 
     def frame_findings(self, outputs_us: Float[np.ndarray, "32 n"], named: bool) -> list[Finding]:
         """Contradictions of the frame; `named` tells whether the user named a vehicle."""
         given = self.frame, self.frame_source, self.said
         return frame_findings(*given, self.motors, outputs_us, named)
-
-
-DIRECTION_CHANGED = "change of a thruster's direction"
-_SETTLING_S = 1.3  # an output's new function is in force by then
 
 
 def wiring(
@@ -86,7 +105,7 @@ def wiring(
     Raises:
         UserError: the log's frame has another number of thrusters than the named vehicle.
     """
-    functions, directions, reverse, frame = _parsed(parameters)
+    functions, frame = _parsed(parameters)
     motor_of = {
         channel: next((f - 32 for _, f in history if f in MOTOR_FUNCTIONS), None)
         for channel, history in sorted(functions.items())
@@ -97,68 +116,39 @@ def wiring(
         frame, source = said, frame_in_words(said)
     name, notes = _vehicle(vehicle, frame, source, channel_of, functions, pulses)
     mounts = load_vehicle(name).propulsion.mounts
-    channels, told = _channels(len(mounts), channel_of, functions)
-    if not directions:
+    _, told = _channels(len(mounts), channel_of, functions)
+    if not any(re.fullmatch(r"MOT_[1-8]_DIRECTION", p.name) for p in parameters):
         told.append("No MOT_n_DIRECTION in the log: all directions are taken as +1.")
     changes = _label_changes({c: functions[c] for c in channel_of.values()})
-    motors = {channel: motor for channel, motor in motor_of.items() if motor is not None}
-    turned = tuple(k for k, c in enumerate(channels, 1) if c in motors and reverse.get(c, False))
-    own = [(mount.motor < 0) != (k in turned) for k, mount in enumerate(mounts, 1)]
     return Wiring(
         name,
-        tuple(channels),
-        _mirrored(own, directions),
+        drives(
+            parameters,
+            [mount.motor for mount in mounts],
+            lambda channel_of: _channels(len(mounts), channel_of, functions)[0],
+        ),
         _settled(changes, first, last),
         (*notes, *told),
         frame,
         source,
         said,
-        motors,
-        turned,
+        {channel: motor for channel, motor in motor_of.items() if motor is not None},
     )
 
 
 def _parsed(
     parameters: Sequence[Parameter],
-) -> tuple[
-    dict[int, list[tuple[float, int]]], list[tuple[float, int, int]], dict[int, bool], int | None
-]:
-    """Functions of outputs by time, directions of motors by time, reversed outputs, frame."""
+) -> tuple[dict[int, list[tuple[float, int]]], int | None]:
+    """Functions of outputs by time, and the frame."""
     functions: dict[int, list[tuple[float, int]]] = {}
-    directions: list[tuple[float, int, int]] = []
-    reverse: dict[int, bool] = {}
     frame = None
     for p in parameters:
         servo = re.fullmatch(r"SERVO([1-9]|[12][0-9]|3[0-2])_FUNCTION", p.name)
-        turned = re.fullmatch(r"SERVO([1-9]|[12][0-9]|3[0-2])_REVERSED", p.name)
-        motor = re.fullmatch(r"MOT_([1-8])_DIRECTION", p.name)
         if servo:
             functions.setdefault(int(servo[1]), []).append((p.t, round(p.value)))
-        elif motor:
-            directions.append((p.t, int(motor[1]), -1 if p.value < 0 else 1))
-        elif turned:
-            reverse[int(turned[1])] = p.value > 0
         elif p.name == "FRAME_CONFIG":
             frame = round(p.value)
-    return functions, directions, reverse, frame
-
-
-def _mirrored(
-    own: Sequence[bool], directions: Sequence[tuple[float, int, int]]
-) -> tuple[tuple[float, tuple[bool, ...]], ...]:
-    """Which thrusters are mirrored from when on; a value's first report holds before it too."""
-    now: dict[int, int] = {}
-    for _, motor, sign in directions:
-        now.setdefault(motor, sign)
-    found = [(-np.inf, now.copy())]
-    for t, motor, sign in directions:
-        if now[motor] != sign:
-            now[motor] = sign
-            found.append((t, now.copy()))
-    return tuple(
-        (t, tuple(is_ != (signs.get(k, 1) < 0) for k, is_ in enumerate(own, 1)))
-        for t, signs in found
-    )
+    return functions, frame
 
 
 _Functions = Mapping[int, Sequence[tuple[float, int]]]
@@ -204,14 +194,19 @@ def _by_outputs(
         return PRESETS[_USUAL], ""
     rows = [channel_of.get(n, n) - 1 for n in range(1, _USUAL + 1)]
     count = moving_thrusters(pulses[[row for row in rows if row < len(pulses)]])
-    why = ", as outputs 7 and 8 stand still while the others move" if count != _USUAL else ""
+    why = ", as outputs 7 and 8 do not both move, while the others do" if count != _USUAL else ""
     return PRESETS[count], why
 
 
 def moving_thrusters(pulses: Float[np.ndarray, "c n"]) -> int:
-    """Thrusters that outputs (µs) drive: six if 7 and 8 stand still while the others move."""
+    """Thrusters that outputs (µs) drive: six if 7 and 8 don't both move while the others do.
+
+    All eight of a Heavy are driven as soon as it holds its attitude; a camera's tilt or a lamp may
+    move alone.
+    """
     driven = [moves(x) for x in pulses[:_USUAL]]
-    return 6 if len(driven) >= 6 and all(driven[:6]) and not any(driven[6:]) else _USUAL
+    eight = len(driven) == _USUAL and all(driven[6:])
+    return 6 if len(driven) >= 6 and all(driven[:6]) and not eight else _USUAL
 
 
 def _drives(history: Sequence[tuple[float, int]]) -> bool:
@@ -249,16 +244,8 @@ def _channels(
 
 
 def direction_findings(wired: Wiring) -> list[Finding]:
-    """A finding for each change of MOT_n_DIRECTION during the log."""
-    return [
-        Finding(
-            "output-direction",
-            f"{t:.1f} s on the vehicle's clock",
-            "MOT_n_DIRECTION changed: the log is cut there, and each part has its own signs",
-            "leave the parameter alone during a dive",
-        )
-        for t in wired.changes
-    ]
+    """A finding for each change of an output or a direction during the log."""
+    return drive_findings(wired.drives)
 
 
 def _label_changes(functions: Mapping[int, Sequence[tuple[float, int]]]) -> list[tuple[float, str]]:
@@ -284,7 +271,7 @@ def _settled(changes: Sequence[tuple[float, str]], first: float, last: float) ->
     start, stop, labels = [], [], []
     times = [t for t, _ in changes[1:]] + [last]
     for (t, label), until in zip(changes, times, strict=True):
-        begin = first if np.isinf(t) else t + _SETTLING_S
+        begin = first if np.isinf(t) else t + SETTLING_S
         if until > begin:
             start.append(begin)
             stop.append(until)
@@ -300,10 +287,10 @@ def thruster_outputs(
     Where the log's MOT_n_DIRECTION differs from it, the value is mirrored about 1500.
     """
     notes = []
-    index = np.array(wired.channels)[:, None]
-    raw = np.where(index > 0, channels_us[index[:, 0] - 1], 0)
-    since = np.searchsorted([start for start, _ in wired.mirrored[1:]], t, side="right")
-    mirrored = np.array([signs for _, signs in wired.mirrored])[since].T
+    since = np.searchsorted([drive.since for drive in wired.drives[1:]], t, side="right")
+    index = np.array([drive.channels for drive in wired.drives])[since].T
+    mirrored = np.array([drive.mirrored for drive in wired.drives])[since].T
+    raw = np.where(index > 0, np.take_along_axis(channels_us, np.maximum(index - 1, 0), 0), 0)
     by_direction = mirrored[:, -1:] if t.size else mirrored
     named = [i for i in np.flatnonzero(by_direction) if i + 1 not in wired.turned]
     if named:
@@ -312,9 +299,12 @@ def thruster_outputs(
             f"Thrusters {which} run the other way than in the vehicle's description "
             "(MOT_n_DIRECTION); their PWM is mirrored about 1500."
         )
-    dead = (raw == 0).all(axis=1) & (index[:, 0] > 0)
+    dead = (raw == 0).all(axis=1) & (index > 0).all(axis=1)
     if dead.any():
-        which = ", ".join(str(i + 1) for i in np.flatnonzero(dead))
+        which = ", ".join(in_words(int(i) + 1, wired.channels)[9:] for i in np.flatnonzero(dead))
         notes.append(f"Thrusters {which} never got a pulse; they are taken as stopped.")
+    if any(c not in (0, k) for k, c in enumerate(wired.channels, 1)):
+        which = ", ".join(in_words(k, wired.channels)[9:] for k in range(1, len(index) + 1))
+        notes.append(f"Thrusters by output: {which}.")
     signs = np.where(mirrored, -1, 1)
     return series(t, thruster_pwm(raw, signs), source, "pwm"), notes

@@ -13,11 +13,12 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ...se3 import AXES, WRENCH
+from ...se3 import WRENCH
 from ...vehicles.vehicle import Vehicle
 from ..commands import voltage_of
+from ..outputs import outputs_of
 from ..store import Recording
-from .command_sentences import (
+from .command_words import (
     dead_thruster,
     exchanged_columns,
     exchanged_thrusters,
@@ -25,21 +26,16 @@ from .command_sentences import (
     no_commands,
     reversed_axes,
     reversed_thruster,
-    silent_axis,
+    shifted,
+    shifted_apart,
+    silent,
+    turned_heading,
 )
 from .finding import Finding
-from .hypotheses import ALL, CAUSAL, PLAUSIBLE, Driven
+from .heading import heading_offset
+from .hypotheses import ALL, CAUSAL, EVIDENCE, MOST, PLAUSIBLE, Driven, named
 from .response import LAGS_S, AxisResponse, responses
 
-_EVIDENCE = 12.0
-"""Nats by which a named hypothesis is more likely than the recorded order: 6e-6 by chance, some
-hundred hypotheses together 1e-3."""
-_MAINLY = 0.75
-"""Share of the largest effect of a change, from which on an axis is one that it acts on mainly."""
-_CONTRARY = 3.0
-"""Nats that an axis may lose by chance under a hypothesis that is true: less than 1 in 20."""
-_MOST = 0.5
-"""Share that a named hypothesis accounts for, and most of the rest that it leaves."""
 _HARDLY, _SURE = 10.0, 0.9
 """Commanded force over the force that the motion shows, above which no vehicle's numbers explain
 it; the largest share of a force that a command is expected to make up."""
@@ -47,11 +43,19 @@ _DEAD = 0.15
 _STRONG = 0.04
 """Share of a thruster's largest thrust, that of a fifth of its command: four to six times what its
 dead band takes."""
+_CONTRARY = 3.0
+"""Nats that an axis may lose by chance under a hypothesis that is true: less than 1 in 20."""
 _NO_FORCE = 1e-3
 """N or N·m below which nothing is driven; pulses in a thruster's dead band give up to 1e-6 N."""
 _FACTORS = np.round(np.arange(-1.5, 1.51, 0.05), 2)
 _LEAST_COUNT = 20.0
 """Independent windows below which nothing is said of an axis."""
+_MAIN = 0.7
+"""Share of the largest lever on an axis from which on a thruster mainly drives it."""
+_LINEAR, _ANGULAR = (0, 1, 2), (3, 4, 5)
+_APART_S = 0.25
+"""s by which the answers of velocities and of rates may differ: thrusters give both the same lag,
+which is known to a step of `LAGS_S` in each."""
 
 
 def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Finding]:
@@ -69,8 +73,8 @@ def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Find
         if r.count >= _LEAST_COUNT
     }
     data = _data(axes, weights, names, vehicle)
-    if vehicle is not None:
-        data = replace(data, driven=_strong(forces[mask], vehicle))
+    judged = () if vehicle is None else _strong(forces[mask], vehicle)
+    data = replace(data, outputs=outputs_of(recording.dataset), judged=judged)
     # an axis without a command tells nothing of the order of columns
     driven = replace(data, axes={i: r for i, r in axes.items() if data.given[i] > 0})
     if not driven.axes:
@@ -79,13 +83,16 @@ def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Find
     nats, found = _orders(driven, wrench)
     if not wrench:
         more, thrusters = _thrusters(driven)
-        found = thrusters if more > nats else found
+        nats, found = (more, thrusters) if more > nats else (nats, found)
+    offset = heading_offset(recording, forces, driven)
+    if offset is not None and offset[0] > nats:
+        found = [turned_heading(offset[1])]
     if found:
         return found
-    silent = [i for i in driven.axes if _unanswered(data, i)]
-    if silent and not any(_answered(data, i) for i in driven.axes):
-        return [no_answer(data, silent)]
-    return [silent_axis(data, i) for i in silent] + _lag(driven)
+    unanswered = [i for i in driven.axes if _unanswered(data, i)]
+    if unanswered and not any(_answered(data, i) for i in driven.axes):
+        return [no_answer(data, unanswered)]
+    return [silent(data, i) for i in unanswered] + _lags(driven)
 
 
 def _columns(
@@ -109,11 +116,12 @@ def _columns(
 
 
 def _strong(forces: np.ndarray, vehicle: Vehicle) -> tuple[int, ...]:
-    """Thrusters that for a while gave enough thrust to be judged: near its dead band, a thruster's
-    curve does not tell its thrust to a factor.
+    """Thrusters that for a while gave enough thrust to be judged.
+
+    Near its dead band a thruster's curve does not tell its thrust to a factor.
     """
     low, high = (np.asarray(limit) for limit in vehicle.thrusters().force_limits())
-    if forces.shape[-1] != len(vehicle.propulsion.mounts):
+    if forces.shape[-1] != len(low):
         return ()
     often = np.percentile(np.abs(forces), 95, axis=0)
     return tuple(np.flatnonzero(often > _STRONG * np.minimum(-low, high)).tolist())
@@ -153,7 +161,7 @@ def _nats(data: Driven, axis: int) -> float:
 
 
 def _answered(data: Driven, axis: int) -> bool:
-    return _nats(data, axis) > _EVIDENCE and data.given[axis] < _HARDLY * data.needed[axis]
+    return _nats(data, axis) > EVIDENCE and data.given[axis] < _HARDLY * data.needed[axis]
 
 
 def _unanswered(data: Driven, axis: int) -> bool:
@@ -163,13 +171,13 @@ def _unanswered(data: Driven, axis: int) -> bool:
     """
     times = data.given[axis] / max(data.needed[axis], 1e-12)
     expected = -0.5 * data.axes[axis].count * np.log1p(-min(times**2, _SURE))
-    return times > _HARDLY or bool(expected > 3 * _EVIDENCE and _nats(data, axis) < _EVIDENCE)
+    return times > _HARDLY or bool(expected > 3 * EVIDENCE and _nats(data, axis) < EVIDENCE)
 
 
 def _orders(data: Driven, wrench: bool) -> tuple[float, list[Finding]]:
     """Columns of a wrench in another order, and axes whose command has the other sign.
 
-    Returns the evidence for it, less `_EVIDENCE` for each change, and the findings.
+    Returns the evidence for it, less `EVIDENCE` for each change, and the findings.
     """
     pairs = np.moveaxis(np.stack([data.weights, -data.weights], axis=-1), 1, 0)  # m, column, sign
     own = sorted(data.axes)
@@ -193,9 +201,9 @@ def _orders(data: Driven, wrench: bool) -> tuple[float, list[Finding]]:
     moved = [
         (i, j, int(sign))
         for i, j, sign, share in moves
-        if (i, 1) != (j, sign) and _named(float(kept[i][0]), float(share), data.axes[i].count)
+        if (i, 1) != (j, sign) and named(float(kept[i][0]), float(share), data.axes[i].count)
     ]
-    worth = best - float(usual[0]) - _EVIDENCE * len(moved)
+    worth = best - float(usual[0]) - EVIDENCE * len(moved)
     if not moved or worth < 0:
         return 0.0, []
     if any(i != j for i, j, _ in moved):
@@ -203,78 +211,102 @@ def _orders(data: Driven, wrench: bool) -> tuple[float, list[Finding]]:
     return worth, [reversed_axes(data, moved, wrench)]
 
 
-def _named(usual: float, share: float, count: float) -> bool:
-    """Whether a hypothesis on one axis is clearly better than the recorded order."""
-    rest = (1 - share) / (1 - usual)
-    return share >= _MOST and rest < _MOST and bool(-0.5 * count * np.log(rest) > _EVIDENCE)
-
-
-def explains(
-    data: Driven,
-    weights: np.ndarray,
-    usual: dict[int, float],
-    shares: dict[int, float],
-) -> bool:
-    """Whether changed weights are clearly better on an axis, and on none of their own worse.
-
-    Thrusters show where they act most. A gain elsewhere, or at the expense of such an axis, is a
-    force that the vehicle's numbers lack, such as the pitch that thrust in surge makes.
-    """
-    largest = np.maximum(np.abs(data.weights).max(axis=1), 1e-12)
-    change = np.abs(weights - data.weights).max(axis=1) / largest
-    main = [i for i in data.axes if change[i] >= _MAINLY * change.max()]
-    named = [_named(usual[i], shares[i], data.axes[i].count) for i in main]
-    lost = [0.5 * data.axes[i].count * (np.log1p(-shares[i]) - np.log1p(-usual[i])) for i in main]
-    return any(named) and bool(max(lost) < _CONTRARY)
-
-
 def _thrusters(data: Driven) -> tuple[float, list[Finding]]:
     """Thrusters that push the other way, are exchanged or dead; as `_orders` returns them."""
-    flips = [("reversed", k, k) for k in data.driven]
-    swaps = [("exchanged", a, b) for a, b in combinations(data.driven, 2)]
+    if not data.judged:
+        return 0.0, []
+    flips = [("reversed", k, k) for k in data.judged]
+    flips += [("reversed", a, b) for a, b in combinations(data.judged, 2)]
+    swaps = [("exchanged", a, b) for a, b in combinations(data.judged, 2)]
     usual, first, _ = data.best(data.weights[..., None], PLAUSIBLE)
     chains = [_chain(data, options) for options in (flips, swaps, flips + swaps) if options]
-    if not chains:
-        return 0.0, []
     worth, weights, changes = max(chains, key=lambda chain: chain[0])
     _, last, lags = data.best(weights[..., None], PLAUSIBLE)
     before, after = ({i: float(s[0]) for i, s in shares.items()} for shares in (first, last))
-    if changes and not explains(data, weights, before, after):
+    if changes and loses(data, weights, before, after):
         worth, weights, changes, last = float(usual[0]), data.weights, [], first
-    dead = [k for k in data.driven if _is_dead(data, weights, k, last, int(lags[0]))]
+    dead = [k for k in data.judged if _is_dead(data, weights, k, last, int(lags[0]))]
+    turned = {k for kind, a, b in changes if kind == "reversed" for k in (a, b)}
     found = [
-        reversed_thruster(data, a) if kind == "reversed" else exchanged_thrusters(data, a, b)
-        for kind, a, b in sorted(changes)
-        if a not in dead
+        exchanged_thrusters(data, a, b) for kind, a, b in sorted(changes) if kind != "reversed"
     ]
+    found += [reversed_thruster(data, k) for k in sorted(turned.difference(dead))]
     found += [dead_thruster(data, k) for k in dead]
     return (worth - float(usual[0]) if changes else 0.5 * bool(dead)), found
+
+
+def loses(
+    data: Driven, weights: np.ndarray, usual: dict[int, float], shares: dict[int, float]
+) -> bool:
+    """Whether an axis on which changed weights mainly act is explained worse by them.
+
+    What is true explains each of them at least as well. A gain at the expense of such an axis is of
+    a force that the vehicle's numbers lack, such as the pitch that thrust in surge makes.
+    """
+    largest = np.maximum(np.abs(data.weights).max(axis=1), 1e-12)
+    change = np.abs(weights - data.weights).max(axis=1) / largest
+    main = [i for i in data.axes if change[i] >= _MAIN * change.max()]
+    lost = [0.5 * data.axes[i].count * (np.log1p(-shares[i]) - np.log1p(-usual[i])) for i in main]
+    return bool(max(lost, default=0.0) > _CONTRARY)
 
 
 _Change = tuple[str, int, int]
 
 
 def _chain(data: Driven, options: Sequence[_Change]) -> tuple[float, np.ndarray, list[_Change]]:
-    """The best change, then the next best, …: evidence less `_EVIDENCE` each, weights, changes."""
-    nats, _, _ = data.best(data.weights[..., None], PLAUSIBLE)
-    now, weights, changes = float(nats[0]), data.weights, []
+    """The best change, then the next best, …: evidence less `EVIDENCE` each, weights, changes."""
+    worth, changes = _worth(data, []), []
     while len(changes) < len(data.columns):
-        tried = np.stack([_changed(weights, *option) for option in options], axis=-1)
+        tried = np.stack([_changed(data, [*changes, one]) for one in options], axis=-1)
         nats, _, _ = data.best(tried, CAUSAL, strict=True)
-        at = int(nats.argmax())
-        if nats[at] - _EVIDENCE < now:
+        net = nats - EVIDENCE * np.array([_cost([*changes, one]) for one in options])
+        at = int(net.argmax())
+        if net[at] < worth:
             break
-        now, weights = float(nats[at]), tried[..., at]
+        worth = float(net[at])
         changes.append(options[at])
-    return now - _EVIDENCE * len(changes), weights, changes
+    changes = _needed(data, changes)
+    return _worth(data, changes), _changed(data, changes), changes
 
 
-def _changed(weights: np.ndarray, kind: str, a: int, b: int) -> np.ndarray:
-    changed = weights.copy()
-    if kind == "reversed":
-        changed[:, a] *= -1
-    else:
-        changed[:, [a, b]] = changed[:, [b, a]]
+def _needed(data: Driven, changes: list[_Change]) -> list[_Change]:
+    """The changes without any of which some axis would be left with twice as much, or more.
+
+    The axis must be one that a changed thruster mainly drives. Small improvements of several axes
+    together, and moments of small lever arms, tell of errors in the vehicle's file.
+    """
+    arms = np.abs(data.weights) / np.maximum(np.abs(data.weights).max(axis=1), 1e-9)[:, None]
+    for one in reversed(changes):
+        rest = [other for other in changes if other is not one]
+        both = np.stack([_changed(data, rest), _changed(data, changes)], axis=-1)
+        _, shares, _ = data.best(both, PLAUSIBLE)
+        main = [i for i in data.axes if max(arms[i, one[1]], arms[i, one[2]]) >= _MAIN]
+        if not any(
+            named(float(shares[i][0]), float(shares[i][1]), data.axes[i].count) for i in main
+        ):
+            return _needed(data, rest)
+    return changes
+
+
+def _worth(data: Driven, changes: Sequence[_Change]) -> float:
+    weights = _changed(data, changes)[..., None]
+    nats, _, _ = data.best(weights, CAUSAL if changes else PLAUSIBLE, strict=bool(changes))
+    return float(nats[0]) - EVIDENCE * _cost(changes)
+
+
+def _cost(changes: Sequence[_Change]) -> int:
+    """Changes; two thrusters that are reversed together are two: one alone may explain nothing."""
+    return sum(2 if kind == "reversed" and a != b else 1 for kind, a, b in changes)
+
+
+def _changed(data: Driven, changes: Sequence[_Change]) -> np.ndarray:
+    """The weights after changes, one after another."""
+    changed = data.weights.copy()
+    for kind, a, b in changes:
+        if kind == "reversed":
+            changed[:, list({a, b})] *= -1
+        else:
+            changed[:, [a, b]] = changed[:, [b, a]]
     return changed
 
 
@@ -286,29 +318,48 @@ def _is_dead(
     tried[:, k] *= _FACTORS
     shares = data.shares(tried, lag)
     at = int(data.evidence(shares).argmax())
-    if abs(_FACTORS[at]) > _DEAD:
-        return False
-    before = {i: float(s[0]) for i, s in usual.items()}
-    after = {i: float(s[at]) for i, s in shares.items()}
-    without = weights.copy()
-    without[:, k] = 0.0
-    return explains(data, without, before, after)
+    return bool(abs(_FACTORS[at]) <= _DEAD) and any(
+        named(float(usual[i][0]), float(shares[i][at]), r.count) for i, r in data.axes.items()
+    )
 
 
-def _lag(data: Driven) -> list[Finding]:
-    weights = data.weights[..., None]
-    nats, shares, lag = data.best(weights, ALL)
-    usual, _, _ = data.best(weights, PLAUSIBLE)
-    strong = [i for i in data.axes if shares[i][0] >= _MOST]
-    if nats[0] - usual[0] < _EVIDENCE or not strong:
+def _lags(data: Driven) -> list[Finding]:
+    """Lags that neither thrusters nor clocks have: of all axes, or of velocities or rates alone."""
+    groups = [_group(data, axes) for axes in (_LINEAR, _ANGULAR)]
+    found = [one for group in groups if (one := _lag(group)) is not None]
+    if len(found) == 2 and found[0][1] == found[1][1]:
+        return [shifted(found[0][0] + found[1][0], found[0][1])]
+    if found or not all(group.axes for group in groups):
+        return [shifted(axes, seconds) for axes, seconds in found]
+    best = [group.best(group.weights[..., None], PLAUSIBLE) for group in groups]
+    at = [int(lags[0]) for _, _, lags in best]
+    apart = float(LAGS_S[at[0]] - LAGS_S[at[1]])
+    strong = all(any(s[0] >= MOST for s in shares.values()) for _, shares, _ in best)
+    if abs(apart) < _APART_S or not strong:
         return []
-    seconds = float(LAGS_S[lag[0]])
-    how = "after" if seconds > 0 else "before"
-    return [
-        Finding(
-            "command-lag",
-            f"commands of {', '.join(AXES[i] for i in strong)}",
-            f"the motion comes {abs(seconds):.1f} s {how} its command",
-            "align the clocks of commands and motion",
-        )
-    ]
+    common = max(
+        sum(float(g.best(g.weights[..., None], [one])[0][0]) for g in groups) for one in PLAUSIBLE
+    )
+    if sum(float(nats[0]) for nats, _, _ in best) - common < EVIDENCE:
+        return []
+    return [shifted_apart(apart)]
+
+
+def _group(data: Driven, axes: Sequence[int]) -> Driven:
+    return replace(data, axes={i: r for i, r in data.axes.items() if i in axes})
+
+
+_Lag = tuple[tuple[int, ...], float]
+
+
+def _lag(data: Driven) -> _Lag | None:
+    """Axes with a strong answer, and the lag (s) at which it is, if that is not plausible."""
+    if not data.axes:
+        return None
+    weights = data.weights[..., None]
+    nats, shares, at = data.best(weights, ALL)
+    usual, _, _ = data.best(weights, PLAUSIBLE)
+    strong = tuple(i for i in data.axes if shares[i][0] >= MOST)
+    if nats[0] - usual[0] < EVIDENCE or not strong:
+        return None
+    return strong, float(LAGS_S[at[0]])

@@ -8,6 +8,11 @@ from jaxtyping import Float
 
 from .response import LAGS_S, AxisResponse
 
+EVIDENCE = 12.0
+"""Nats by which a named hypothesis is more likely than the recorded order: 6e-6 by chance, some
+hundred hypotheses together 1e-3."""
+MOST = 0.5
+"""Share that a named hypothesis accounts for, and most of the rest that it leaves."""
 _EARLIEST, _LATEST = -0.15, 0.45
 """s of lag that thrusters and clocks have."""
 _LEAST_MASS = 0.1
@@ -32,8 +37,11 @@ class Driven:
 
     mass: dict[int, float]
     """The vehicle's mass or moment of inertia by axis; 0 if it is not known."""
-    driven: tuple[int, ...] = ()
+
+    judged: tuple[int, ...] = ()
     """Columns of thrusters that gave enough thrust to be judged."""
+    outputs: tuple[int, ...] = ()
+    """Output of the autopilot that drives each thruster; empty if it is not known."""
 
     def shares(self, weights: np.ndarray, lag: int, strict: bool = False) -> dict[int, np.ndarray]:
         """Shares by axis for hypotheses of weights (6, m, *H).
@@ -65,3 +73,9 @@ class Driven:
             for i in self.axes
         }
         return nats.max(axis=0), picked, np.asarray(lags)[at]
+
+
+def named(usual: float, share: float, count: float) -> bool:
+    """Whether a hypothesis on one axis is clearly better than the recorded order."""
+    rest = (1 - share) / (1 - usual)
+    return share >= MOST and rest < MOST and bool(-0.5 * count * np.log(rest) > EVIDENCE)

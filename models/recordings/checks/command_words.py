@@ -1,10 +1,11 @@
-"""The findings on commands, in sentences."""
+"""Sentences of the findings on commands and motion, each with its place and remedy."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from ...se3 import AXES, WRENCH
+from ..outputs import in_words
 from ..store import Recording
 from .finding import Finding
 from .hypotheses import Driven
@@ -17,7 +18,7 @@ _RIGHT_DOWN = np.array([1, -1, -1, 1, -1, -1])
 
 
 def no_commands(recording: Recording) -> Finding:
-    """No thruster was driven."""
+    """No command ever differs from zero."""
     rates = recording.dataset["V_WB_B"].to_numpy()[recording.mask][:, 3:]
     turned = bool(np.nanmax(np.abs(rates), initial=0.0) > 0.2)
     told = "the vehicle was turned by hand or drifted" if turned else "nothing was driven"
@@ -30,7 +31,7 @@ def no_commands(recording: Recording) -> Finding:
 
 
 def no_answer(data: Driven, silent: Sequence[int]) -> Finding:
-    """No axis answers its command."""
+    """The motion follows no command, of these axes for sure."""
     axes = ", ".join(AXES[i] for i in silent)
     times = min(data.given[i] / max(data.needed[i], 1e-12) for i in silent)
     return Finding(
@@ -42,8 +43,8 @@ def no_answer(data: Driven, silent: Sequence[int]) -> Finding:
     )
 
 
-def silent_axis(data: Driven, axis: int) -> Finding:
-    """One axis does not answer."""
+def silent(data: Driven, axis: int) -> Finding:
+    """An axis does not answer its command."""
     times = data.given[axis] / max(data.needed[axis], 1e-12)
     return Finding(
         "axis-silent",
@@ -55,7 +56,7 @@ def silent_axis(data: Driven, axis: int) -> Finding:
 
 
 def exchanged_columns(moved: Sequence[tuple[int, int, int]]) -> Finding:
-    """Columns of a wrench stand in another order; `moved` are (axis, column, sign)."""
+    """Columns of a wrench that drive other axes: (axis, column, sign) of each."""
     names = [n for n, order in _ORDERS.items() if all(order[j] == i for i, j, _ in moved)]
     parts = [f"`{WRENCH[j]}` drives {AXES[i]}{' backwards' * (s < 0)}" for i, j, s in moved]
     look = f": columns X…N stand {names[0]}" if names else ""
@@ -68,7 +69,7 @@ def exchanged_columns(moved: Sequence[tuple[int, int, int]]) -> Finding:
 
 
 def reversed_axes(data: Driven, moved: Sequence[tuple[int, int, int]], wrench: bool) -> Finding:
-    """Axes move against their command."""
+    """Axes whose command has the other sign."""
     axes = [i for i, _, _ in moved]
     right_down = [i for i in data.axes if _RIGHT_DOWN[i] < 0]
     frd = wrench and set(axes) == set(right_down)
@@ -85,31 +86,77 @@ def reversed_axes(data: Driven, moved: Sequence[tuple[int, int, int]], wrench: b
 
 
 def reversed_thruster(data: Driven, k: int) -> Finding:
-    """A thruster pushes the other way."""
+    """Thruster k (from 0) pushes the other way."""
+    output = data.outputs[k] if data.outputs else 0
+    causes = (
+        f"SERVO{output}_REVERSED or MOT_{k + 1}_DIRECTION"
+        if output
+        else f"MOT_{k + 1}_DIRECTION, or SERVOn_REVERSED of the output n that drives it"
+    )
     return Finding(
         "thruster-reversed",
         f"column {data.columns[k]}",
-        f"thruster {k + 1} pushes the other way: MOT_{k + 1}_DIRECTION, or SERVOn_REVERSED of the "
-        "output n that drives it",
+        f"{in_words(k + 1, data.outputs)} pushes the other way: {causes}",
         f"correct the parameter, or the sign of {data.columns[k]}",
     )
 
 
 def exchanged_thrusters(data: Driven, a: int, b: int) -> Finding:
-    """Two thrusters are exchanged."""
+    """Thrusters a and b (from 0) are exchanged."""
+    one, other = (in_words(k + 1, data.outputs) for k in (a, b))
+    remedy = "give the columns in the order of the vehicle's file"
+    if data.outputs and data.outputs[a] and data.outputs[b]:
+        numbers = sorted((data.outputs[a], data.outputs[b]))
+        functions = " and ".join(f"SERVO{n}_FUNCTION" for n in numbers)
+        remedy = f"check the wiring against {functions}, or {remedy}"
     return Finding(
         "thruster-exchanged",
         f"columns {data.columns[a]}, {data.columns[b]}",
-        f"thrusters {a + 1} and {b + 1} look exchanged",
-        "give the columns in the order of the vehicle's file",
+        f"{one} and {other} look exchanged",
+        remedy,
     )
 
 
 def dead_thruster(data: Driven, k: int) -> Finding:
-    """A thruster has no effect."""
+    """Thruster k (from 0) has no effect."""
     return Finding(
         "thruster-dead",
         f"column {data.columns[k]}",
-        f"thruster {k + 1} has no effect on the motion",
+        f"{in_words(k + 1, data.outputs)} has no effect on the motion",
         "check its power and propeller",
+    )
+
+
+def turned_heading(degrees: float) -> Finding:
+    """The recorded heading is off by so much (positive: to the left of the true one)."""
+    side = "left" if degrees > 0 else "right"
+    large = abs(degrees) > 45
+    return Finding(
+        "heading-wrong" if large else "heading-offset",
+        "surge, sway",
+        f"the motion goes {abs(degrees):.0f}° beside the commands: the recorded heading points "
+        f"about {abs(degrees):.0f}° to the {side} of the vehicle's bow",
+        "calibrate the compass, or check its orientation (COMPASS_ORIENT, AHRS_ORIENTATION)",
+    )
+
+
+def shifted(axes: Sequence[int], seconds: float) -> Finding:
+    """Motion along axes that is shifted against its commands (positive: later)."""
+    how = "after" if seconds > 0 else "before"
+    return Finding(
+        "command-lag",
+        f"commands of {', '.join(AXES[i] for i in axes)}",
+        f"the motion comes {abs(seconds):.1f} s {how} its command",
+        "align the clocks of commands and motion",
+    )
+
+
+def shifted_apart(seconds: float) -> Finding:
+    """Velocities that answer commands later than rates do (positive), or earlier."""
+    how = "after" if seconds > 0 else "before"
+    return Finding(
+        "velocity-lag",
+        "u,v,w",
+        f"u,v,w answer the commands {abs(seconds):.1f} s {how} p,q,r",
+        "correct the delay of the velocity's sensor, or align the clocks of the instruments",
     )

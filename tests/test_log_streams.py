@@ -110,7 +110,7 @@ def test_an_accelerometer_that_stands_still_has_no_readings_there(tmp_path):
     recording, found, _ = imported(tmp_path, held)
     assert "stand still at one value for 10.0 s" in found["sensor-left-out"].text
     run = next(recording.trajectories())
-    read = np.isfinite(run.sensors["imu_specific_force"]).all(axis=1)
+    read = np.isfinite(run.sensors["imu_specific_force"][:, 0])
     t = run.start + recording.dt * np.arange(len(run))
     assert read[t < 109.9].all()
     assert not read[t > 110.2].any()

@@ -331,11 +331,15 @@ def _lags(data: Driven) -> list[Finding]:
         return [shifted(found[0][0] + found[1][0], found[0][1])]
     if found or not all(group.axes for group in groups):
         return [shifted(axes, seconds) for axes, seconds in found]
+    _, shares, _ = data.best(data.weights[..., None], PLAUSIBLE)
+    strong = [i for i, share in shares.items() if share[0] >= MOST]  # others have any lag
+    groups = [_group(group, strong) for group in groups]
+    if not all(group.axes for group in groups):
+        return []
     best = [group.best(group.weights[..., None], PLAUSIBLE) for group in groups]
     at = [int(lags[0]) for _, _, lags in best]
     apart = float(LAGS_S[at[0]] - LAGS_S[at[1]])
-    strong = all(any(s[0] >= MOST for s in shares.values()) for _, shares, _ in best)
-    if abs(apart) < _APART_S or not strong:
+    if abs(apart) < _APART_S:
         return []
     common = max(
         sum(float(g.best(g.weights[..., None], [one])[0][0]) for g in groups) for one in PLAUSIBLE

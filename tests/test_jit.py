@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import LeafSystem
 
-from spinndrift.systems.compiled.jit import VectorFunction, compiled, together
+from spinndrift.systems.compiled.jit import Lowered, VectorFunction, compiled, together
 from spinndrift.systems.drake import value_or_zeros
 
 
@@ -55,14 +55,16 @@ def test_equal_functions_share_one_program_and_others_don_t():
 
 def test_programs_of_one_text_but_other_trees_are_two():
     like = jax.ShapeDtypeStruct((2,), np.float64)
-    pair, named = compiled(lambda a: (a, a), like), compiled(lambda a: {"x": a, "y": a}, like)
-    assert pair is compiled(lambda b: (b, b), like)
+    code = (lambda a: (a, a), lambda a: {"x": a, "y": a}, lambda b: (b, b))
+    pair, named, again = compiled(*(Lowered(function, like) for function in code))
+    assert pair is again
+    assert compiled(Lowered(code[0], like)) == [pair]
     assert set(named.call(np.ones(2))) == {"x", "y"}
 
 
 def test_programs_run_together_give_each_its_own():
     like = jax.ShapeDtypeStruct((2,), np.float64)
-    programs = [compiled(lambda a, k=k: k * a, like) for k in (1.0, 2.0, 3.0)]
+    programs = compiled(*(Lowered(lambda a, k=k: k * a, like) for k in (1.0, 2.0, 3.0)))
     results = together(programs, [(np.full(2, x),) for x in (1.0, 10.0, 100.0)])
     np.testing.assert_array_equal(results, [[1, 1], [20, 20], [300, 300]])
 

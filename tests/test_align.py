@@ -123,6 +123,7 @@ def test_what_does_not_go_together_is_refused(more, message, tmp_path, monkeypat
     assert message in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.slow
 def test_both_logs_of_a_real_dive_agree(tmp_path):
     """Telemetry and the logger's file of one dive, on one clock."""
     folder = shared_data("data", "sitl_log")

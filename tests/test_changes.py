@@ -70,6 +70,7 @@ def test_a_diagnosis_says_when_a_thruster_was_fouled(tmp_path):
     assert d.verdict == "explained"
 
 
+@pytest.mark.slow
 def test_a_thruster_that_is_fouled_for_seconds_is_found_in_its_part(tmp_path):
     fouled = Episode(ThrusterGain(3, 0.4), within(RUNS, 7, 3.1, 6.4))
     state = found(tmp_path, ThrusterGain(5, 0.7), fouled)
@@ -125,6 +126,7 @@ def test_what_does_not_change_is_not_found_in_parts(tmp_path, effects):
     assert state.hypotheses == [("thruster_gain", "3")] * len(effects)
 
 
+@pytest.mark.slow
 def test_an_envelope_of_one_is_the_effect_itself_and_of_zero_none(tmp_path):
     problem = started(recorded(tmp_path)).problem
     data = problem.data
@@ -148,6 +150,7 @@ def test_an_envelope_of_one_is_the_effect_itself_and_of_zero_none(tmp_path):
         np.testing.assert_allclose(errors[2][..., ~odd], expected[1][..., ~odd], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_sensitivities_to_a_part_are_those_of_differences(tmp_path):
     problem = started(recorded(tmp_path)).problem
     M, R = problem.data.weight.shape[0] + 1, problem.data.weight.shape[1]

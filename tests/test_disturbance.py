@@ -300,6 +300,7 @@ def test_states_known_exactly_are_not_taken_for_estimates(problem_of):
     np.testing.assert_allclose(noise.diffusion, LEVELS, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_a_name_that_halves_the_errors_is_told_of_states_without_noise(problem_of):
     """Smooth errors of a wrong model look like an estimator's until the name is found."""
     problem, hidden = problem_of("current_steady", 1.0, noise=Noise.none())
@@ -313,6 +314,7 @@ def test_a_name_that_halves_the_errors_is_told_of_states_without_noise(problem_o
     np.testing.assert_allclose(found, [hidden.east, hidden.north], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_drag_stays_passive_and_wild_steps_are_tamed(problem_of):
     problem, _ = problem_of("quadratic_drag", 1.0)
     row = problem.library.at("quadratic_drag", "pitch")

@@ -68,7 +68,9 @@ def until(true: Callable[[], bool], seconds: float = 10.0) -> bool:
     return False
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    "way", [WAYS[0], *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS[1:])]
+)
 def test_every_axis_gets_the_outputs_that_are_foreseen(port: int, way):
     with connect(port, actuation=way) as driver:
         assert until(lambda: all(found.passed for found in driver.preflight()), 30.0)
@@ -247,7 +249,9 @@ with Driver(config, load_vehicle("bluerov2_heavy").thrusters()) as driver:
 """
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize(
+    "how", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)]
+)
 def test_a_killed_or_hung_process_leaves_no_thruster_running(port: int, how: signal.Signals):
     process = subprocess.Popen(
         [sys.executable, "-c", KILLED, f"tcp:127.0.0.1:{port}"],

@@ -29,6 +29,7 @@ def spoilt(tmp_path, fault):
     return read_csv(tmp_path / "data")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fault",
     ["lost_lock", *(pytest.param(f, marks=pytest.mark.slow) for f in ("stuck", "pose_jump"))],

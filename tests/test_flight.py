@@ -146,6 +146,7 @@ def test_a_guard_ends_a_collection_and_voids_the_trajectory_it_was_in(
     assert (folder / "dive-1" / "telemetry.tlog").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_nothing_is_armed_without_being_asked(port: int):
     with pytest.raises(UserError, match="add --arm to fly, or --dry-run"):
         fly(scenario(port, 1.0))
@@ -229,6 +230,7 @@ class Failing(LeafSystem):
 """
 
 
+@pytest.mark.slow
 def test_an_exception_in_the_diagram_leaves_no_thruster_running(port: int, tmp_path: Path):
     (tmp_path / "failing.py").write_text(CONTROLLER)
     own = f"controller: !Own {{system: {tmp_path}/failing.py:Failing}}"

@@ -102,6 +102,7 @@ def test_a_pause_of_the_accelerometer_is_too_long_for_a_diagnosis(tmp_path):
     assert make_data(recording, load_vehicle("bluerov2_heavy")).specific_force is None
 
 
+@pytest.mark.slow
 def test_the_smoother_gives_forces_where_there_were_readings(tmp_path):
     times = START + np.arange(0.0, DURATION, 0.5)
     recording, run, *_ = imported(tmp_path, with_imu(times, horizontal=False))

@@ -45,6 +45,7 @@ def test_pushes_are_stationary_and_forget_with_their_time_constant(model):
         np.testing.assert_allclose(found, np.exp(-lag * dt / TIME), atol=0.03)
 
 
+@pytest.mark.slow
 def test_a_rollout_feels_them_as_a_wrench(model):
     rng, dt, S = np.random.default_rng(0), 0.05, 2
     X = jnp.tile(jnp.eye(7)[:, :1], (1, 5))

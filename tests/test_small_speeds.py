@@ -143,6 +143,7 @@ def test_the_effect_shows_what_the_instrument_shows():
     np.testing.assert_array_equal(read(cls.neutral()), v)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("loop", "columns"),
     [pytest.param("open", ("u",), marks=pytest.mark.slow), ("closed", UVW)],

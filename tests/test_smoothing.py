@@ -75,6 +75,7 @@ def errors(recording, truth, found):
     return np.sqrt((error**2).mean()), (normal**2).mean()
 
 
+@pytest.mark.slow
 def test_hidden_velocities_under_the_true_model_have_the_claimed_errors():
     true = load_vehicle("bluerov2_heavy")
     recording, truth = simulated(true)

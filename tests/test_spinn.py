@@ -248,6 +248,7 @@ def test_a_deterministic_model_ignores_brownian_increments():
     np.testing.assert_array_equal(noisy[1], quiet[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spd", "potential"),
     [("cholesky", "gravity"), pytest.param("eigenvalues", "pose", marks=pytest.mark.slow)],

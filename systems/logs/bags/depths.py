@@ -1,7 +1,6 @@
 """Depth of a bag: by pressure in any usual unit, or as a number; and whether it is the water's."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -92,10 +91,8 @@ def checked(
     A height that rises where the depth grows is a finding: one of them has its axis reversed.
     """
     found = followed(depth, position)
-    if depth is not None and found.depth is None and position is not None:
-        mirrored = followed(replace(depth, x=-depth.x), position)
-        if mirrored.depth is not None and mirrored.sure:
-            return Followed(None, sure=True), [_reversed(depth, position)]
+    if found.findings and depth is not None and position is not None:
+        return Followed(None, sure=True), [_reversed(depth, position)]
     if found.depth is None or found.sure or not (proposed and may_be_the_hulls(taken)):
         return found, []
     said = (

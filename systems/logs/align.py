@@ -67,7 +67,7 @@ def reference(path: Path) -> Recording:
     """The recording to align with: a file, or that of a run's folder.
 
     Raises:
-        UserError: there is none, or it doesn't say when it began.
+        UserError: there is none.
     """
     file = path / "log.nc" if path.is_dir() else path
     if path.is_dir() and not file.exists():

@@ -41,8 +41,8 @@ _HARDLY, _SURE = 10.0, 0.9
 it; the largest share of a force that a command is expected to make up."""
 _DEAD = 0.15
 _STRONG = 0.04
-"""Share of a thruster's largest thrust, that of a fifth of its command: four to six times what its
-dead band takes."""
+"""Share of a thruster's largest thrust: that of a fifth of its command, 80 µs, if thrust is
+quadratic in it. A dead band takes 25 to 30 µs of them."""
 _CONTRARY = 3.0
 """Nats that an axis may lose by chance under a hypothesis that is true: less than 1 in 20."""
 _NO_FORCE = 1e-3
@@ -116,9 +116,9 @@ def _columns(
 
 
 def _strong(forces: np.ndarray, vehicle: Vehicle) -> tuple[int, ...]:
-    """Thrusters that for a while gave enough thrust to be judged.
+    """Thrusters whose thrust was often large enough to be judged.
 
-    Near its dead band a thruster's curve does not tell its thrust to a factor.
+    Near the dead band the curve of a thruster is uncertain by factors.
     """
     low, high = (np.asarray(limit) for limit in vehicle.thrusters().force_limits())
     if forces.shape[-1] != len(low):

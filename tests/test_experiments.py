@@ -9,7 +9,12 @@ from hidden.scenarios import Plan
 
 from spinndrift.models.recordings.csv import read_csv
 from spinndrift.models.vehicles.vehicle import load_vehicle
-from spinndrift.training.diagnosis.findings.experiments import _information, _ratios, experiments
+from spinndrift.training.diagnosis.findings.experiments import (
+    _information,
+    _opponents,
+    _ratios,
+    experiments,
+)
 from spinndrift.training.diagnosis.findings.maneuver_library import (
     MANEUVERS,
     VARIANTS,
@@ -72,6 +77,14 @@ def test_a_chirp_tells_a_lag_from_a_delay_and_drifting_tells_nothing(lagging):
     alone = experiments(problem, evaluation, [nothing], [])[LAG]
     assert alone.text.startswith("to measure it better")
     assert 0 < max(alone.nats.values()) < max(found.nats.values()), "its size is well known"
+
+
+def test_unmodelled_structure_is_a_rival_as_any_other(lagging):
+    _, _, fit = lagging
+    structure = ("unknown", "surge")
+    assert _opponents(Choice(LAG, fit, (structure,), ()), [LAG]) == [structure]
+    assert _opponents(Choice(LAG, fit, (), ((structure, 1.0),)), [LAG]) == [structure]
+    assert _opponents(Choice(structure, fit, (LAG,), ()), [structure]) == [LAG]
 
 
 def test_expected_nats_are_those_of_least_squares(lagging):

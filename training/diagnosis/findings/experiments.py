@@ -116,9 +116,12 @@ def _opponents(choice: Choice, named: Sequence[Hypothesis]) -> list[Hypothesis]:
     """
     own = choice.hypothesis[0]
 
+    def nested(other: str) -> bool:
+        wider = kind(other)
+        return own in wider.simpler and len(wider.parameters) > len(kind(own).parameters)
+
     def apart(h: Hypothesis) -> bool:
-        more = len(kind(h[0]).parameters) > len(kind(own).parameters)
-        return h not in named and h[0] != own and not (more and own in kind(h[0]).simpler)
+        return h not in named and h[0] != own and not nested(h[0])
 
     ties = [h for h in choice.ties if apart(h)]
     return ties[:_MOST] or [h for h, _ in choice.rivals if apart(h)][:1]

@@ -100,6 +100,7 @@ class _Lines:
         self._what, self._out = what, out
         self._shown, self._tenth = False, 0
         self._first: tuple[float, float] | None = None
+        self._starting = ""  # the remark printed since work started
 
     def show(self) -> None:
         self._shown = True
@@ -108,9 +109,11 @@ class _Lines:
         fraction, now = min(max(fraction, 0.0), 1.0), time.monotonic()
         if fraction <= 0:  # work starts or restarts
             self._tenth, self._first = 0, None
-            if self._shown and remark:
+            if self._shown and remark and remark != self._starting:
                 self._out.print(f"{self._what}: {remark}")
+                self._starting = remark
             return
+        self._starting = ""
         if self._first is None:
             self._first = (now, fraction)
         if not self._shown or int(10 * fraction) <= self._tenth:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import hypothesis
 import jax
+import jaxtyping
 import pytest
 
 from spinndrift.sims.compile_cache import (
@@ -45,6 +46,18 @@ def interruptible() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _types_checked(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Check types and shapes of every call, but not in modules that run whole commands.
+
+    It takes a fifth of the time there, and modules of their own test what the commands call.
+    """
+    whole = request.node.get_closest_marker("whole") is not None
+    jaxtyping.config.update("jaxtyping_disable", whole)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(autouse=True, scope="session")

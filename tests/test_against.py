@@ -19,6 +19,8 @@ from spinndrift.training.diagnosis.against.scatter import (
 )
 from spinndrift.training.diagnosis.selection.state import Selection
 
+pytestmark = pytest.mark.whole
+
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(scenarios=6, runs=1, seconds=6.0)
 

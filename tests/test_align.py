@@ -14,6 +14,8 @@ from spinndrift.models.recordings.store import Recording
 from spinndrift.sims.cli import main
 from spinndrift.systems.logs.load import LogOptions, import_log
 
+pytestmark = pytest.mark.whole
+
 LOG = ROOT / "sims/data/sitl_dive.tlog.xz"
 DT, YAW, SHIFT = 0.04, 2.1, np.array([5.0, -3.0])
 

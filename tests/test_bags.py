@@ -24,6 +24,8 @@ from spinndrift.systems.logs.load import LogOptions, import_log, load_data
 from spinndrift.systems.logs.log_bytes import read_log_bytes
 from spinndrift.systems.logs.packets import message_id, scan
 
+pytestmark = pytest.mark.whole
+
 DEMO = ROOT / "sims" / "data" / "sitl_dive.tlog.xz"
 START, DURATION = 100.0, 6.0
 _STAMP_S = 2e-9

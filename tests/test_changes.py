@@ -25,6 +25,8 @@ from spinndrift.training.diagnosis.pipeline import DiagnoseConfig, Diagnoser, di
 from spinndrift.training.diagnosis.selection.search import Search
 from spinndrift.training.diagnosis.selection.state import Selection
 
+pytestmark = pytest.mark.whole
+
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(scenarios=5, runs=2, seconds=8.0)
 RUNS = 10

@@ -32,6 +32,8 @@ from spinndrift.sims.diagnosis_benchmark.tables import interval, share, tables
 from spinndrift.sims.reports.marked_page import BEGIN, END
 from spinndrift.training.diagnosis.findings import result
 
+pytestmark = pytest.mark.whole
+
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(scenarios=2, runs=1, seconds=2.0, h=0.01)
 LIBRARY = Library(

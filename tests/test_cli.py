@@ -31,6 +31,8 @@ from spinndrift.training.config import (
 from spinndrift.training.fitting.run_folder import TRAINING
 from spinndrift.training.losses.matching import Mse
 
+pytestmark = pytest.mark.whole
+
 TINY = TrainingConfig(
     objective=Mse(),
     model=SpinnConfig(width=4, depth=1, constant_mass=True),

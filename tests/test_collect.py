@@ -26,6 +26,8 @@ from spinndrift.training.data.groups import group_labels
 from spinndrift.training.data.maneuvers import maneuver_wrench
 from spinndrift.training.data.windows import make_windows
 
+pytestmark = pytest.mark.whole
+
 VEHICLE = load_vehicle("bluerov2_heavy")
 SETTINGS = Maneuvers(("surge-forward", "yaw-left"), 2, duration=1.0, steady=Steadiness(time=0.2))
 

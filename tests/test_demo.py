@@ -2,6 +2,7 @@
 
 import json
 
+import pytest
 from diagonal import Diagonal
 from test_cli import TINY
 from test_demo_diagnosis import finding, told
@@ -19,6 +20,8 @@ from spinndrift.sims.run.loop import simulate
 from spinndrift.sims.scenarios.scenario import load_scenario
 from spinndrift.systems.logs.load import load_data
 from spinndrift.training.fitting.run_folder import TRAINING
+
+pytestmark = pytest.mark.whole
 
 SECTIONS = (
     "What is wrong", "What to check", "What to fly next", "What it gains", "Held-out error",

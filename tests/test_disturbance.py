@@ -36,6 +36,8 @@ from spinndrift.training.diagnosis.selection.correlated_noise import CorrelatedN
 from spinndrift.training.diagnosis.selection.search import Search
 from spinndrift.training.diagnosis.selection.state import Selection
 
+pytestmark = pytest.mark.whole
+
 VEHICLE = load_vehicle("bluerov2_heavy")
 LEVELS = np.array([1.0] * 3 + [0.03] * 3)
 

@@ -24,6 +24,8 @@ from spinndrift.systems.mavlink.link import Link
 from spinndrift.systems.mavlink.parameters import Borrowed, Parameters, borrowed_file
 from spinndrift.systems.mavlink.transport import Connection
 
+pytestmark = pytest.mark.whole
+
 WAYS = ("manual_control", "rc_override", "thruster_passthrough")
 WRENCHES = np.diag([20.0, 20.0, 20.0, 2.0, 2.0, 4.0])
 HERE = np.array([0.0, 0.0, -1.5])

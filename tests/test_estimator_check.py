@@ -33,6 +33,8 @@ from spinndrift.sims.run.loop import Run, Timing
 from spinndrift.sims.scenarios.criteria import Outcome
 from spinndrift.sims.scenarios.scenario import Scenario
 
+pytestmark = pytest.mark.whole
+
 RUNS = {"consistency": 3, "faults": 2}
 
 

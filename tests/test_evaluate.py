@@ -17,6 +17,8 @@ from spinndrift.sims.reports.figures_learning import coverage_figure, error_figu
 from spinndrift.training.evaluation.evaluate import evaluate
 from spinndrift.training.evaluation.metrics import energy_score, order_statistics
 
+pytestmark = pytest.mark.whole
+
 TRUTH = Diagonal.of()
 WRONG = Diagonal.of(mass=13.0, drag=5.0, diffusion=0.4)
 SILENT = Diagonal.of(diffusion=1e-30)

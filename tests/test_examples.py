@@ -7,6 +7,8 @@ import pytest
 
 from helpers import ROOT, load_example
 
+pytestmark = pytest.mark.whole
+
 
 def test_own_controller_holds_station_in_the_harbour(capsys):
     runpy.run_path(str(ROOT / "examples" / "own_controller.py"), run_name="__main__")

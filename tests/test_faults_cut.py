@@ -15,6 +15,8 @@ from spinndrift.training.diagnosis.data.checks import problems, without_faults
 from spinndrift.training.diagnosis.disturbance.found import laws_of
 from spinndrift.training.diagnosis.pipeline import Diagnoser
 
+pytestmark = pytest.mark.whole
+
 VEHICLE = load_vehicle("bluerov2_heavy")
 
 

@@ -22,6 +22,8 @@ from spinndrift.systems.estimation.config import EkfConfig
 from spinndrift.systems.estimation.delayed import DelayedFilter
 from spinndrift.systems.estimation.state import Readings, health_names
 
+pytestmark = pytest.mark.whole
+
 SEEDS = 10
 EVERY = 20  # samples from one estimate that is kept to the next
 BEGIN, LATER, END = 800, 1400, 2000  # samples of 10 ms: first and last of a fault, end of the run

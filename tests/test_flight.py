@@ -35,6 +35,8 @@ from spinndrift.systems.mavlink.link import Link
 from spinndrift.systems.mavlink.parameters import Parameters
 from spinndrift.systems.mavlink.transport import Connection
 
+pytestmark = pytest.mark.whole
+
 # a loaded machine is late and loses its estimate for a while, which has tests of its own
 PATIENT = "late: 20, lost: 20, silence: 5, stale: 5, stale_aid: 20, outputs: 20, plan_age: 20"
 

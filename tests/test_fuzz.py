@@ -11,6 +11,8 @@ from fuzz.kinds import KINDS
 
 from spinndrift.models.config.errors import UserError
 
+pytestmark = pytest.mark.whole
+
 COUNT = 1000
 FRAMES = 200
 """Inputs of twenty frames each."""

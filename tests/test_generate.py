@@ -10,6 +10,8 @@ from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.data.generate import GenerateConfig, generate
 from spinndrift.training.data.maneuvers import MANEUVERS, maneuver_wrench
 
+pytestmark = pytest.mark.whole
+
 VEHICLE = load_vehicle("bluerov2_heavy")
 SHORT = GenerateConfig(trajectories=2, duration=1.0, substeps=4)
 

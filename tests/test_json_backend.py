@@ -24,6 +24,8 @@ from spinndrift.sims.vehicle.json_protocol import Frames, servos
 from spinndrift.sims.vehicle.physics import Physics
 from spinndrift.systems.mavlink.transport import Datagrams
 
+pytestmark = pytest.mark.whole
+
 LIMIT = 30.0  # s of wall time for an answer, on a busy machine
 DT = 1 / 400
 NEUTRAL = [1500] * 8

@@ -17,6 +17,8 @@ from spinndrift.systems.mavlink.link import Link
 from spinndrift.systems.mavlink.parameters import Parameters
 from spinndrift.systems.mavlink.transport import Connection
 
+pytestmark = pytest.mark.whole
+
 KINDS = ["tcp", "udp"]
 RATES = {"ATTITUDE_QUATERNION": 100.0, "SERVO_OUTPUT_RAW": 50.0, "RAW_IMU": 100.0}
 

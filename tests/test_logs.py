@@ -41,6 +41,8 @@ from spinndrift.systems.logs.signals import Series, Signals
 from spinndrift.systems.logs.tlog import read_tlog
 from spinndrift.systems.mavlink import codec
 
+pytestmark = pytest.mark.whole
+
 DEMO = ROOT / "sims" / "data" / "sitl_dive.tlog.xz"
 
 

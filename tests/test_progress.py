@@ -50,6 +50,23 @@ def test_work_that_begins_again_counts_anew(soon):
     assert len(lines) == 21
 
 
+def test_what_starts_is_told_once_however_often_it_is_reported(soon):
+    out = io.StringIO()
+    with progress_bar("work", Console(file=out, width=100)) as update:
+        time.sleep(0.2)
+        for _ in range(5):
+            update(0.0, "compiling")
+        update(0.0, "warming up")
+        update(0.5)
+        update(0.0, "compiling")
+    lines = out.getvalue().splitlines()
+    assert [line for line in lines if "%" not in line] == [
+        "work: compiling",
+        "work: warming up",
+        "work: compiling",
+    ]
+
+
 def test_a_terminal_gets_a_bar(soon):
     told = played(True, 0.3)
     assert "work" in told

@@ -14,6 +14,8 @@ from pydrake.systems.analysis import Simulator
 import spinndrift
 from helpers import ROOT, run_python
 
+pytestmark = pytest.mark.whole
+
 NAMES = """
     UserError Vehicle load_vehicle FossenDynamics Spinn EffectConfig save_model load_model
     Recording Trajectory write_csv load_data

@@ -22,6 +22,8 @@ from spinndrift.training.diagnosis.filter.noise import slip_of
 from spinndrift.training.diagnosis.findings.reported import residual
 from spinndrift.training.diagnosis.pipeline import Diagnoser, diagnose
 
+pytestmark = pytest.mark.whole
+
 VEHICLE = load_vehicle("bluerov2_heavy")
 
 

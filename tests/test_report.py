@@ -16,6 +16,8 @@ from spinndrift.sims.scenarios.criteria import FollowPath, Outcome, ReachGoal
 from spinndrift.systems.planning.mppi import FIGURES
 from spinndrift.systems.planning.obstacles import Pylon
 
+pytestmark = pytest.mark.whole
+
 VEHICLE = load_vehicle("bluerov2_heavy")
 PYLONS = (Pylon(1.5, -1.2, 0.4, name="near pylon"), Pylon(3.0, 0.2, 0.4))
 SCENE = Scene(VEHICLE.size, PYLONS, GOAL, water_depth=5.0)

@@ -23,6 +23,8 @@ from spinndrift.sims.run.signals import mean_over
 from spinndrift.sims.scenarios.scenario import Scenario, load_scenario, overridden
 from spinndrift.systems.closed_loop import Signal
 
+pytestmark = pytest.mark.whole
+
 CROSSING = """
 duration: 0.6
 controller:

@@ -16,6 +16,8 @@ from spinndrift.sims.scenarios.criteria import FollowPath, ReachGoal
 from spinndrift.sims.scenarios.scenario import Scenario, load_scenario, overridden, scenario_names
 from spinndrift.systems.controllers.kinds import MppiImpedance, TrackReference
 
+pytestmark = pytest.mark.whole
+
 SMALL = """
 planner: {horizon: 10, sequences: 16, realisations: 1, knots: [2], effective_samples: 4,
     shown_paths: 4}

@@ -21,6 +21,8 @@ from spinndrift.training.data.generate import GenerateConfig, generate
 from spinndrift.training.data.maneuvers import maneuver_wrench
 from spinndrift.training.diagnosis.pipeline import DiagnoseConfig, Diagnoser
 
+pytestmark = pytest.mark.whole
+
 VEHICLE = load_vehicle("bluerov2")
 WEAK, LOST = 3, 0.4  # number of the thruster, share of its force
 

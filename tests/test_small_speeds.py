@@ -24,6 +24,8 @@ from spinndrift.training.diagnosis.data.checks import problems
 from spinndrift.training.diagnosis.disturbance.found import laws_of
 from spinndrift.training.diagnosis.pipeline import DiagnoseConfig, Diagnoser, diagnose
 
+pytestmark = pytest.mark.whole
+
 VEHICLE = load_vehicle("bluerov2_heavy")
 UVW = ("u", "v", "w")
 POSE, TWIST = ("qw", "qx", "qy", "qz", "x", "y", "z"), ("u", "v", "w", "p", "q", "r")

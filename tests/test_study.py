@@ -39,6 +39,8 @@ from spinndrift.sims.study.work import run_task
 from spinndrift.training.fitting.guard import TrainingError
 from spinndrift.training.methods import METHODS, method_config
 
+pytestmark = pytest.mark.whole
+
 TINY = scaled("tiny")
 PREPARE = """
 from diagonal import Diagonal

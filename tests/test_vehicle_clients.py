@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from served_vehicle import LIMIT, Served
 
+pytestmark = pytest.mark.whole
+
 MAVPROXY = Path(sys.executable).parent / "mavproxy.py"
 
 MAVSDK = """

@@ -15,6 +15,8 @@ from spinndrift.sims.vehicle.vehicle import Vehicle
 from spinndrift.systems.mavlink import codec
 from spinndrift.systems.mavlink.dialect import Message, Parser, mavlink
 
+pytestmark = pytest.mark.whole
+
 TICK = 0.01
 
 

@@ -12,6 +12,8 @@ from spinndrift.models.recordings.store import Recording
 from spinndrift.systems.mavlink.dialect import Message, Parser, mavlink
 from spinndrift.systems.mavlink.transport import Connection, Transport
 
+pytestmark = pytest.mark.whole
+
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[Served]:

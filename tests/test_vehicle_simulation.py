@@ -12,6 +12,8 @@ from spinndrift.sims.vehicle.write import write_vehicle
 from spinndrift.systems.mavlink import codec
 from spinndrift.systems.mavlink.dialect import Message, Parser, mavlink
 
+pytestmark = pytest.mark.whole
+
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 SCENARIO = load_scenario(
     "station_keeping_calm",

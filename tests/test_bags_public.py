@@ -631,7 +631,7 @@ def test_a_dvl_without_its_definition_is_said(tmp_path):
         base.execute("delete from message_definitions")
     signals = read_bag(path)
     assert signals.velocity is None
-    assert f"The bag has no definition of /dvl/data {kind}: not read" in said(signals)
+    assert f"No definition of /dvl/data {kind} is in the bag, so it is not read" in said(signals)
 
 
 @pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])

@@ -6,10 +6,13 @@ import pytest
 from log_writers import PARAMETERS, dataflash, dialect, dive, ned, outputs, truth
 
 from spinndrift.models.config.errors import UserError
+from spinndrift.models.frames import frd_to_flu
 from spinndrift.models.recordings.checks.finding import findings_of
 from spinndrift.models.recordings.outputs import outputs_of
+from spinndrift.models.recordings.resample import rotations
 from spinndrift.systems.logs.clock import epochs
 from spinndrift.systems.logs.load import import_log
+from spinndrift.systems.mavlink import codec
 
 DURATION = 20.0
 
@@ -72,6 +75,91 @@ def test_streams_that_fit_in_another_unit_or_sign_only_are_refused(tmp_path, kin
     assert said in found["motion-contradiction"].text
 
 
+def exchanged(*pairs):
+    def change(_, message):
+        for a, b in pairs:
+            x, y = getattr(message, a), getattr(message, b)
+            setattr(message, a, y)
+            setattr(message, b, x)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (exchanged(("x", "y"), ("vx", "vy")), "RAW_IMU feels only otherwise: north and east"),
+        (scaled(-1.0, "y", "vy"), "only otherwise: the velocity to the east has the other sign"),
+        (scaled(1 / 0.3048, "x", "y", "vx", "vy"), "only otherwise: it looks like ft/s"),
+        (exchanged(("x", "y")), "x and y look exchanged"),
+        (scaled(1 / 0.3048, "z", "vz"), "height of LOCAL_POSITION_NED looks like feet"),
+        (scaled(1000.0, "z"), "height of LOCAL_POSITION_NED looks like mm"),
+    ],
+)
+def test_axes_and_units_that_only_other_sensors_tell(tmp_path, change, said):
+    """Position and velocity may be wrong alike: accelerometer and pressure tell."""
+    log = with_imu(remade(dive(duration=DURATION), "LOCAL_POSITION_NED", change), accelerated)
+    with pytest.raises(UserError, match=f"{said}.*--accept motion-contradiction"):
+        imported(tmp_path, log)
+
+
+def test_the_right_axes_and_units_have_no_finding(tmp_path):
+    _, found, _ = imported(tmp_path, with_imu(dive(duration=DURATION), accelerated))
+    assert found == {}
+
+
+def test_angles_in_degrees_are_named(tmp_path):
+    log = dive(duration=DURATION)
+    for t, (q, _, _, w) in zip(
+        times := 100 + np.arange(0, DURATION, 0.02), ned(times), strict=True
+    ):
+        roll, pitch, yaw = codec.euler_from_attitude(np.asarray(q)[:, None])
+        angles = np.rad2deg([roll[0], pitch[0], yaw[0]])
+        fields = (round(t * 1e3), *angles, *w)
+        log.send(t, dialect.MAVLink_attitude_message(*fields))
+    with pytest.raises(UserError, match=r"ATTITUDE: roll, pitch and yaw reach .* degrees"):
+        imported(tmp_path, without(log, "ATTITUDE_QUATERNION"))
+
+
+@pytest.mark.parametrize("jitter", ["normal", "late"])
+def test_jittering_stamps_of_a_steady_stream_are_steadied(tmp_path, jitter):
+    """The attitude is that of the right times but for a common latency, and the finding says so."""
+    rng = np.random.default_rng(0)
+    draw = rng.normal if jitter == "normal" else rng.exponential
+
+    def change(_, message):
+        message.time_boot_ms += round(20 * float(draw()))
+
+    recording, found, _ = imported(
+        tmp_path, remade(dive(duration=DURATION), "ATTITUDE_QUATERNION", change)
+    )
+    assert "about steady 50 Hz" in found["clock-jitter"].text
+    run = next(recording.trajectories())
+    t = run.start + recording.dt * np.arange(len(run))
+    late = np.log(2) * 0.02 if jitter == "late" else 0.0  # the median latency
+    off = rotations(truth(t - late)[0][:4]).inv() * rotations(run.X_WB[:, :4].T)
+    assert np.quantile(off.magnitude(), 0.95) < 0.01  # rad: 10 ms at 1 rad/s
+
+
+def test_a_stream_whose_stamps_drift_is_put_on_the_clock_of_the_others(tmp_path):
+    def change(t, message):
+        message.time_boot_ms += round(5.0 * (t - 100.0))  # 0.5 %, 0.3 s in all
+
+    log = remade(dive(duration=60.0, rates=(25.0, 10.0, 25.0)), "LOCAL_POSITION_NED", change)
+    recording, found, _ = imported(tmp_path, log)
+    assert "drift by 0.3 s" in found["clock-rate"].text
+    run = next(recording.trajectories())
+    t = run.start + recording.dt * np.arange(len(run))
+    inner = slice(20, -20)
+    assert np.abs(run.X_WB[inner, 4:] - truth(t)[0][4:, inner].T).max() < 0.05
+
+
+def test_a_message_that_is_stamped_late_is_no_step_of_the_clock():
+    raw = np.arange(0.0, 10.0, 0.05)
+    raw[[50, 100, 150]] += 0.6
+    assert epochs(raw)[1] == ()
+
+
 def test_a_climb_against_the_height_is_refused(tmp_path):
     """Without a horizontal estimate and pressure nothing else tells."""
     slow = dive(duration=30.0, horizontal=False, rates=(50.0, 5.0, 50.0), hud=10.0)
@@ -90,6 +178,14 @@ def with_imu(log, change=lambda t, f: f):
         fields = [round(x) for x in (*change(t, -1000.0 * down), *(1000.0 * w))]
         log.send(t, dialect.MAVLink_raw_imu_message(round(t * 1e6), *fields, 0, 0, 0))
     return log
+
+
+def accelerated(t, f):
+    """The specific force (mg) with that of the motion, in the autopilot's axes."""
+    h = 1e-3
+    change = (truth(t + h)[2] - truth(t - h)[2]) / (2 * h)
+    in_body = rotations(truth(np.atleast_1d(t))[0][:4]).inv().apply(change)[0]
+    return f + frd_to_flu(in_body) / codec.G * 1000.0
 
 
 def test_an_accelerometer_that_feels_no_gravity_is_left_out(tmp_path):

@@ -28,6 +28,7 @@ from .kinematics import contradictions
 from .outputs import outputs_of, with_outputs
 from .resample import continuous
 from .schema import COMMANDS, UNEVEN
+from .steady_times import Steady, steady_times
 from .store import Recording
 
 Frames = Literal["ENU/FLU", "NED/FRD"]
@@ -95,7 +96,8 @@ def read_csv(
     runs: list[Run] = []
     for name, scenario in files.items():
         table = read_table(folder / name)
-        runs.extend(cut(_run(table, scenario, meta, notes), Path(name).name, notes, resample))
+        run = _run(table, scenario, meta, notes, findings)
+        runs.extend(cut(run, Path(name).name, notes, resample))
     dt = common_step(folder, [run.t for run in runs], rate or meta.rate, notes, resample)
     trajectories = [on_grid(run, dt) if resample else as_recorded(run, dt) for run in runs]
     try:
@@ -129,7 +131,19 @@ def _unlisted(name: str) -> Finding:
     )
 
 
-def _run(table: Table, scenario: str, meta: CsvFolder, notes: list[str]) -> Run:
+def _jitter(name: str, steady: Steady) -> Finding:
+    return Finding(
+        "clock-jitter",
+        name,
+        f"t jitters by {1e3 * steady.jitter:.2g} ms (rms) about steady {steady.rate:.3g} Hz, at "
+        "which the motion is smoother: steady times were taken",
+        "write the times of measurement, not those of arrival",
+    )
+
+
+def _run(
+    table: Table, scenario: str, meta: CsvFolder, notes: list[str], findings: list[Finding]
+) -> Run:
     groups = checked_groups(table, meta.ignore)
     t = table[["t"]][0]
     X = np.concatenate([unit_quaternions(table), table[XYZ]])
@@ -140,6 +154,10 @@ def _run(table: Table, scenario: str, meta: CsvFolder, notes: list[str]) -> Run:
         if "F_Bo_B" in commands:
             commands["F_Bo_B"] = twist_frd_to_flu(commands["F_Bo_B"])
     X[:4] = continuous(X[:4])
+    steady = steady_times(t, np.concatenate([X, V])) if meta.check else None
+    if steady is not None and (np.diff(steady.t) > 0).all():
+        t = steady.t
+        findings.append(_jitter(table.path.name, steady))
     if meta.check:
         errors, doubts = contradictions(t, X, V)
         if errors:

@@ -2,19 +2,32 @@
 
 Over windows of about half a second the displacement of the poses, expressed in the body, must equal
 the integral of the body twist. Wrong conventions (degrees, scalar-last quaternions, velocities in
-the world frame, other axes) leave a residual that one change of convention removes.
+the world frame, other axes) leave a residual that one change of convention removes. So it is along
+each of the world's axes alone, whose share in the whole may be small.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .conventions import (
+    ANGULAR,
+    LINEAR,
+    Axes,
+    Reading,
+    along_axis,
+    as_given,
+    exchanged,
+    quaternions,
+)
 from .resample import continuous, rotations
 
 _WINDOW_S, _LONGER_S = 0.5, (2.0, 5.0)
 _MOVES_M, _TURNS_RAD = 0.02, 0.02  # rms displacement in a window below which nothing is compared
+_EVIDENCE, _ROUNDING = 12.0, 1e-3
+"""Nats by which a unit of one axis is more likely (6e-6 by chance), and what rounding may leave."""
 _AGREED, _EXPLAINED, _DOUBTFUL, _CONTRADICTED = 0.98, 0.9, 0.8, 0.5
 _SHORT = (0.1, 5.0)  # m/s, rad/s: largest second difference that is not an outlier
 _MOST = 0.5  # share of the windows that must contradict; fewer are faults of an instrument
@@ -101,86 +114,6 @@ def dead_reckoned(
     return np.concatenate([X_WB[:, :4], np.where(np.isnan(X_WB[:, 4:]), path, X_WB[:, 4:])], axis=1)
 
 
-def _flip(x: np.ndarray, rows: tuple[int, ...]) -> np.ndarray:
-    sign = np.ones((x.shape[0], 1))
-    sign[list(rows)] = -1
-    return x * sign
-
-
-def _world(X: np.ndarray, V: np.ndarray, part: slice) -> Arrays:
-    turned = V.copy()
-    turned[part] = rotations(X[:4]).inv().apply(V[part].T).T
-    return X, turned
-
-
-def _mirrored(X: np.ndarray, V: np.ndarray, row: int) -> Arrays:
-    """Velocities with the other sign along one of the world's axes."""
-    R = rotations(X[:4])
-    turned = V.copy()
-    turned[:3] = R.inv().apply(_flip(R.apply(V[:3].T).T, (row,)).T).T
-    return X, turned
-
-
-_LINEAR: list[tuple[str, Callable[[np.ndarray, np.ndarray], Arrays]]] = [
-    (
-        "u,v,w look like velocities along the world's axes; rotate them into the body",
-        lambda X, V: _world(X, V, slice(0, 3)),
-    ),
-    ("u,v,w look like mm/s; give m/s", lambda X, V: (X, V * 1e-3)),
-    ("u,v,w look like cm/s; give m/s", lambda X, V: (X, V * 1e-2)),
-    ("u,v,w look like km/h; give m/s", lambda X, V: (X, V / 3.6)),
-    ("u,v,w look like knots; give m/s", lambda X, V: (X, V * 0.514444)),
-    ("x,y,z look like mm; give m", lambda X, V: (X, V * 1e3)),
-    ("x,y,z look like cm; give m", lambda X, V: (X, V * 1e2)),
-    (
-        "u,v,w look like forward-right-down while x,y,z and the quaternion do not; "
-        "give all in one convention",
-        lambda X, V: (X, _flip(V, (1, 2))),
-    ),
-    ("u seems to have the wrong sign; give forward as positive", lambda X, V: (X, _flip(V, (0,)))),
-    ("v seems to have the wrong sign; give left as positive", lambda X, V: (X, _flip(V, (1,)))),
-    (
-        "the velocity along the world's x has the wrong sign; give all in one convention",
-        lambda X, V: _mirrored(X, V, 0),
-    ),
-    (
-        "the velocity along the world's y has the wrong sign; give all in one convention",
-        lambda X, V: _mirrored(X, V, 1),
-    ),
-    (
-        "z seems to have the wrong sign against w; give all in one convention",
-        lambda X, V: (_flip(X, (6,)), V),
-    ),
-    (
-        "x,y,z look like north-east-down while the quaternion does not; give all in one convention",
-        lambda X, V: (np.concatenate([X[:4], X[[5]], X[[4]], -X[[6]]]), V),
-    ),
-]
-_ANGULAR: list[tuple[str, Callable[[np.ndarray, np.ndarray], Arrays]]] = [
-    ("p,q,r look like deg/s; give rad/s", lambda X, V: (X, np.deg2rad(V))),
-    ("p seems to have the wrong sign", lambda X, V: (X, _flip(V, (3,)))),
-    ("q seems to have the wrong sign", lambda X, V: (X, _flip(V, (4,)))),
-    ("r seems to have the wrong sign", lambda X, V: (X, _flip(V, (5,)))),
-    (
-        "the quaternion's columns look like x,y,z,w; give w first",
-        lambda X, V: (np.concatenate([X[[3, 0, 1, 2]], X[4:]]), V),
-    ),
-    (
-        "p,q,r look like rates about the world's axes; rotate them into the body",
-        lambda X, V: _world(X, V, slice(3, 6)),
-    ),
-    (
-        "the quaternion looks like world-to-body; give body-to-world (its conjugate)",
-        lambda X, V: (_flip(X, (1, 2, 3)), V),
-    ),
-    (
-        "p,q,r look like forward-right-down while the quaternion does not; "
-        "give all in one convention",
-        lambda X, V: (X, _flip(V, (4, 5))),
-    ),
-]
-
-
 def _mostly(t: np.ndarray, X_WB: np.ndarray, V: np.ndarray, rows: slice) -> float:
     """Explained share in the half of the windows that agrees best."""
     moved, integrated = (a[rows] for a in increments(t, X_WB, V))
@@ -224,6 +157,50 @@ def _agreed(t: np.ndarray, X_WB: np.ndarray, V: np.ndarray) -> bool:
     return bool(known) and min(known) > _EXPLAINED
 
 
+def _linear_axes(t: np.ndarray, X: np.ndarray, V: np.ndarray) -> list[Axes]:
+    """Displacements and integrals in the body, in the world, and of velocities given there."""
+    moved, integrated = increments(t, X, V)
+    edges = _edges(t, _WINDOW_S)
+    in_world = np.add.reduceat(np.diff(X[4:]), edges, axis=1)
+    R = rotations(continuous(X[:4])[:, 1:] + continuous(X[:4])[:, :-1])
+    turned = R.apply(0.5 * (V[:3, 1:] + V[:3, :-1]).T).T * np.diff(t)
+    names, as_world = ("x", "y", "z"), "u,v,w look like velocities along the world's axes"
+    body, world = "give u forward, v left, w up", "give x east, y north, z up of all, or all as NED"
+    return [
+        Axes(("u", "v", "w"), moved[:3], integrated[:3], right=body),
+        Axes(names, in_world, np.add.reduceat(turned, edges, axis=1), right=world),
+        Axes(names, in_world, integrated[:3], as_world, right=f"{body}, in the body's axes"),
+    ]
+
+
+def _angular_axes(t: np.ndarray, X: np.ndarray, V: np.ndarray) -> list[Axes]:
+    """Turns and integrals of the rates in the body."""
+    moved, integrated = increments(t, X, V)
+    units = (("", 1.0), ("in deg/s", np.pi / 180))
+    return [Axes(("p", "q", "r"), moved[3:], integrated[3:], units=units)]
+
+
+def _along_axes(t: np.ndarray, X: np.ndarray, V: np.ndarray) -> str:
+    """The unit or sign of one of the world's axes that contradicts the velocity; empty if none."""
+    if not np.isfinite(V[:3]).all():
+        return ""
+    for length in (_WINDOW_S, *_LONGER_S):
+        edges = _edges(t, length)
+        R = rotations(continuous(X[:4])[:, 1:] + continuous(X[:4])[:, :-1])
+        steps = R.apply(0.5 * (V[:3, 1:] + V[:3, :-1]).T).T * np.diff(t)
+        moved, way = (np.add.reduceat(x, edges, axis=1) for x in (np.diff(X[4:]), steps))
+        for axis in range(3):
+            sizes = [np.sqrt(np.mean(x[axis] ** 2)) for x in (moved, way)]
+            found = along_axis(axis, moved[axis], way[axis]) if max(sizes) > _MOVES_M else None
+            if found is None:
+                continue
+            (best, given), left = found, 1 - found[0].share
+            better = best.share > _EXPLAINED and left < _BETTER * (1 - given)
+            if better and _clear(left, 1 - given, edges.size):
+                return best.reading
+    return ""
+
+
 def contradictions(
     t: Float[np.ndarray, " N"], X_WB: Float[np.ndarray, "7 N"], V_WB_B: Float[np.ndarray, "6 N"]
 ) -> tuple[list[str], list[str]]:
@@ -244,27 +221,79 @@ def contradictions(
         count = int(outliers.any(axis=0).sum())
         doubts.append(f"{count} single velocities lie far from both their neighbours.")
     for what, rows, readings in (
-        ("p,q,r", slice(3, 6), _ANGULAR),
-        ("u,v,w", slice(0, 3), _LINEAR),
+        ("p,q,r", slice(3, 6), ANGULAR),
+        ("u,v,w", slice(0, 3), LINEAR),
     ):
         part = 1 if rows.start == 3 else 0
-        now = agreement(t, X_WB, V_WB_B)[part]
-        if np.isnan(now.explained) or now.explained > _AGREED:
-            continue
+        now = agreement(t, X_WB, V_WB_B)[part].explained
         source = "rotation" if part else "displacement"
-        found = f"the integral of {what} explains {max(now.explained, 0):.0%} of the {source}"
-        scores = [agreement(t, *change(X_WB, V_WB_B))[part].explained for _, change in readings]
-        best = int(np.nanargmax([-np.inf if np.isnan(s) else s for s in scores]))
-        if scores[best] > _EXPLAINED and 1 - scores[best] < _BETTER * (1 - now.explained):
-            errors.append(f"{found}: {readings[best][0]}")
+        if not now <= _AGREED:
+            one = _by_axes(t, X_WB, V_WB_B, part)
+            errors += [f"{_found(what, now, source)}: {one}"] if one else []
+            continue
+        found = _found(what, now, source)
+        reading = _reading(t, X_WB, V_WB_B, part, readings, now)
+        if reading is not None:
+            errors.append(f"{found}: {reading}")
             break  # consequences of a wrong attitude are not reported again
         longer = (agreement(t, X_WB, V_WB_B, s)[part].explained for s in _LONGER_S)
-        explained = [now.explained, _mostly(t, X_WB, V_WB_B, rows), *longer]
+        explained = [now, _mostly(t, X_WB, V_WB_B, rows), *longer]
         if np.nanmax(explained) < _CONTRADICTED and t[-1] - t[0] > _SEVERAL * _WINDOW_S:
             errors.append(f"{found}: {UNNAMED}")
             break
-        if now.explained < _DOUBTFUL:
+        if now < _DOUBTFUL:
             doubts.append(
                 f"{found[0].upper()}{found[1:]}; noise, or units and frames to be checked."
             )
     return errors, doubts
+
+
+def _found(what: str, explained: float, source: str) -> str:
+    share = max(explained, 0) if np.isfinite(explained) else 0.0
+    return f"the integral of {what} explains {share:.0%} of the {source}"
+
+
+def _reading(
+    t: np.ndarray,
+    X: np.ndarray,
+    V: np.ndarray,
+    part: int,
+    readings: Sequence[Reading],
+    now: float,
+) -> str | None:
+    """The convention that makes poses and twists agree, in words: named, or axes and signs."""
+    named = _best(t, X, V, part, readings, now)
+    if named is not None:
+        return named
+    groups = _angular_axes(t, X, V) if part else _linear_axes(t, X, V)
+    found = exchanged(groups, max(_EXPLAINED, 1 - _BETTER * (1 - now)))
+    if found is not None:
+        return found.reading
+    turned = _best(t, X, V, part, list(quaternions()), now) if part else None
+    return turned or _by_axes(t, X, V, part) or None
+
+
+def _best(
+    t: np.ndarray, X: np.ndarray, V: np.ndarray, part: int, readings: Sequence[Reading], now: float
+) -> str | None:
+    """The reading that explains most, if that is clearly more than now."""
+    scores = [agreement(t, *change(X, V))[part].explained for _, change in readings]
+    best = int(np.nanargmax([-np.inf if np.isnan(s) else s for s in scores]))
+    clear = scores[best] > _EXPLAINED and 1 - scores[best] < _BETTER * (1 - now)
+    return readings[best][0] if clear else None
+
+
+def _by_axes(t: np.ndarray, X: np.ndarray, V: np.ndarray, part: int) -> str:
+    """The reading that makes axes agree which make a small part of the motion; empty if none."""
+    groups = _angular_axes(t, X, V) if part else _linear_axes(t, X, V)
+    given, count = as_given(groups[0]), groups[0].moved.shape[1]
+    if given < _AGREED:
+        found = exchanged(groups, max(_EXPLAINED, 1 - _BETTER * (1 - given)), even=True)
+        if found is not None and _clear(1 - found.share, 1 - given, count):
+            return found.reading
+    return "" if part else _along_axes(t, X, V)
+
+
+def _clear(left: float, given: float, count: int) -> bool:
+    """Whether a reading leaves so much less of `count` windows that chance does not."""
+    return bool(-0.5 * count * np.log((left + _ROUNDING) / (given + _ROUNDING)) > _EVIDENCE)

@@ -1,4 +1,6 @@
-"""Times of a log whose clock steps back: by a reboot, or by a fault."""
+"""Times of a log whose clock steps back, by a reboot or by a fault, or runs apart from another."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -8,11 +10,71 @@ from ...models.recordings.checks.finding import Finding
 REBOOT_S = 5.0
 """A step back of more than this is a reboot."""
 _STEP_S, _STAYS_S, _LATER = 0.2, 0.1, 8
-"""s of a step back that lasts for the next messages; a single message that comes late is none."""
+"""s of a step back from the messages before to those after; one that comes late, or is stamped
+late, is none."""
 _BETWEEN_S = 10.0
 _WRAP_MS_S = 2**32 * 1e-3
 _PIECE_S, _PIECES, _RATE = 10.0, 6, 0.02
 """Pieces over which two clocks are compared, how many are needed, and what they may differ by."""
+
+_LEAST_S, _CLEAR, _FEWEST = 0.02, 6.0, 4
+"""Drift that matters (s): half a sample at 25 Hz; times its standard error that it must have; and
+the pieces that are needed."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Least latency along time, a line.
+
+    Attributes:
+        middle: s on the clock of the latencies' times.
+        value: latency there (s).
+        slope: s per s.
+        change: over the whole (s).
+    """
+
+    middle: float
+    value: float
+    slope: float
+    change: float
+
+    def at(self, t: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Least latency at some times (s)."""
+        return self.value + self.slope * (t - self.middle)
+
+
+def least_latencies(
+    t: Float[np.ndarray, " n"], latency: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Times and values of the least latencies of pieces of 10 s."""
+    piece = np.floor((t - t.min()) / _PIECE_S).astype(int)
+    rows = [
+        inside for n in np.unique(piece) if (inside := np.flatnonzero(piece == n)).size >= _LATER
+    ]
+    least = np.array([inside[latency[inside].argmin()] for inside in rows], int)
+    return t[least], latency[least]
+
+
+def drift(t: Float[np.ndarray, " n"], latency: Float[np.ndarray, " n"]) -> Drift | None:
+    """The line through the least latencies of pieces of 10 s; None if they stay as they are.
+
+    A latency is never negative, so the least ones change as one clock does against the other (Olson
+    2010, "A passive solution to the sensor synchronization problem"). The slope is the median of
+    those between all pieces (Sen 1968).
+    """
+    x, y = least_latencies(t, latency)
+    if x.size < _FEWEST:
+        return None
+    a, b = np.triu_indices(x.size, 1)
+    slope = float(np.median((y[b] - y[a]) / (x[b] - x[a])))
+    rest = y - slope * x
+    scatter = 1.4826 * float(np.median(np.abs(rest - np.median(rest))))
+    error = scatter / float(np.sqrt(np.sum((x - x.mean()) ** 2)))
+    change = slope * float(t.max() - t.min())
+    if abs(change) < _LEAST_S or abs(slope) < _CLEAR * error:
+        return None
+    middle = float(np.median(x))
+    return Drift(middle, float(np.median(rest)) + slope * middle, slope, change)
 
 
 def epochs(
@@ -30,6 +92,9 @@ def epochs(
         before = raw[start - 1]
         if raw[start : start + _LATER].max() > before - _STAYS_S:
             continue
+        earlier, later = raw[max(start - _LATER, 0) : start], raw[start : start + _LATER]
+        if np.median(earlier) - np.median(later) < _STAYS_S:
+            continue  # a message that is stamped too late was before it
         if before - raw[start] > _WRAP_MS_S / 2:
             shift[start:] = shift[start - 1] + _WRAP_MS_S
             continue

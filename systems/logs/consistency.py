@@ -11,6 +11,7 @@ import numpy as np
 from ...models.recordings.build import Trajectory
 from ...models.recordings.checks.finding import Finding
 from ...models.recordings.checks.velocity import lag_findings
+from ...models.recordings.conventions import LENGTHS, SPEEDS
 from ...models.recordings.kinematics import UNNAMED, contradictions
 from ...models.recordings.store import Recording
 from .signals import Signals
@@ -26,10 +27,10 @@ _FITS, _BETTER = 0.7, 0.3
 """Share of the squared change that the right climb explains, and what it leaves of the rest."""
 _SCALES = {
     "has the other sign than the height": -1.0,
-    "looks like cm/s": 0.01,
-    "looks like mm/s": 0.001,
-    "is in m/s, while the height looks like cm": 100.0,
-    "is in m/s, while the height looks like mm": 1000.0,
+    **{f"looks like {unit}": size for unit, size in SPEEDS.items()},
+    **{
+        f"is in m/s, while the height looks like {unit}": 1 / size for unit, size in LENGTHS.items()
+    },
 }
 
 

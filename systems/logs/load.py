@@ -133,8 +133,9 @@ def import_log(  # long: a third of it says what it takes and refuses
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
     period = 1.0 / signals.outputs.rate
-    bag = bag_kind(path) is not None  # its reader compares the axes of topics with the motion
-    moved = [] if bag else motion_findings(signals, trajectories, recording)
+    # the reader of a bag compares the axes of topics with the motion, and is believed if accepted
+    told = any(f.word == "wrong-frame" for f in signals.findings)
+    moved = [] if told else motion_findings(signals, trajectories, recording)
     enforce(str(path), moved, accept)
     progress(1.0)
     recording = Recording(with_outputs(recording.dataset, signals.channels))

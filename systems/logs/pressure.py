@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...models.recordings.checks.finding import Finding
+from ...models.recordings.conventions import LENGTHS
 from ..mavlink import codec
 from .signals import Parameter, Series, series, values_at
 
@@ -21,11 +22,14 @@ all changes: of a vehicle at rest a few are as large, as with the noise of a GPS
 _RATIO = 2.0
 """Factor by which the changes of a depth and of the height may differ: salt and a wrong
 specific gravity make a few percent, a hull's barometer nearly all of it."""
-_FOOT, _NEAR = 0.3048, 1.1
-"""m; and the factor within which a ratio tells of a unit."""
+_NEAR, _FITS = 1.1, 0.9
+"""Factor within which a ratio tells of a unit, and the share of the changes that it then explains:
+of a barometer in a hull heat and leaks make as much as the depth does."""
 _LOWEST_HPA, _ABOVE_M = 500.0, 1.0
 """hPa that no surface of water has less of (5500 m high); m above the surface in the median."""
 _UNITS = ((0.5, 8.0, "bar"), (8.0, 60.0, "psi"), (60.0, _LOWEST_HPA, "kPa"))
+_HULL = 0.1
+"""Share of the water's pressure that a hull which gives way may show."""
 _DEEP_M, _FAST_M, _FAST_S = 6.0, 0.2, 2.0
 """Depth that a sealed hull never shows (1.6 atmospheres), and a change that heat does not make."""
 
@@ -38,13 +42,15 @@ class Followed:
         depth: None if it does not follow the height.
         told: a sentence on a depth that was dropped.
         sure: whether the height moved enough to tell.
-        findings: a contradiction between the signs of pressure and height.
+        findings: a contradiction between the signs or units of depth and height.
+        opposite: whether their signs differ.
     """
 
     depth: Series | None
     told: tuple[str, ...] = ()
     sure: bool = False
     findings: tuple[Finding, ...] = ()
+    opposite: bool = False
 
 
 def depth_series(
@@ -83,13 +89,22 @@ def _left_out(source: str, text: str) -> Finding:
     return Finding("sensor-left-out", source, f"{text}; the pressure is left out", remedy)
 
 
-def followed(depth: Series | None, position: Series | None) -> Followed:
-    """Drop a depth by pressure that does not follow the estimated height, if there is one."""
-    ratio = None if depth is None or position is None else _ratio(depth, position)
-    if depth is None or position is None or ratio is None:
+def followed(depth: Series | None, position: Series | None, pressed: bool = True) -> Followed:
+    """Drop a depth by pressure that does not follow the estimated height, if there is one.
+
+    `pressed` tells whether it is by pressure, else a number in any unit.
+    """
+    found = None if depth is None or position is None else _ratio(depth, position)
+    if depth is None or position is None or found is None:
         return Followed(depth)
+    ratio, explained = found
     if 1 / _RATIO < ratio < _RATIO:
         return Followed(depth, sure=True)
+    for unit, size in LENGTHS.items() if explained > _FITS else ():
+        if 1 / _NEAR < ratio / size < _NEAR and _not_a_hulls(depth, size, pressed):
+            return Followed(depth, sure=True, findings=(_height_in(unit, depth, position, ratio),))
+        if not pressed and 1 / _NEAR < ratio * size < _NEAR:
+            return Followed(None, sure=True, findings=(_depth_in(unit, size, depth, position),))
     if 1 / _RATIO < -ratio < _RATIO:
         sign = Finding(
             "motion-contradiction",
@@ -98,15 +113,37 @@ def followed(depth: Series | None, position: Series | None) -> Followed:
             "pressure rises with depth, so correct the sign of the height; give the log with the "
             "streams as the autopilot sends them",
         )
-        return Followed(depth, sure=True, findings=(sign,))
+        return Followed(depth, sure=True, findings=(sign,), opposite=True)
     changes = f"{depth.source} changes by {100 * ratio:.0f} % of the estimated height's change"
-    if 1 / _NEAR < ratio / _FOOT < _NEAR:
-        said = f"{changes}, as if the heights were in feet: the pressure was left out."
-    elif ratio > _RATIO:
+    if ratio > _RATIO:
         said = f"{changes}: it is no pressure of water in hPa, and was left out."
     else:
         said = f"{changes}, as a barometer in the hull does: it was left out."
     return Followed(None, (said,), sure=True)
+
+
+def _not_a_hulls(depth: Series, size: float, pressed: bool) -> bool:
+    """Whether changes of a few percent of the height's can't be those in a hull that gives way."""
+    return not pressed or size > _HULL or in_water_for_sure(depth)
+
+
+def _height_in(unit: str, depth: Series, position: Series, ratio: float) -> Finding:
+    return Finding(
+        "motion-contradiction",
+        f"{position.source}, {depth.source}",
+        f"the height of {position.source} looks like {unit}: {depth.source} changes by "
+        f"{100 * ratio:.3g} % of it",
+        "give heights and positions in m",
+    )
+
+
+def _depth_in(unit: str, size: float, depth: Series, position: Series) -> Finding:
+    return Finding(
+        "sensor-left-out",
+        depth.source,
+        f"its depths look like {unit} against the height of {position.source}: they are left out",
+        f"give them in m, in a topic map by `scale: {size:g}`",
+    )
 
 
 def in_water_for_sure(depth: Series) -> bool:
@@ -135,11 +172,12 @@ def outside(found: Followed, better: str) -> Followed:
     return Followed(None, findings=(left,))
 
 
-def _ratio(depth: Series, position: Series) -> float | None:
+def _ratio(depth: Series, position: Series) -> tuple[float, float] | None:
     """Median ratio of changes of depth and of the estimate; None if the height hardly moves.
 
-    The changes are those over the shortest lag at which the height moves. In the median resets of
-    the estimate, and drift of a barometer, do not count.
+    The second result is the share of the squared changes of depth that the ratio explains. The
+    changes are those over the shortest lag at which the height moves. In the median resets of the
+    estimate, and drift of a barometer, do not count.
     """
     known = np.isfinite(position.x[2])
     t, z = position.t[known], position.x[2, known]
@@ -152,5 +190,7 @@ def _ratio(depth: Series, position: Series) -> float | None:
         deeper = np.interp(before + lag, depth.t, depth.x) - np.interp(before, depth.t, depth.x)
         clear = np.abs(moved) > _MOVED_M
         if np.count_nonzero(clear) >= max(_LEAST, _SHARE * clear.size):
-            return float(np.median(deeper[clear] / moved[clear]))
+            ratio = float(np.median(deeper[clear] / moved[clear]))
+            left = float(np.sum((deeper - ratio * moved) ** 2))
+            return ratio, 1 - left / max(float(np.sum(deeper**2)), 1e-12)
     return None

@@ -50,6 +50,8 @@ WANTED = (
 )
 AIDS = ("VISION_POSITION_DELTA", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE", "ODOMETRY")
 _FIX_3D = 3
+_BEYOND = 0.05
+"""Share of the angles beyond a turn that damaged messages do not make."""
 
 
 def signals_from_tlog(  # long: a line for each stream of a log
@@ -89,6 +91,7 @@ def signals_from_tlog(  # long: a line for each stream of a log
     findings = kind_findings(*log.kind) or firmware_findings("STATUSTEXT", texts, log.kind[1])
     findings += [
         *log.findings,
+        *_angle_findings(tables, attitude),
         *frame,
         *stops,
         *missing_states(spans, voltage, batteries),
@@ -144,6 +147,18 @@ def _attitude(tables: Mapping[str, Table]) -> Series:
     if not usable:
         raise UserError("no ATTITUDE in this log; stream ATTITUDE (50 Hz is good) while logging")
     return max(usable, key=lambda s: s.t.size)
+
+
+def _angle_findings(tables: Mapping[str, Table], attitude: Series) -> list[Finding]:
+    """Angles that are beyond a turn in rad."""
+    table = tables.get("ATTITUDE")
+    if table is None or attitude.source != "ATTITUDE":
+        return []
+    angles = np.abs(np.stack([table[name] for name in ("roll", "pitch", "yaw")]))
+    if np.mean(np.nanmax(angles, axis=0) > 2 * np.pi) < _BEYOND:
+        return []
+    text = f"roll, pitch and yaw reach {np.nanmax(angles):.0f}: they look like degrees"
+    return [Finding("motion-contradiction", "ATTITUDE", text, "give rad, as the autopilot does")]
 
 
 def _rates(tables: Mapping[str, Table], attitude: Series) -> tuple[Series, tuple[str, ...]]:

@@ -9,6 +9,7 @@ from ...models.recordings.checks.finding import Finding
 from ...models.recordings.resample import rotations, slerp
 from ...models.vehicles.vehicle import load_vehicle
 from ..mavlink import codec
+from .plane import plane_findings
 from .signals import Series, Signals
 
 _GRAVITY, _UPRIGHT = (8.0, 12.0), 0.5
@@ -40,6 +41,8 @@ def sound(signals: Signals) -> Signals:
         wrong = _gravity_finding(signals.attitude, force)
         findings += [wrong] if wrong is not None else _tilt_findings(signals.attitude, force)
         force = force if wrong is None else None
+    if not findings:  # of an accelerometer that is right
+        findings += plane_findings(signals.attitude, signals.velocity, force)
     voltage = _battery(signals, findings)
     position, attitude, velocity = (
         _refreshed(one, rows, notes)

@@ -17,7 +17,8 @@ import numpy as np
 
 from ...models.config.errors import UserError
 from ...models.recordings.checks.finding import Finding
-from .clock import REBOOT_S, epochs, in_words, rate_findings
+from ...models.recordings.steady_times import steady_times
+from .clock import REBOOT_S, Drift, drift, epochs, in_words, least_latencies, rate_findings
 from .log_bytes import Progress, no_progress
 from .packets import Packets, message_id, message_name, repeated, rows_of, scan
 from .table import Table, numbers
@@ -25,6 +26,11 @@ from .table import Table, numbers
 _GROUND_STATION, _NO_AUTOPILOT, _SUBMARINE = 6, 8, 12
 _CLOCKS = ("ATTITUDE", "ATTITUDE_QUATERNION", "SYSTEM_TIME")
 _WRAP_US_S = 2**32 * 1e-6
+_STREAMS = (
+    "ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "LOCAL_POSITION_NED", "RAW_IMU",
+    "SCALED_IMU", "SCALED_PRESSURE", "SCALED_PRESSURE2", "SERVO_OUTPUT_RAW", "VFR_HUD",
+)  # fmt: skip
+"""Messages that are sent at a steady rate."""
 
 System = tuple[int, int]
 
@@ -162,12 +168,41 @@ def _put_on_vehicle_clock(
     at, raw = at[order], raw[order]
     shift, boots, steps = epochs(raw)
     base = raw + shift
-    notes = [*in_words(boots, steps), *_clock_notes(base, stamps[at], boots)]
-    newest = np.maximum.accumulate(base)  # a message that came late tells no time to others
-    latest = np.maximum.accumulate(np.where(base == newest, np.arange(base.size), 0))
+    jumped = _clock_notes(base, stamps[at], boots)
+    notes = [*in_words(boots, steps), *jumped]
+    found = _of_own_clock(tables, index, at, base, shift)
+    if not jumped:
+        found += _run_alike(tables, {name: stamps[rows] for name, rows in index.items()})
+    right = np.concatenate([tables[name]["t"] for name in timed])[order]
+    newest = np.maximum.accumulate(right)  # a message that came late tells no time to others
+    latest = np.maximum.accumulate(np.where(right == newest, np.arange(right.size), 0))
     for name, table in tables.items():
-        i = np.clip(np.searchsorted(at, index[name], side="right") - 1, 0, at.size - 1)
-        elapsed = np.clip(stamps[index[name]] - stamps[at[latest[i]]], -1.0, 1.0)
+        if "t" not in table:
+            i = _before(at, index[name])
+            elapsed = np.clip(stamps[index[name]] - stamps[at[latest[i]]], -1.0, 1.0)
+            table["t"], jitter = _steadied(name, table, newest[i] + elapsed)
+            found += jitter
+        tables[name] = table.rows(np.argsort(table["t"], kind="stable"))
+    order = np.argsort(base, kind="stable")
+    return boots, notes, [*rate_findings(base[order], stamps[at][order]), *found]
+
+
+def _before(at: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """The last message with a time before each of some, or the first."""
+    return np.clip(np.searchsorted(at, rows, side="right") - 1, 0, at.size - 1)
+
+
+def _of_own_clock(
+    tables: Mapping[str, Table],
+    index: Mapping[str, np.ndarray],
+    at: np.ndarray,
+    base: np.ndarray,
+    shift: np.ndarray,
+) -> list[Finding]:
+    """Add `t` to the tables of messages with a time of their own."""
+    found = []
+    for name, table in tables.items():
+        i = _before(at, index[name])
         if "time_boot_ms" in table:
             t = table["time_boot_ms"] * 1e-3 + shift[i]
         elif "time_usec" in table:
@@ -177,12 +212,77 @@ def _put_on_vehicle_clock(
                 usec = usec + _WRAP_US_S * np.round((near - usec) / _WRAP_US_S)
             t = np.where(np.abs(usec - near) < REBOOT_S, usec, near) + shift[i]
         else:
-            t = newest[i] + elapsed
-        table["t"] = t
-        sorting = np.argsort(t, kind="stable")
-        tables[name] = table.rows(sorting)
-    order = np.argsort(base, kind="stable")
-    return boots, notes, rate_findings(base[order], stamps[at][order])
+            continue
+        table["t"], jitter = _steadied(name, table, t)
+        found += jitter
+    return found
+
+
+def _steadied(name: str, table: Table, t: np.ndarray) -> tuple[np.ndarray, list[Finding]]:
+    """Steady times of a stream whose times jitter, as its numbers say, and a finding on it."""
+    several = any(key in table and np.ptp(table[key]) > 0 for key in ("port", "id"))
+    if name not in _STREAMS or several:
+        return t, []
+    rows = [
+        values.astype(float)
+        for key, values in table.items()
+        if not key.startswith("time_") and values.ndim == 1 and values.dtype.kind in "fiu"
+    ]
+    timed = "time_boot_ms" in table or "time_usec" in table
+    steady = steady_times(t, np.stack(rows), late=not timed)
+    if steady is None:
+        return t, []
+    text = (
+        f"its times{'' if timed else ' of arrival'} jitter by {1e3 * steady.jitter:.2g} ms (rms) "
+        f"about steady {steady.rate:.3g} Hz, at which its numbers are smoother: steady times were "
+        "taken"
+    )
+    return steady.t, [Finding("clock-jitter", name, text, "log the times of measurement")]
+
+
+def _run_alike(tables: Mapping[str, Table], arrived: Mapping[str, np.ndarray]) -> list[Finding]:
+    """Put streams whose times drift against those of most others on their clock, in place.
+
+    Least latencies on the logger's clock tell; what its clock does is common to all.
+    """
+    timed = [
+        name
+        for name in _STREAMS
+        if name in tables and ("time_boot_ms" in tables[name] or "time_usec" in tables[name])
+    ]
+    if len(timed) < 2:
+        return []
+    apart = {
+        (one, other): None if one == other else _drift(tables, arrived, one, other)
+        for one in timed
+        for other in timed
+    }
+    alike = {other: sum(apart[one, other] is None for one in timed) for other in timed}
+    first = max(timed, key=lambda name: alike[name])
+    found = []
+    for name in timed:
+        line = apart[name, first]
+        if line is None:
+            continue
+        table = tables[name]
+        table["t"] = table["t"] + line.at(arrived[name])
+        text = (
+            f"its times drift by {abs(line.change):.2g} s against those of {first}; they were "
+            "corrected by the least latencies on the logger's clock"
+        )
+        found.append(Finding("clock-rate", name, text, "log the times of one clock"))
+    return found
+
+
+def _drift(
+    tables: Mapping[str, Table], arrived: Mapping[str, np.ndarray], one: str, other: str
+) -> Drift | None:
+    """How the latencies of a stream drift against the least ones of another."""
+    stamps, latency = least_latencies(arrived[other], arrived[other] - tables[other]["t"])
+    own = arrived[one]
+    if not stamps.size:
+        return None
+    return drift(own, own - tables[one]["t"] - np.interp(own, stamps, latency))
 
 
 def _clock_notes(base: np.ndarray, stamps: np.ndarray, boots: tuple[float, ...]) -> list[str]:

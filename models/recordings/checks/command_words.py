@@ -140,6 +140,25 @@ def turned_heading(degrees: float) -> Finding:
     )
 
 
+_MIRRORS = {
+    0.0: "the motion along y has the other sign",
+    45.0: "x and y look exchanged (north and east)",
+    90.0: "the motion along x has the other sign",
+    135.0: "x and y look exchanged, and both have the other sign",
+}
+
+
+def mirrored(degrees: float) -> Finding:
+    """The horizontal motion is a mirror image, the mirror along this direction from x to y."""
+    how = _MIRRORS.get(degrees, f"it is mirrored at {degrees:.0f}° from x")
+    return Finding(
+        "plane-mirrored",
+        "x, y, u, v",
+        f"the horizontal motion answers the commands only as a mirror image: {how}",
+        "give x east, y north, z up with the heading from x towards y, or all as NED",
+    )
+
+
 def shifted(axes: Sequence[int], seconds: float) -> Finding:
     """Motion along axes that is shifted against its commands (positive: later)."""
     how = "after" if seconds > 0 else "before"

@@ -13,15 +13,15 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ...se3 import WRENCH
 from ...vehicles.vehicle import Vehicle
-from ..commands import voltage_of
 from ..outputs import outputs_of
 from ..store import Recording
+from .columns import columns_of
 from .command_words import (
     dead_thruster,
     exchanged_columns,
     exchanged_thrusters,
+    mirrored,
     no_answer,
     no_commands,
     reversed_axes,
@@ -32,7 +32,8 @@ from .command_words import (
     turned_heading,
 )
 from .finding import Finding
-from .heading import heading_offset
+from .heading import heading_offset, mirrored_plane
+from .held_outputs import held_column, held_throughout
 from .hypotheses import ALL, CAUSAL, EVIDENCE, MOST, PLAUSIBLE, Driven, named
 from .response import LAGS_S, AxisResponse, responses
 
@@ -60,13 +61,15 @@ which is known to a step of `LAGS_S` in each."""
 
 def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Finding]:
     """What is wrong between commands and motion; thrusters only if their vehicle is known."""
-    columns = _columns(recording, vehicle)
+    columns = columns_of(recording, vehicle)
     if columns is None:
         return []
     forces, weights, names = columns
     mask = recording.mask
     if not np.abs(forces[mask]).max(initial=0.0) > _NO_FORCE:
         return [no_commands(recording)]
+    if found := held_throughout(recording, vehicle, forces):
+        return found
     axes = {
         i: r
         for i, r in responses(recording, forces, recording.command_period).items()
@@ -82,37 +85,21 @@ def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Find
     wrench = recording.thrust_from == "F_Bo_B"
     nats, found = _orders(driven, wrench)
     if not wrench:
-        more, thrusters = _thrusters(driven)
-        nats, found = (more, thrusters) if more > nats else (nats, found)
+        held = held_column(recording, vehicle, driven)
+        for more, thrusters in (_thrusters(driven), held):
+            nats, found = (more, thrusters) if more > nats else (nats, found)
     offset = heading_offset(recording, forces, driven)
     if offset is not None and offset[0] > nats:
-        found = [turned_heading(offset[1])]
+        nats, found = offset[0], [turned_heading(offset[1])]
+    mirror = mirrored_plane(recording, forces, driven)
+    if mirror is not None and mirror[0] > nats:
+        found = [mirrored(mirror[1])]
     if found:
         return found
     unanswered = [i for i in driven.axes if _unanswered(data, i)]
     if unanswered and not any(_answered(data, i) for i in driven.axes):
         return [no_answer(data, unanswered)]
     return [silent(data, i) for i in unanswered] + _lags(driven)
-
-
-def _columns(
-    recording: Recording, vehicle: Vehicle | None
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]] | None:
-    """Forces (J, K, N, m), their weights in the wrench (6, m), and the columns' names."""
-    name = recording.thrust_from
-    values = recording.dataset[name].to_numpy()
-    if name == "F_Bo_B":
-        return values, np.eye(6), WRENCH
-    if vehicle is None or values.shape[-1] != len(vehicle.propulsion.mounts):
-        return None
-    thrusters = vehicle.thrusters()
-    names = tuple(f"{'pwm' if name == 'pwm' else 'f'}{k + 1}" for k in range(values.shape[-1]))
-    if name == "pwm":
-        pulses = np.nan_to_num(values, nan=1500.0)
-        mirrored = 1500 + np.asarray(thrusters.motor_directions) * (pulses - 1500)
-        volts = voltage_of(recording.dataset, thrusters)[..., None]
-        values = thrusters.curve.steady(mirrored, volts)
-    return values, np.asarray(thrusters.allocation), names
 
 
 def _strong(forces: np.ndarray, vehicle: Vehicle) -> tuple[int, ...]:

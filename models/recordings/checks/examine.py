@@ -9,8 +9,10 @@ from ...vehicles.vehicle import Vehicle
 from ..build import Trajectory
 from ..schema import UNEVEN
 from ..store import Recording
+from .columns import columns_of
 from .commands import command_findings
 from .finding import Finding, check_accepted, enforce, findings_of, with_findings
+from .held_outputs import all_held
 from .small_speeds import dead_zones
 from .velocity import held_finding, lag_findings, unmeasured, zone_finding
 
@@ -34,7 +36,8 @@ def examine(
     """
     check_accepted(accept)
     recording, cut = _without_unmeasured(recording, source)
-    found = [*findings_of(recording.dataset), *cut, *lag_findings(recording)]
+    recording, held = _without_held(recording, vehicle, source)
+    found = [*findings_of(recording.dataset), *cut, *held, *lag_findings(recording)]
     found += command_findings(recording, vehicle)
     enforce(source, found, accept)
     return type(recording)(with_findings(recording.dataset, found))
@@ -67,6 +70,32 @@ def _without_unmeasured(recording: Recording, source: str) -> tuple[Recording, l
     attrs = recording.dataset.attrs
     kept = Recording.from_trajectories(pieces, recording.dt)
     return Recording(kept.dataset.assign_attrs(attrs)), found
+
+
+def _without_held(
+    recording: Recording, vehicle: Vehicle | None, source: str
+) -> tuple[Recording, list[Finding]]:
+    """The recording without stretches in which the commands were not recorded."""
+    columns = columns_of(recording, vehicle)
+    held = [] if columns is None else all_held(recording, *columns[:2])
+    if not held:
+        return recording, []
+    pieces: list[Trajectory] = []
+    for number, run in enumerate(recording.trajectories()):
+        lost = np.any([one.samples for one in held if one.run == number] or [False], axis=0)
+        t = recording.dt * np.arange(len(run))
+        pieces += good_pieces(run, t, ~lost) if np.any(lost) else [run]
+    found = [one.finding for one in held]
+    return _of_pieces(recording, pieces, found, source), found
+
+
+def _of_pieces(
+    recording: Recording, pieces: list[Trajectory], found: list[Finding], source: str
+) -> Recording:
+    if not pieces:
+        raise UserError(f"{source}: {found[-1]} Nothing is left of it")
+    kept = Recording.from_trajectories(pieces, recording.dt)
+    return Recording(kept.dataset.assign_attrs(recording.dataset.attrs))
 
 
 def good_pieces(run: Trajectory, t: np.ndarray, good: np.ndarray) -> list[Trajectory]:

@@ -87,7 +87,7 @@ def responses(
     pieces = [
         piece
         for j, k in np.argwhere(recording.lengths > 1)
-        if (piece := _filtered(recording, int(j), int(k), commands, half)) is not None
+        if (piece := filtered(recording, int(j), int(k), commands, half)) is not None
     ]
     if not pieces:
         return {}
@@ -101,17 +101,28 @@ def responses(
 
 
 @dataclass(frozen=True)
-class _Piece:
-    """One run, filtered and thinned: v̇ (n, 6), motion terms (n, q), commands by lag (L, n, m)."""
+class Piece:
+    """One run, filtered and thinned, less its mean.
+
+    Attributes:
+        rate: v̇ (n, 6).
+        terms: v, |v| v and others (n, q).
+        commands: by lag (L, n, m).
+        middle: sample in the middle of each window.
+        half: samples on each side of it.
+    """
 
     rate: np.ndarray
     terms: np.ndarray
     commands: np.ndarray
+    middle: np.ndarray
+    half: int
 
 
-def _filtered(
+def filtered(
     recording: Recording, j: int, k: int, commands: np.ndarray, half: float
-) -> _Piece | None:
+) -> Piece | None:
+    """One run correlated with a window of half width `half` (s); None if it is too short."""
     dt, length = recording.dt, int(recording.lengths[j, k])
     V = recording.dataset["V_WB_B"].to_numpy()[j, k, :length]
     q = recording.dataset["X_WB"].to_numpy()[j, k, :length, :4]
@@ -135,10 +146,12 @@ def _filtered(
     terms = np.concatenate([V, V * np.abs(V), up, np.stack(products, axis=1)], axis=1)
     inner = np.arange(len(V))
     shifted = np.stack([held[np.clip(inner - r, 0, len(V) - 1)] for r in reach])
-    return _Piece(
+    return Piece(
         _smoothed(V, -slope, step),
         _smoothed(terms, window, step),
         np.stack([_smoothed(c, window, step) for c in shifted]),
+        np.arange(n, len(V) - n, step),
+        n,
     )
 
 
@@ -149,7 +162,7 @@ def _smoothed(x: np.ndarray, window: np.ndarray, step: int) -> np.ndarray:
     return y - y.mean(axis=0)
 
 
-def _axis(axis: int, pieces: Sequence[_Piece], step: float) -> AxisResponse:
+def _axis(axis: int, pieces: Sequence[Piece], step: float) -> AxisResponse:
     free = [12, 13, 14, 15 + 2 * axis, 16 + 2 * axis]
     terms = np.concatenate([p.terms for p in pieces])
     R = np.stack(

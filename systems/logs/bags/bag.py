@@ -1,6 +1,7 @@
 """Reads topics of a ROS 1 bag (.bag) or a ROS 2 bag (.db3, .mcap, or their folder) as columns."""
 
 import struct
+from collections import Counter
 from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -33,7 +34,9 @@ _REPAIR = {
     "sqlite3": "`ros2 bag reindex`",
     "folder": "`ros2 bag reindex`",
 }
-_PUBLISHED = ""
+_PUBLISHED, _SHOWN = "", 12
+LOOKED_AT = 200
+"""First messages of a topic, by which a map is proposed."""
 _NANOSECONDS = 1_000_000_000
 _LATEST_NS = 1 << 62
 
@@ -63,8 +66,9 @@ class Column:
         form: what its numbers are.
         x: numbers of each (k, n), see `form`.
         text: word of each.
-        frame: `frame_id` of the first header; `child` likewise `child_frame_id`.
+        frame: `frame_id` of the headers; `child` likewise `child_frame_id`.
         broken: number of messages that could not be read.
+        others: messages in other frames, which are left out, by their frames.
     """
 
     topic: str
@@ -77,6 +81,7 @@ class Column:
     frame: str = ""
     child: str = ""
     broken: int = 0
+    others: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass
@@ -88,8 +93,7 @@ class _Rows:
     stamps: list[int] = field(default_factory=list)
     x: list[tuple[float, ...]] = field(default_factory=list)
     text: list[str] = field(default_factory=list)
-    frame: str = ""
-    child: str = ""
+    frames: list[tuple[str, str]] = field(default_factory=list)
     broken: int = 0
 
     def add(self, message: Any, received: int) -> None:
@@ -98,9 +102,8 @@ class _Rows:
         if self.x and len(x) != len(self.x[0]):
             x = (np.nan,) * len(self.x[0])
         header = getattr(message, "header", None)
-        if not self.x:
-            self.frame = str(getattr(header, "frame_id", ""))
-            self.child = str(getattr(message, "child_frame_id", ""))
+        frame, child = getattr(header, "frame_id", ""), getattr(message, "child_frame_id", "")
+        self.frames.append((str(frame), str(child)))
         stamp = 0 if header is None else header.stamp.sec * _NANOSECONDS + header.stamp.nanosec
         at, text = min(max(int(received), -_LATEST_NS), _LATEST_NS), str(self.form.text(message))
         self.x.append(x)
@@ -109,19 +112,24 @@ class _Rows:
         self.text.append(text)
 
     def column(self, topic: str, type_: str) -> Column:
-        """The rows as arrays."""
+        """The rows as arrays, of the frames that are usual in the first ones."""
+        first = Counter(one for one in self.frames[:LOOKED_AT] if any(one))
+        counts = Counter(one for one in self.frames if any(one)) if first else first
+        usual = max(first, key=lambda one: first[one], default=("", ""))
+        kept = np.array([one == usual or not any(one) for one in self.frames], bool)
         stamps, received = np.array(self.stamps, np.int64), np.array(self.received, np.int64)
+        stamps, received = stamps[kept], received[kept]
         return Column(
             topic,
             type_,
             self.form,
             received,
             _filled(stamps, received) if stamps.any() else None,
-            numbers(np.array(self.x, float).reshape(len(self.x), -1).T),
-            tuple(self.text),
-            self.frame,
-            self.child,
+            numbers(np.array(self.x, float).reshape(len(self.x), -1).T[:, kept]),
+            tuple(text for text, one in zip(self.text, kept.tolist(), strict=True) if one),
+            *usual,
             self.broken,
+            {" to ".join(filter(None, one)): n for one, n in counts.items() if one != usual},
         )
 
 
@@ -156,6 +164,16 @@ class Bag:
         for one in reader.connections:
             if (form := self._form(one)) is not None:
                 self.forms.setdefault(one.topic, form)
+
+    def lacking(self) -> str:
+        """What is not read for want of a definition, and the remedy, in words; empty if nothing."""
+        if not self.undefined:
+            return ""
+        several = ", ".join(f"{t} {self.topics[t]}" for t in sorted(self.undefined)[:_SHOWN])
+        return (
+            f"no definition of {several} is in the bag, so it is not read; record as MCAP, or "
+            "convert the bag (`ros2 bag convert`) where its package is installed"
+        )
 
     def _form(self, connection: Any) -> Form | None:
         if connection.msgtype != self.topics.get(connection.topic):
@@ -256,6 +274,11 @@ class Bag:
                 store.register(get_types_from_msg(definition.data, connection.msgtype))
                 store.get_msgdef(connection.msgtype)
                 return store
+        if not definition.data:
+            self.note(
+                "The bag holds no definitions of its messages, as before ROS 2 Iron: those of "
+                "ROS 2 Humble and mavros are assumed."
+            )
         if _PUBLISHED in self._stores:
             return self._stores[_PUBLISHED]
         store = get_typestore(Stores.ROS1_NOETIC if self.kind == "ros1" else Stores.ROS2_HUMBLE)

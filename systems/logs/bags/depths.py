@@ -1,6 +1,7 @@
 """Depth of a bag: by pressure in any usual unit, or as a number; and whether it is the water's."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -90,9 +91,13 @@ def checked(
 
     A height that rises where the depth grows is a finding: one of them has its axis reversed.
     """
-    found = followed(depth, position)
-    if found.findings and depth is not None and position is not None:
+    topic = taken.topic("depth")
+    pressed = topic is not None and taken.columns[topic.topic].type == PRESSURE
+    found = followed(depth, position, pressed)
+    if depth is not None and position is not None and found.opposite:
         return Followed(None, sure=True), [_reversed(depth, position)]
+    if found.findings:
+        return replace(found, findings=()), list(found.findings)
     if found.depth is None or found.sure or not (proposed and may_be_the_hulls(taken)):
         return found, []
     said = (

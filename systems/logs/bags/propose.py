@@ -10,7 +10,7 @@ import numpy as np
 from ....models.config.errors import UserError
 from ....models.config.yaml_text import emit
 from .adjust import adjusted
-from .bag import Bag, Column
+from .bag import LOOKED_AT, Bag, Column
 from .depths import FIRST_BAROMETER, unit_of
 from .messages import COMMANDS, NUMBERS, PRESSURE, Quantity
 from .mounting import is_tf, read_mounts
@@ -19,7 +19,7 @@ from .singles import NUMBERED, singles
 from .topics import Topic, TopicMap, frames_of
 from .vehicles import vehicles_of
 
-_LOOKED_AT, _COMMANDS_LOOKED_AT = 200, 5000
+_COMMANDS_LOOKED_AT = 5000
 _SHOWN = 12
 _ORDERED = re.compile(
     r"cmd|command|setpoint|desired|target|reference|goal|planned|waypoint|trajectory|initial|error"
@@ -57,9 +57,8 @@ def inspect(bag: Bag) -> list[Seen]:
         UserError: the bag holds none.
     """
     known = [t for t in sorted(bag.topics) if t in bag.forms and bag.counts[t]]
-    if bag.undefined:
-        several = ", ".join(f"{t} {bag.topics[t]}" for t in sorted(bag.undefined)[:_SHOWN])
-        bag.note(f"The bag has no definition of {several}: not read (MCAP files have them).")
+    if lacking := bag.lacking():
+        bag.note(f"{lacking[0].upper()}{lacking[1:]}.")
     found = []
     for topic in known:
         try:
@@ -86,9 +85,9 @@ def _looked_at(bag: Bag, topic: str) -> dict[str, Column]:
     """The first messages of a topic; more of commands and pressures, and if the vehicle rests."""
     kind = bag.topics[topic]
     if not (kind.endswith("MultiArray") or kind in (*NUMBERS, PRESSURE)):
-        found = bag.read([topic], most=_LOOKED_AT)
+        found = bag.read([topic], most=LOOKED_AT)
         resting = {q for q in _MOVING for one in found.values() if _rests(one, q)}
-        if not resting or bag.counts[topic] <= _LOOKED_AT:
+        if not resting or bag.counts[topic] <= LOOKED_AT:
             return found
     return bag.read([topic], most=_COMMANDS_LOOKED_AT)
 
@@ -101,7 +100,8 @@ def listed(bag: Bag) -> str:
     """The topics of a bag, in words."""
     names = [f"{t} {kind} ×{bag.counts[t]}" for t, kind in sorted(bag.topics.items())]
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return (", ".join(names[:_SHOWN]) + more) or "it has no topics"
+    lacking = f"; {bag.lacking()}" if bag.undefined else ""
+    return ((", ".join(names[:_SHOWN]) + more) or "it has no topics") + lacking
 
 
 def propose(bag: Bag) -> TopicMap:

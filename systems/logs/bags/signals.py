@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from .axes import axes_findings, velocity_axes
 from .bag import Bag, Column, open_bag
 from .clocks import Clock
 from .depths import checked, depth, may_be_the_hulls
+from .left_out import left_out
 from .messages import COMMANDS, SAMPLED, Quantity
 from .mounting import mounted, read_mounts
 from .propose import listed, propose
@@ -109,14 +111,14 @@ def _signals(
     voltage = _voltage(taken)
     batteries = [one.topic for one in (taken.topic("voltage"),) if one is not None]
     findings = [*frame, *axes_findings(taken, attitude, place, force), *reversed_]
-    findings += [*missing_states(spans, voltage, batteries, "mavros_msgs/State"), *_broken(columns)]
+    findings += missing_states(spans, voltage, batteries, "mavros_msgs/State")
+    findings += [*left_out(columns), *taken.clock.findings, *direction_findings(wired)]
     return Signals(
         attitude=attitude,
         rates=rates,
         outputs=outputs,
         command=command,
         held=columns[outputs.source].type not in SAMPLED,
-        vehicle=wired.vehicle,
         position=position,
         velocity=velocity,
         specific_force=force,
@@ -124,10 +126,27 @@ def _signals(
         voltage=voltage,
         rc=_rc(taken),
         spans=spans,
-        notes=(*taken.notes, *strange, *wire_notes, *motion_notes, *delays, *below.told),
-        findings=(*findings, *direction_findings(wired)),
-        turned=wired.turned,
+        cuts=(*((t, "step back of the clock") for t in taken.clock.cuts), *wired.cuts),
+        notes=(
+            *taken.clock.notes,
+            *taken.notes,
+            *strange,
+            *wire_notes,
+            *motion_notes,
+            *delays,
+            *below.told,
+        ),
+        findings=tuple(findings),
+        **_wired(wired, command, columns[outputs.source]),
     )
+
+
+def _wired(wired: Wiring, command: str, column: Column) -> dict[str, Any]:
+    """What the wiring says of the outputs: numbers of outputs are an autopilot's alone."""
+    if command != "pwm":
+        return {"vehicle": wired.vehicle}
+    outputs = {} if column.type in SAMPLED else {"channels": ()}
+    return wired.of_signals() | outputs
 
 
 def _undelayed(
@@ -366,16 +385,3 @@ def _voltage(taken: Quantities) -> Series | None:
 def _rc(taken: Quantities) -> Series | None:
     found = taken.taken("rc")
     return None if found is None else series(found[1], found[2], found[0].topic, "channel")
-
-
-def _broken(columns: Mapping[str, Column]) -> list[Finding]:
-    return [
-        Finding(
-            "messages-unreadable",
-            topic,
-            f"{one.broken} of its messages can't be read and were left out",
-            "copy the bag again",
-        )
-        for topic, one in columns.items()
-        if one.broken
-    ]

@@ -147,6 +147,8 @@ def load_map(path: Path, bag: Bag) -> TopicMap:
         if one.type not in ("", type_):
             raise UserError(f"{path}: {one.topic} is of type {type_}, not {one.type}; correct it")
         form = bag.forms.get(one.topic)
+        if form is None and one.topic in bag.undefined:
+            raise UserError(f"{path}: {one.topic} can't be taken: {bag.lacking()}")
         if form is None:
             raise UserError(
                 f"{path}: {one.topic} is of type {type_}, which is not read; leave it out"

@@ -60,7 +60,7 @@ def build_diagram(
     `X_WB` and `V_WB_B`; its further outputs of `station_ports` are logged as well.
 
     With `hardware` the station is a vehicle's, used as `link` says, and a planner runs beside the
-    loop (`sims.run.flight`).
+    loop (`sims.run.flight`). Without a horizontal sensor a controller may hold attitude and depth.
 
     Raises:
         UserError: a configuration names what can't be read, or controller or stand-in lack a port.
@@ -75,8 +75,11 @@ def build_diagram(
     else:
         check_stand_in(stand_in, station)
         plant = builder.AddNamedSystem("station", stand_in)
+    told = hardware and link is not None and link.estimate == "autopilot"
     if hardware:
         controller = controller.beside_the_loop()
+    if not (station.sensing.horizontal or told or stand_in):
+        controller = controller.without_position(station) or controller
     control = controller.add_to(builder, station, goal)
     for name in (*INPUTS, *TOLD):
         if name in INPUTS or (plant.HasOutputPort(name) and control.HasInputPort(name)):

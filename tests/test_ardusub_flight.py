@@ -25,6 +25,8 @@ from spinndrift.systems.mavlink.transport import Connection
 pytestmark = pytest.mark.skipif(not BINARY, reason="SPINNDRIFT_ARDUSUB names no binary")
 LIMIT = 120.0  # s of wall time for anything
 STOPS = 2.5  # s until the thrusters are still: that of docs/field.md, and the streams' own time
+PATIENT = "late: 5, plan_age: 10, lost: 5, silence: 5, stale: 5, stale_aid: 10, outputs: 10"
+"""Guards that a loaded machine trips; those of the vehicle and of the place stay."""
 _OFFSETS = {"X": 5, "Y": 13, "Z": -18}
 PARAMETERS = {
     "FRAME_CONFIG": 2,
@@ -85,14 +87,16 @@ def instance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
 def flight(instance: int, folder: Path, actuation: str, goal: bool) -> Iterator[subprocess.Popen]:
     """`spinndrift run` in a process of its own; without a `goal` it goes on for 40 s."""
     end = "" if goal else "duration: 40, success: !ReachGoal {radius: 0.01, near_radius: 0.02}, "
+    safety = f"max_depth: 8.0, fence: [9.0, 8.0], end: disarm, {PATIENT}"
     link = (
         f'!Mavlink {{connection: "tcp:127.0.0.1:{5760 + 10 * instance}", actuation: {actuation}, '
-        "estimate: autopilot, safety: {max_depth: 8.0, fence: [9.0, 8.0], end: disarm}}"
+        f"estimate: autopilot, safety: {{{safety}}}}}"
     )
     text = f"{{{end}station: {{sensing: {{dvl: null}}}}, vehicle_link: {link}}}"
     command = [sys.executable, "-m", "spinndrift", "run", "pylon_crossing_vehicle", "--arm"]
     command += ["--scenario-text", text, "--out", str(folder / "flight")]
     surroundings = os.environ | {"XDG_STATE_HOME": str(folder)}
+    surroundings.pop("XLA_FLAGS", None)  # those of the tests compile fast, for a slow planner
     with (folder / "run.txt").open("w") as log:
         process = subprocess.Popen(command, env=surroundings, stdout=log, stderr=log)
     try:

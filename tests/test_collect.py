@@ -17,8 +17,8 @@ from spinndrift.models.recordings.store import Recording
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.run.collection import COLLECTION, Collected, collect, maneuver_scenario
 from spinndrift.sims.run.experiment import chosen_maneuvers
+from spinndrift.sims.run.flight_log import without_horizontal
 from spinndrift.sims.run.log import RunLog
-from spinndrift.sims.run.trajectories import _without_horizontal
 from spinndrift.sims.scenarios.maneuvers import Maneuvers
 from spinndrift.sims.scenarios.scenario import Scenario, load_scenario
 from spinndrift.systems.controllers.maneuvers import Phase, Steadiness
@@ -183,7 +183,7 @@ def test_without_a_horizontal_aid_the_recording_has_climb_and_depth_alone():
     v_W = np.column_stack([np.zeros((5, 2)), rng.normal(size=5)])
     X = np.column_stack([R.as_quat(scalar_first=True), rng.normal(size=(5, 3))])
     V = np.column_stack([R.inv().apply(v_W), rng.normal(size=(5, 3))])
-    X1, V1, climb = _without_horizontal(X, V)
+    X1, V1, climb = without_horizontal(X, V)
     assert np.isnan(X1[:, 4:6]).all()
     assert np.isnan(V1[:, :2]).all()
     np.testing.assert_array_equal(X1[:, [0, 1, 2, 3, 6]], X[:, [0, 1, 2, 3, 6]])

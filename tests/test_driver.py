@@ -232,6 +232,62 @@ def test_a_pilot_who_changes_the_mode_is_left_alone(port: int):
         assert "STABILIZE" in acted.reason
 
 
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ((176, 1.0, 2.0), "the mode was changed to ALT_HOLD meanwhile"),
+        pytest.param(
+            (400, 1.0, 2989.0),
+            "somebody else has armed the vehicle meanwhile",
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_a_vehicle_that_a_pilot_takes_before_arming_is_left_alone(
+    served: Served, port: int, monkeypatch: pytest.MonkeyPatch, command, words: str
+):
+    autopilot = served.simulation.vehicle.autopilot
+    with connect(port) as driver:
+        borrow = driver._borrowed.borrow
+
+        def taken(*given) -> None:
+            borrow(*given)
+            before = autopilot.mode, autopilot.armed
+            driver._ask(*command)
+            assert until(lambda: (autopilot.mode, autopilot.armed) != before)
+            assert until(lambda: (s := driver._seen()).armed or s.mode != "MANUAL")
+
+        monkeypatch.setattr(driver._borrowed, "borrow", taken)
+        with pytest.raises(commands.VehicleRefused, match=words):
+            driver.prepare()
+    assert autopilot.armed == (command[0] == 400)
+    assert served.simulation.vehicle.parameters["FS_PILOT_TIMEOUT"] == 3.0, "given back"
+    with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
+        link.find_vehicle(15.0)
+        commands.disarm(link)
+        commands.set_mode(link, "MANUAL")
+
+
+@pytest.mark.slow
+def test_an_armed_vehicle_keeps_what_a_former_run_has_left(served: Served, port: int):
+    """Its thrusters run: nobody changes what their outputs do."""
+    with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
+        number = commands.identity(link).serial_number
+        file = borrowed_file(Connection.parse(f"tcp:127.0.0.1:{port}"), number)
+        Borrowed(Parameters(link), file).borrow({"FS_PILOT_TIMEOUT": 0.5})
+        commands.arm(link)
+    values = served.simulation.vehicle.parameters
+    with connect(port) as driver:
+        found = {finding.name: finding for finding in driver.preflight()}
+        assert not found["disarmed"].passed
+        assert not found["outputs"].passed
+        assert values["FS_PILOT_TIMEOUT"] == 0.5
+        commands.disarm(driver.link)
+        found = {finding.name: finding for finding in driver.preflight()}
+        assert found["disarmed"].passed
+        assert values["FS_PILOT_TIMEOUT"] == 3.0
+
+
 KILLED = """
 import sys, time
 import numpy as np

@@ -16,6 +16,7 @@ from spinndrift.sims import cli
 from spinndrift.sims.run.flight_log import Entry
 from spinndrift.sims.run.live import LivePage, guard_rows
 from spinndrift.sims.run.loop import simulate
+from spinndrift.sims.scenarios.criteria import Outcome
 from spinndrift.sims.scenarios.scenario import load_scenario
 from spinndrift.systems.mavlink.safety import SafetyConfig
 
@@ -34,11 +35,12 @@ def test_the_page_needs_nothing_from_elsewhere_and_its_state_is_json():
         assert not linked, "all is in the page"
         page.begin(load_scenario("pylon_crossing_vehicle"))
         page.show(1.5, lambda: {"X_WB": np.array([1.0, 0, 0, 0, np.nan, 2, -3])})
-        page.end("Stopped at 1.6 s: the vehicle was not heard.")
+        page.end(Outcome("guard", 1.6, "Stopped at 1.6 s: the vehicle was not heard."))
         state = json.loads(fetched(page, "state.json"))
         assert state["X_WB"] == [1, 0, 0, 0, None, 2, -3]
         assert (state["t"], state["fence"], len(state["obstacles"])) == (1.5, [7, 5], 3)
         assert state["reason"] == "Stopped at 1.6 s: the vehicle was not heard."
+        assert (state["ended"], state["good"]) == (True, False)
         with pytest.raises(urllib.error.HTTPError, match="404"):
             fetched(page, "../../etc/passwd")
 

@@ -51,6 +51,7 @@ def arguments() -> dict[str, dict]:
         "MppiBeside": {"planner": planner},
         "VehicleInterface": {"sensors": SHIPPED, "thrusters": 8, "health": 5},
         "Impedance": {"law": law, "layout": PlanLayout()},
+        "WithoutPosition": {"place": (0.0, 0.0)},
         "DisturbanceObserver": {"observer": MomentumObserver(dynamics)},
         "ManeuverSequence": {"program": program, "law": law, "steady": Steadiness()},
         "Reference": {"path": HoldPose()},

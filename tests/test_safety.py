@@ -16,7 +16,7 @@ from spinndrift.systems.mavlink.safety import (
 )
 
 AGES = {"vehicle": 0.05, "attitude": 0.05, "depth": 0.1, "aid": 0.2, "plan": 0.3, "loop": 0.1}
-AGES |= {"dead_man": 0.2}
+AGES |= {"dead_man": 0.2, "imu": 0.02, "dead_reckoning": 0.3}
 CONFIG = SafetyConfig(dead_man=1.0)
 START = State("MANUAL", np.array([5.0, -3.0, -1.0]))
 
@@ -38,7 +38,9 @@ FAULTS = {
     "attitude": {"ages": {"attitude": float("inf")}},
     "depth": {"ages": {"depth": 0.6}},
     "depth_sensor": {"depth_healthy": False},
+    "imu": {"ages": {"imu": 0.6}},
     "aid": {"ages": {"aid": 2.1}},
+    "dead_reckoning": {"ages": {"dead_reckoning": 6.1}},
     "loop": {"ages": {"loop": 0.6}},
     "estimate": {"health": 2},
     "plan": {"ages": {"plan": 2.5}},

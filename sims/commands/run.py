@@ -93,7 +93,7 @@ class Run:
                 with progress_bar(f"flying {scenario.name}") as update:
                     flown = simulate(scenario, update, self.engine, live=live)
             if live is not None:
-                live.end(flown.outcome.sentence)
+                live.end(flown.outcome)
             values = write_files(flown, out, self.report)
         if not self.quiet:
             self._summary(values, out)
@@ -126,7 +126,7 @@ class Run:
     def _summary(self, values: dict, out: Path) -> None:
         shown, path, timing = console(), values["path"], values["timing"]
         shown.print(values["outcome"]["words"])
-        told = [f"path {path['length_m']:.1f} m"]
+        told = [] if path["length_m"] is None else [f"path {path['length_m']:.1f} m"]
         for name, block, key in (
             ("minimum clearance", path, "min_clearance_m"),
             ("tracking error", values["tracking"], "position_rms_m"),
@@ -140,5 +140,6 @@ class Run:
         if beyond:
             allowed = values["planner"]["allowed_collision_probability"]
             told.append(f"collision risk above the allowed {100 * allowed:g} % in {beyond} plans")
-        shown.print(", ".join(told))
+        if told:
+            shown.print(", ".join(told))
         shown.print(f"wrote {out}" + (f"; open {out / 'report.html'}" if self.report else ""))

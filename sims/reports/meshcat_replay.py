@@ -92,7 +92,7 @@ def _surroundings(meshcat: Meshcat, log: RunLog, scene: Scene) -> None:
         meshcat.SetProperty(path, "visible", False)
     meshcat.SetProperty("/Background", "top_color", [0.80, 0.90, 0.95])
     meshcat.SetProperty("/Background", "bottom_color", [0.16, 0.36, 0.46])
-    p = log["X_WB"][:, 4:]
+    p = _poses(log)[:, 4:]
     points = p if scene.goal is None else np.concatenate([p, [scene.goal]])
     low, high = points.min(axis=0), points.max(axis=0)
     middle = (low + high) / 2
@@ -140,16 +140,21 @@ def _vehicle(meshcat: Meshcat, vehicle: Vehicle) -> None:
         meshcat.SetTransform(f"vehicle/thruster_{i + 1}", X)
 
 
+def _poses(log: RunLog) -> np.ndarray:
+    """X_WB; a vehicle whose place is not known is shown at x = y = 0."""
+    return np.nan_to_num(log["X_WB"])
+
+
 def _motion(meshcat: Meshcat, log: RunLog) -> None:
     every = max(1, round(1 / (FRAMES * log.dt)))
-    for t, X in zip(log.time[::every], log["X_WB"][::every], strict=True):
+    for t, X in zip(log.time[::every], _poses(log)[::every], strict=True):
         R = RotationMatrix(Quaternion(X[:4] / np.linalg.norm(X[:4])))
         meshcat.SetTransform("vehicle", _pose(X[4:], R), float(t))
 
 
 def _flown(meshcat: Meshcat, log: RunLog) -> None:
     """The path, piece by piece over time."""
-    p = log["X_WB"][:, 4:]
+    p = _poses(log)[:, 4:]
     size = max(1, round(_PIECE / log.dt))
     for k in range(0, max(len(p) - 1, 0), size):
         path = f"flown/{k:05d}"

@@ -119,8 +119,12 @@ def _path_section(
     replay: str,
     values: dict[str, Any],
 ) -> None:
-    text = f"The [3-D replay]({replay}) shows the whole run."
-    page.section("Path", text if replay else "")
+    text = f"The [3-D replay]({replay}) shows the whole run." if replay else ""
+    if not log.placed:
+        unknown = "The vehicle did not know its place, but its depth and attitude."
+        page.section("Path", f"{unknown} {text}".strip())
+        return
+    page.section("Path", text)
     page.figure(
         path_figure(log, scene),
         "Planned, flown and estimated path. Shaded: the hull at several times. "
@@ -204,7 +208,8 @@ def _tiles(values: dict[str, Any]) -> list[tuple[str, str, str]]:
     else:
         add("Time", values["outcome"]["time_s"], "s", 1)
         add("Distance left", path.get("final_distance_m"), "m", 2)
-    add("Path", path["length_m"], "m", 1, f"up to {path['max_speed_m_s']:.2f} m/s")
+    fastest = path["max_speed_m_s"]
+    add("Path", path["length_m"], "m", 1, "" if fastest is None else f"up to {fastest:.2f} m/s")
     add("Minimum clearance", path.get("min_clearance_m"), "m", 2, "hull to pylon")
     add("Tracking error", tracking.get("position_rms_m"), "m", 2, "RMS")
     add("Estimation error", values["estimate"].get("position_rms_m"), "m", 2, "RMS")

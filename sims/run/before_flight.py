@@ -17,7 +17,7 @@ from ...systems.mavlink.interface import RESOLUTION, unread
 from ...systems.mavlink.link import Received
 from ...systems.mavlink.preflight import Finding
 from ..scenarios.scenario import Scenario
-from .way import check_free, find_passage, no_safe_plan
+from .way import check_free, check_positioned, find_passage, no_safe_plan
 
 _RATES = (200.0, 100.0, 50.0, 40.0, 20.0)  # Hz that the filter may have; their ticks fit the loop's
 _FEW = 5  # values
@@ -33,14 +33,15 @@ def checked_link(scenario: Scenario) -> Mavlink:
     """The scenario's link.
 
     Raises:
-        UserError: it has none, or a sensor that no vehicle has, an obstacle at the start, or no
-            safe plan.
+        UserError: it has none, or a sensor that no vehicle has, an obstacle at the start, no safe
+            plan, or something that needs a position where there is none.
     """
     link = scenario.link()
     for name in unread(scenario.station.sensing.sensors):
         raise UserError(
             f"station.sensing.more.{name}: no message of a vehicle measures it; leave it out"
         )
+    check_positioned(scenario)
     check_free(scenario)
     passage = find_passage(scenario)
     if passage is not None and not passage.safe:
@@ -123,8 +124,11 @@ def as_granted(scenario: Scenario, driver: Driver, say: Tell = lambda text: None
     late = [each.latencies[1] for each in sensing.sensors.values() if each.late]
     horizon = max([sensing.ekf.horizon, *(t + 2.5 / rate for t in late)])
     ekf, link = replace(sensing.ekf, horizon=horizon), scenario.vehicle_link
-    if not sensing.horizontal and link is not None and link.estimate == "own":
-        say("no sensor of horizontal motion: position is lost within seconds, the fence is off")
+    if not scenario.positioned and link is not None:
+        say(
+            "no sensor of horizontal motion: the vehicle does not know where it is; depth and "
+            "attitude are held, it drifts, and the fence is off"
+        )
         safety = replace(link.safety, fence=(_NEVER, _NEVER))
         scenario = replace(scenario, vehicle_link=replace(link, safety=safety))
     sensing = replace(sensing, imu=imu, ekf=ekf, depth=depth)

@@ -72,7 +72,8 @@ def maneuver_scenario(scenario: Scenario, settings: Maneuvers) -> Scenario:
             "vehicle_link.safety.max_depth and station.sensing.dvl.water_depth"
         )
     rate = _BELOW_SPINNING * scenario.safety.spin_rate
-    settings = replace(settings, bounds=Bounds((depths[0], depths[1]), sides, rate))
+    bounds = Bounds((depths[0], depths[1]), sides, rate)
+    settings = replace(settings, bounds=bounds, positioned=scenario.positioned)
     return replace(
         scenario,
         controller=settings,
@@ -214,7 +215,7 @@ def collect(
             seeded = left.with_changes(seed=(left.seed + number - 1) % 2**32)
             run = simulate(seeded, progress, engine, collection.keep, live)
         if live is not None:
-            live.end(run.outcome.sentence)
+            live.end(run.outcome)
         write_files(run, dive, report)
     there = collection.finished
     return Collected(run.outcome, len(there) - len(before), len(there), wanted)
@@ -243,7 +244,7 @@ def _told(value: Any) -> str:
 
 
 def _notes(scenario: Scenario) -> list[str]:
-    settings, station = scenario.controller, scenario.station
+    settings = scenario.controller
     assert isinstance(settings, Maneuvers)
     notes = [
         f"Each trajectory begins with the end of its rest at the start; {settings.duration:g} s of "
@@ -252,7 +253,7 @@ def _notes(scenario: Scenario) -> list[str]:
     ]
     if scenario.vehicle_link is None:
         notes.append("X_WB and V_WB_B are the simulation's truth; the estimates are beside them.")
-    elif not station.sensing.horizontal and scenario.vehicle_link.estimate == "own":
+    elif not scenario.positioned:
         notes.append(
             "The vehicle has no horizontal aid: a start is an attitude, a depth and a heading, at "
             "rest means turn rates and climb, and x, y, u, v are missing."

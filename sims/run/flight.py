@@ -75,6 +75,8 @@ def fly(
         checks = preflight(driver, scenario, say)
         scenario = as_granted(scenario, driver, say)
         driver.use(scenario.vehicle_link or link)
+        if live is not None:
+            live.begin(scenario)
         cockpit = Cockpit(driver, scenario)
         progress(0.0, "compiling")
         cockpit.warm_up()
@@ -312,7 +314,10 @@ class Cockpit:
         return Clockwork(simulator, self.tick, epoch)
 
     def _await_readings(self) -> None:
-        """Wait until the readings are new: those of before are old after a compilation."""
+        """Wait until the readings are new: those of before are old after a compilation.
+
+        An armed vehicle gets neutral commands meanwhile.
+        """
         since, driver = time.monotonic(), self.driver
         wants_dvl = isinstance(self.scenario.station.sensing.dvl, Dvl)
         while time.monotonic() < since + _START:
@@ -320,7 +325,8 @@ class Cockpit:
             fresh = attitude is not None and attitude.arrival > since
             if fresh and (not wants_dvl or driver.dvl_state()[0] < time.monotonic() - since):
                 return
-            time.sleep(0.01)
+            driver.idle()
+            time.sleep(0.02)
 
     def _ages(self, context: Context) -> dict[str, Callable[[], float]]:
         """Ages (s) of the plan that a planner made, and of the dead-man key."""

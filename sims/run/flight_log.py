@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from ...systems.closed_loop import Signal
 from ...systems.mavlink import telemetry
@@ -22,6 +23,7 @@ ORDERS = ("fly", "neutral", "hold_depth", "disarm", "yield")
 AGES = tuple(age for age, *_ in AGED.values())
 """Names of the ages in the log, in their order."""
 _SAME = 1e-6  # s
+_RECENT = 60.0  # s for which a text of the vehicle is shown
 _NOTES = (
     "X_WB and V_WB_B are the estimate, flown on a vehicle; there is no truth.",
     "F_Bo_B is the mean over each step of the wrench that was sent, within the guards' limits. pwm "
@@ -92,6 +94,20 @@ class Journal:
         volts = "" if math.isnan(last.voltage) else f", {last.voltage:.1f} V"
         return f"{ORDERS[last.order]}{volts}"
 
+    def vehicle(self) -> dict[str, Any]:
+        """What the vehicle says of itself, and how well it is heard."""
+        link, now = self._driver.link, time.monotonic()
+        status, found = telemetry.status(link, now), link.statistics(rated=False)
+        total = max(found.received + found.lost, 1)
+        return {
+            "mode": "" if status is None else status.mode,
+            "armed": status is not None and status.armed,
+            "link_lost": found.lost / total,
+            "round_trip": found.round_trip,
+            "reconnections": found.reconnections,
+            "heard": [text for _, _, text in link.texts(now - _RECENT)][-8:],
+        }
+
     def summary(self) -> dict[str, Any]:
         """Times in each order (s), the reason, the lowest voltage, the longest silence."""
         times = np.array([entry.t for entry in self.entries])
@@ -151,6 +167,20 @@ class Journal:
         return {"F_Bo_B": mean_over(sent, grid, dt)} | {n: c[index] for n, c in columns.items()}
 
 
+def without_horizontal(X: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States without what a vehicle without a horizontal aid can't know, and its climb (m/s).
+
+    As in an imported log: w is the part of the climb along the body's axis.
+    """
+    X, V = X.copy(), V.copy()
+    R = Rotation.from_quat(X[:, :4], scalar_first=True)
+    climb = R.apply(V[:, :3])[:, 2]
+    X[:, 4:6] = np.nan
+    V[:, :2] = np.nan
+    V[:, 2] = climb * R.as_matrix()[:, 2, 2]
+    return X, V, climb
+
+
 def _ages(entry: Entry) -> list[float]:
     """Ages in the order of `AGES`; NaN for those that there are not, or that are infinite."""
     found = [entry.ages.get(name, math.nan) for name in AGES]
@@ -168,9 +198,14 @@ def collect_flight(
     dt = 1 / scenario.log.rate
     n = max(1, min(round(end / dt) + 1, len(signals["X_WB"].time)))
     grid = dt * np.arange(n)
+    X, V = signals["X_WB"].value[:n], signals["V_WB_B"].value[:n]
+    notes = _NOTES
+    if not scenario.positioned:
+        X, V, _ = without_horizontal(X, V)
+        notes = (*notes, "There is no horizontal aid: x, y, u and v are unknown, NaN.")
     variables = {
-        "X_WB": signals["X_WB"].value[:n],
-        "V_WB_B": signals["V_WB_B"].value[:n],
+        "X_WB": X,
+        "V_WB_B": V,
         **journal.at(grid),
         "health": signals["health"].value[:n],
     }
@@ -186,7 +221,7 @@ def collect_flight(
         tap.plans(float(grid[-1])),
         vehicle=scenario.station.vehicle,
         source=f"scenario {scenario.name} on the vehicle at {link and link.connection}",
-        notes=_NOTES,
+        notes=notes,
         fused=scenario.station.sensing.fused,
         start=journal.boot,
     )

@@ -20,12 +20,15 @@ from pydrake.systems.framework import Context, Diagram
 
 from ...models.config.errors import UserError
 from ...systems.mavlink.safety import AGED, SafetyConfig
+from ..scenarios.criteria import Outcome
 from ..scenarios.scenario import Scenario
-from .flight_log import ORDERS, Entry, Journal
+from .flight_log import ORDERS, Entry, Journal, without_horizontal
 from .signals import PlanTap
 
 _PAGE = Path(__file__).with_name("live.html")
 _PERIOD = 0.2  # s between the states that are taken in
+_FORESEEN = ("goal", "duration", "finished")
+"""Ends of a run that are not shown as an alarm."""
 
 
 class LivePage:
@@ -90,8 +93,9 @@ class LivePage:
             size=station.load_vehicle().size,
             obstacles=[[p.x, p.y, p.diameter / 2, p.name] for p in station.obstacles],
             goal=None if scenario.goal is None else scenario.goal.tolist(),
-            fence=link.safety.fence if link else None,
+            fence=link.safety.fence if link and scenario.positioned else None,
             sensors=["imu", *station.sensing.fused],
+            duration=scenario.duration,
         )
 
     def say(self, text: str) -> None:
@@ -105,9 +109,9 @@ class LivePage:
             self._seen = now
             self._put(**{"t": t, **seen()})
 
-    def end(self, sentence: str) -> None:
+    def end(self, outcome: Outcome) -> None:
         """Show why the run has ended."""
-        self._put(reason=sentence)
+        self._put(reason=outcome.sentence, ended=True, good=outcome.reason in _FORESEEN)
 
     def _put(self, **new: Any) -> None:
         self._state = {**self._state, **new}  # one assignment: a reader has the old or the new one
@@ -164,6 +168,8 @@ def guard_rows(
     )  # fmt: skip
     for axis, name in enumerate("xy"):
         away, side = abs(float(X_WB[4 + axis]) - start[axis]), safety.fence[axis]
+        if math.isnan(away):  # off
+            continue
         rows.append({"name": f"fence {name}", "value": away, "limit": f"{side:g} m",
                      "share": away / side})  # fmt: skip
     if safety.min_voltage > 0:
@@ -183,6 +189,9 @@ def flight_view(
     words: str,
 ) -> dict[str, Any]:
     """The row of a flight's log at time t (s); `seen` are pose, twist and health."""
+    if not scenario.positioned:
+        (X,), (V,), _ = without_horizontal(seen[0][None], seen[1][None])
+        seen = [X, V, *seen[2:]]
     view, link = _estimate_view(tap, seen, words), scenario.vehicle_link
     entry = journal.before(t)
     if entry is None or link is None:
@@ -191,6 +200,7 @@ def flight_view(
         "F_Bo_B": entry.F_Bo_B,
         "pwm": entry.shown,
         "voltage": entry.voltage,
+        **journal.vehicle(),
         "order": ORDERS[entry.order],
         "tripped": journal.tripped,
         "reason": journal.reason,

@@ -137,6 +137,11 @@ class RunLog:
         return self.recording.dt
 
     @property
+    def placed(self) -> bool:
+        """Whether x and y of the vehicle are known at any time."""
+        return bool(np.isfinite(self["X_WB"][:, 4:6]).all(axis=1).any())
+
+    @property
     def least_risk(self) -> float | None:
         """Probability of a collision on the widest path to the goal, if there is a goal."""
         return self._attribute("least_risk")

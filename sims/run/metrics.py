@@ -63,6 +63,9 @@ def verdict(outcome: Outcome, success: Success, values: dict[str, Any]) -> tuple
     rms = values["tracking"]["position_rms_m"]
     if rms is None or math.isnan(rms):
         return False, "The run was too short to measure the tracking error."
+    if values["path"]["length_m"] is None or math.isnan(values["path"]["length_m"]):
+        words = f"The depth was held within {rms:.2f} m RMS; the place is not known."
+        return rms <= success.position_rms, words
     if rms <= success.position_rms:
         return (
             True,
@@ -84,12 +87,19 @@ def clearance(
 
 
 def tracking_error(log: RunLog) -> tuple[np.ndarray, np.ndarray] | None:
-    """Plan minus truth over time: log(X_WB⁻¹ X_plan) (N, 6), twist (N, 6); NaN without a plan."""
+    """Plan minus truth over time: log(X_WB⁻¹ X_plan) (N, 6), twist (N, 6); NaN without a plan.
+
+    A place that is not known (NaN) has no error, and neither has a velocity.
+    """
     if "X_WB_plan" not in log or not np.any(log["plan_valid"] > 0.5):
         return None
     valid = (log["plan_valid"] > 0.5)[:, None]
-    pose = local(log["X_WB"], np.where(valid, log["X_WB_plan"], log["X_WB"]))
-    twist = log["V_WB_B_plan"] - log["V_WB_B"]
+    X, V = (
+        np.where(np.isnan(known := log[name]) & valid, log[f"{name}_plan"], known)
+        for name in ("X_WB", "V_WB_B")
+    )
+    pose = local(X, np.where(valid, log["X_WB_plan"], X))
+    twist = log["V_WB_B_plan"] - V
     return np.where(valid, pose, np.nan), np.where(valid, twist, np.nan)
 
 

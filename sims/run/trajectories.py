@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram
-from scipy.spatial.transform import Rotation
 
 from ...models.recordings.build import Trajectory
 from ...systems.closed_loop import Signal, logged
@@ -13,7 +12,7 @@ from ...systems.controllers.maneuvers import Phase
 from ..scenarios.criteria import Outcome
 from ..scenarios.maneuvers import Maneuvers
 from ..scenarios.scenario import Scenario
-from .flight_log import Journal
+from .flight_log import Journal, without_horizontal
 from .signals import mean_over
 
 Keep = Callable[[int, Trajectory], None]
@@ -122,8 +121,8 @@ class ManeuverTap:
         if self._journal is not None:
             commands = self._journal.steps(grid, dt)
             sensors = {n: commands.pop(n) for n in ("voltage", "pwm_shown") if n in commands}
-            if not station.sensing.horizontal and self._estimated_here:
-                X, V, climb = _without_horizontal(X, V)
+            if not self._scenario.positioned:
+                X, V, climb = without_horizontal(X, V)
                 sensors["vertical_velocity"] = climb
         else:
             acting = signals["F_acting"]
@@ -146,25 +145,6 @@ class ManeuverTap:
         sensors["dive_time"] = grid
         # repeats begin at the same time of their clocks: training compares them instant by instant
         return Trajectory(name, X, V, commands, sensors)
-
-    @property
-    def _estimated_here(self) -> bool:
-        link = self._scenario.vehicle_link
-        return link is not None and link.estimate == "own"
-
-
-def _without_horizontal(X: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States without what a vehicle without a horizontal aid can't know, and its climb (m/s).
-
-    As in an imported log: w is the part of the climb along the body's axis.
-    """
-    X, V = X.copy(), V.copy()
-    R = Rotation.from_quat(X[:, :4], scalar_first=True)
-    climb = R.apply(V[:, :3])[:, 2]
-    X[:, 4:6] = np.nan
-    V[:, :2] = np.nan
-    V[:, 2] = climb * R.as_matrix()[:, 2, 2]
-    return X, V, climb
 
 
 def _label(name: tuple[str, int]) -> str:

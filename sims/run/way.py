@@ -32,6 +32,33 @@ def check_free(scenario: Scenario) -> None:
                 raise UserError(_taken("success.goal", pylon, gap))
 
 
+def check_positioned(scenario: Scenario) -> None:
+    """Check that a vehicle without a position is asked for nothing that needs one.
+
+    Raises:
+        UserError: its controller, its goal or its obstacles need one.
+    """
+    if scenario.positioned:
+        return
+    lacking = (
+        "needs to know where the vehicle is, and station.sensing has no sensor of horizontal motion"
+    )
+    remedy = "add its DVL, or take `estimate: autopilot` if the autopilot has a position, or"
+    kind = type(scenario.controller).__name__
+    if scenario.controller.without_position(scenario.station) is None:
+        raise UserError(
+            f"controller: !{kind} {lacking}; {remedy} hold depth and attitude: "
+            "controller: !TrackReference {path: !HoldPose {at: {position: [0, 0, -1.5]}}}"
+        )
+    if isinstance(scenario.success, ReachGoal):
+        raise UserError(f"success: !ReachGoal {lacking}; {remedy} give !FollowPath {{}}")
+    if scenario.station.obstacles:
+        raise UserError(
+            f"station.obstacles: to keep clear of them {lacking}; {remedy} fly in free water: "
+            "station: {obstacles: []}"
+        )
+
+
 def find_passage(scenario: Scenario) -> Passage | None:
     """The widest path to the goal, with the planner's measure of risk; None without a goal.
 

@@ -101,6 +101,8 @@ class Maneuvers(Controller):
         gains: of the proportional-derivative controller.
         error_limit: distance (m) and angle (rad) at which its error is saturated.
         finished: trajectories that aren't flown again, such as `surge-forward 3`.
+        positioned: whether the vehicle knows its place; by default if a sensor observes horizontal
+            motion. Otherwise a start is an attitude, a depth and a heading.
     """
 
     maneuvers: tuple[str, ...] = tuple(MANEUVERS)
@@ -113,6 +115,7 @@ class Maneuvers(Controller):
     gains: ImpedanceGains = field(default_factory=ImpedanceGains)
     error_limit: tuple[float, float] = (1.0, 1.0)
     finished: tuple[str, ...] = ()
+    positioned: bool | None = None
 
     def __post_init__(self) -> None:
         """Check names and numbers."""
@@ -147,6 +150,10 @@ class Maneuvers(Controller):
         """
         return _planned(self, station)[0]
 
+    def without_position(self, station: StationConfig) -> Controller | None:
+        del station
+        return self
+
     def build(self, station: StationConfig, goal: Goal = None) -> System:
         del goal
         flown, F_Bo_B, which = _planned(self, station)
@@ -160,8 +167,12 @@ class Maneuvers(Controller):
         names = tuple((each.maneuver, each.repeat) for each in flown)
         program = ManeuverProgram(starts, which, F_Bo_B, held, step, names)
         period = step / math.ceil(step / _LONGEST - 1e-9)
-        health = station_ports(station)[1]["health"] if station.sensing.horizontal else None
+        health = station_ports(station)[1]["health"] if _positioned(self, station) else None
         return ManeuverSequence(program, law, self.steady, period, health)
+
+
+def _positioned(config: Maneuvers, station: StationConfig) -> bool:
+    return station.sensing.horizontal if config.positioned is None else config.positioned
 
 
 def check_maneuver(name: str) -> None:
@@ -215,7 +226,7 @@ def _planned(
     if not sequences:
         raise UserError("Maneuvers.finished: it holds all trajectories; give more `repeats`")
     low, high, rates = _paths(vehicle, sequences, 1 / config.rate)
-    free = not station.sensing.horizontal
+    free = not _positioned(config, station)
     flown, shares = [], []
     for (name, number), X, row in zip(wanted, starts, which, strict=True):
         found = _fit(config.bounds, station, X, low[row], high[row], rates[row], free)

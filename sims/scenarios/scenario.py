@@ -122,6 +122,12 @@ class Scenario:
         return None if goal is None else np.array(goal.position)
 
     @property
+    def positioned(self) -> bool:
+        """Whether the vehicle knows where it is: by a sensor of its own, or by the autopilot."""
+        told = self.vehicle_link is not None and self.vehicle_link.estimate == "autopilot"
+        return told or self.station.sensing.horizontal
+
+    @property
     def code(self) -> tuple[str, ...]:
         """The user code that runs with it: files or modules, with the class in them."""
         sensing, task = self.station.sensing, getattr(self.controller, "task", None)

@@ -38,6 +38,7 @@ from ..station.parts import add_noise
 from ..station.ports import station_ports
 from .health_gate import HealthGate
 from .impedance import Impedance, ImpedanceGains, ImpedanceLaw
+from .without_position import WithoutPosition
 
 INPUTS = {"X_WB": 7, "V_WB_B": 6}
 """Input ports of every controller and their sizes."""
@@ -67,6 +68,14 @@ class Controller(abc.ABC):
         """The same controller for a loop in real time, which may not wait for its planner."""
         return self
 
+    def without_position(self, station: StationConfig) -> "Controller | None":
+        """The same controller for a vehicle that knows attitude and depth alone; None without one.
+
+        A user's own decides by itself what to do with an estimate whose health is lost.
+        """
+        del station
+        return None
+
     def add_to(self, builder: DiagramBuilder, station: StationConfig, goal: Goal = None) -> System:
         """Add the system to a diagram under the name `controller`.
 
@@ -78,6 +87,11 @@ class Controller(abc.ABC):
         told = {name: sizes[name] for name in TOLD}
         check_ports("controller", system, (INPUTS, OUTPUTS), (told, {}))
         return builder.AddNamedSystem("controller", system)
+
+
+def _given(controller: Any) -> dict[str, Any]:
+    """The values of its fields by their names."""
+    return {field.name: getattr(controller, field.name) for field in fields(controller)}
 
 
 @dataclass(frozen=True)
@@ -138,11 +152,13 @@ class Tracking:
         layout: PlanLayout,
         observed: Dynamics,
         noise_period: float | None = None,
+        place: tuple[float, float] | None = None,
     ) -> Diagram:
         """A controller around the source of a plan; the source's output ports are exported too.
 
         `observed` is the model that the disturbance observer uses; `noise_period` (s) is the period
-        at which the source's `noise` is drawn.
+        at which the source's `noise` is drawn. A `place` (x and y, m) is that of the plan, for a
+        vehicle that does not know where it is.
         """
         vehicle = station.load_vehicle()
         limits = ThrusterLimits.create(vehicle.thrusters(), station.voltage)
@@ -162,8 +178,10 @@ class Tracking:
             systems.append(observer)
         if source.HasInputPort("X_WB"):
             systems.append(source)
-        gate = builder.AddNamedSystem("gate", HealthGate(station_ports(station)[1]["health"]))
-        for name in (*INPUTS, *TOLD):
+        size = station_ports(station)[1]["health"]
+        known = HealthGate(size) if place is None else WithoutPosition(place)
+        gate = builder.AddNamedSystem("gate", known)
+        for name in (*INPUTS, *(TOLD if place is None else ())):
             builder.ExportInput(gate.GetInputPort(name), name)
         for name in INPUTS:
             for system in systems:
@@ -246,7 +264,7 @@ class MppiImpedance(Controller):
         return Mppi(planner)
 
     def beside_the_loop(self) -> "MppiImpedance":
-        given: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        given = _given(self)
         given["planner"] = with_free_core(self.planner)
         return _MppiBesideImpedance(**given)
 
@@ -265,6 +283,9 @@ class _MppiBesideImpedance(MppiImpedance):
 class TrackReference(Controller):
     """Impedance control along a given path; obstacles are ignored.
 
+    On a vehicle without a position a path that stays at its x and y is followed in attitude and
+    depth.
+
     Attributes:
         path: the path.
         feedforward: add the wrenches that the physics of the station's vehicle needs on the path.
@@ -277,9 +298,24 @@ class TrackReference(Controller):
 
     def build(self, station: StationConfig, goal: Goal = None) -> Diagram:
         del goal
+        return self._build(station, None)
+
+    def _build(self, station: StationConfig, place: tuple[float, float] | None) -> Diagram:
         model = station.load_vehicle().dynamics()
         reference = Reference(self.path, model if self.feedforward else None)
-        return self.tracking.build(station, reference, reference.layout, model)
+        return self.tracking.build(station, reference, reference.layout, model, place=place)
+
+    def without_position(self, station: StationConfig) -> "Controller | None":
+        del station
+        return None if self.path.place() is None else _TrackAttitude(**_given(self))
+
+
+class _TrackAttitude(TrackReference):
+    """Holds attitude and depth of its path."""
+
+    def build(self, station: StationConfig, goal: Goal = None) -> Diagram:
+        del goal
+        return self._build(station, self.path.place())
 
 
 @dataclass(frozen=True)
@@ -300,6 +336,10 @@ class Own(OwnSystem, Controller):
 
     def build(self, station: StationConfig, goal: Goal = None) -> System:
         return self.make(station.offered(goal))
+
+    def without_position(self, station: StationConfig) -> "Controller | None":
+        del station
+        return self
 
 
 ControllerKind = MppiImpedance | TrackReference | Own

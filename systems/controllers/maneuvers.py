@@ -22,6 +22,7 @@ from ..compiled.pure import Event, Inputs, Pure, State, shown
 from ..drake import drake_array, group, set_groups, value, value_or_none
 from .health_gate import LOST
 from .impedance import ImpedanceLaw
+from .without_position import horizontal_left_out
 
 
 class Phase(enum.IntEnum):
@@ -87,19 +88,6 @@ class ManeuverProgram(eqx.Module):
     F_hold: Float[np.ndarray, "n 6"]
     step: float = eqx.field(static=True)
     names: tuple[tuple[str, int], ...] = eqx.field(static=True)
-
-
-def horizontal_left_out(
-    X_WB: Float[Array, "7"], V_WB_B: Float[Array, "6"], start: Float[Array, "7"]
-) -> tuple[Float[Array, "6"], Float[Array, "7"]]:
-    """Twist and start pose without what a vehicle without a horizontal aid can't know.
-
-    The twist keeps its climb and turn rate; the start lies at the vehicle's own place.
-    """
-    climb = se3.rotate(X_WB, V_WB_B[:3])[2]
-    up = jnp.zeros(3, V_WB_B.dtype).at[2].set(climb)
-    here = jnp.concatenate([start[:4], X_WB[4:6], start[6:]])
-    return jnp.concatenate([se3.rotate_inverse(X_WB, up), V_WB_B[3:]]), here
 
 
 def errors(

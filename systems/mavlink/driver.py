@@ -26,23 +26,12 @@ from .dialect import mavlink
 from .guard_process import Guard, stop_thrusters
 from .link import Link
 from .parameters import Borrowed, Parameters, borrowed_file
-from .preflight import Facts, Finding, Requirements, for_dive, is_depth_healthy, preflight
+from .preflight import Finding, Requirements, for_dive, is_depth_healthy, preflight, told
 from .safety import Snapshot, State, Supervisor
 from .telemetry import Sensed, sensed
 from .transport import Connection
 
 _SETTLE = 2.5  # s over which rates are counted before the pre-flight check
-_STREAMS = {
-    "HEARTBEAT": 5.0,
-    "ATTITUDE_QUATERNION": 50.0,
-    "SCALED_PRESSURE2": 25.0,  # above the sensor's own rate: a change tells when it measured
-    "SERVO_OUTPUT_RAW": 20.0,
-    "LOCAL_POSITION_NED": 10.0,
-    "BATTERY_STATUS": 2.0,
-    "SYS_STATUS": 2.0,
-    "EKF_STATUS_REPORT": 2.0,
-}
-"""Rates that are asked for (Hz)."""
 _ALIKE = 12.0  # µs by which outputs may differ from commanded ones: whole numbers on three axes
 _DELAY = 0.5  # s: the longest time in which a command shows in SERVO_OUTPUT_RAW
 _HOLD = "ALT_HOLD"
@@ -96,7 +85,7 @@ class Driver:
             self._identity = commands.identity(self.link)
             self._parameters = Parameters(self.link)
             self._read_vehicle()
-            rates = _STREAMS | {"RAW_IMU": config.imu_rate}
+            rates = telemetry.STREAMS | {"RAW_IMU": config.imu_rate}
             self.refused = commands.request_rates(self.link, rates)
             self.dvl = None if config.dvl is None else config.dvl.open()
         except BaseException:
@@ -155,31 +144,17 @@ class Driver:
         )
 
     def preflight(self) -> list[Finding]:
-        """The checks before arming; waits until rates can be counted."""
+        """The checks before arming; waits until rates can be counted.
+
+        Parameters that a former run left changed are given back, unless somebody has armed.
+        """
         if self.link.clock.reboots != self._boots:
             self._read_vehicle()
-        self.restore()
+        if not self._seen().armed:
+            self.restore()
         time.sleep(_SETTLE)
-        heartbeat = self.link.latest("HEARTBEAT")
-        status = telemetry.status(self.link, time.monotonic())
-        assert heartbeat is not None
-        assert status is not None
-        system, estimator = self.link.latest("SYS_STATUS"), self.link.latest("EKF_STATUS_REPORT")
-        facts = Facts(
-            self.link.statistics(),
-            self.parameters,
-            int(heartbeat.message.type),
-            int(heartbeat.message.autopilot),
-            status.armed,
-            status.mode,
-            telemetry.battery(self.link),
-            None if system is None else int(system.message.onboard_control_sensors_health),
-            None if estimator is None else int(estimator.message.flags),
-            status.leak,
-            len(self.link.others()),
-            not self._borrowed.left_over,
-            self._identity.version,
-        )
+        given_back = not self._borrowed.left_over
+        facts = told(self.link, self.parameters, self._identity.version, given_back)
         return preflight(self.requirements(), facts)
 
     def _read_vehicle(self) -> None:
@@ -230,10 +205,35 @@ class Driver:
             self._neutral(0.2)
             self._borrowed.borrow(changed, lambda: self._neutral(0.06))
             self._neutral(0.2)
+            self._check_untouched(armed=False)
             commands.arm(self.link)
+            self._check_untouched(armed=True)
         except BaseException:
             self.stop()
             raise
+
+    def _check_untouched(self, armed: bool) -> None:
+        """Check that nobody has taken the vehicle; it is left alone unless we have armed it."""
+        status = self._seen()
+        other = "" if status.mode == _FLY else f"the mode was changed to {status.mode}"
+        if status.armed and not armed:
+            other = "somebody else has armed the vehicle"
+        if other:
+            self._ended = self._ended if armed else "yield"
+            raise commands.VehicleRefused(f"arming: {other} meanwhile; the dive is left to a pilot")
+
+    def _seen(self) -> telemetry.Status:
+        status = telemetry.status(self.link, time.monotonic())
+        assert status is not None, "a vehicle is found by its heartbeat"
+        return status
+
+    def idle(self) -> None:
+        """Send neutral to a vehicle that we have armed: while it waits its failsafe wants to hear.
+
+        Before `prepare` nothing is sent.
+        """
+        if self._guard is not None:
+            self.link.send(self._actuation.neutral(self.vehicle))
 
     # ------------------------------------------------------------------------------ in the loop
 

@@ -145,7 +145,7 @@ class VehicleInterface(LeafSystem):
         self._driver: Driver | None = None
         self._held = ExitStack()
         self._epoch, self._anchor = 0.0, Anchor()
-        self._samples = InertialSamples()
+        self._samples, self._sampled = InertialSamples(), 0.0
         self._dither = np.random.default_rng(0)
         self._raw, self._changed, self._pushed = np.full(6, np.nan), 0.0, math.inf
         self._depth_seen = math.nan, 0.0
@@ -162,6 +162,7 @@ class VehicleInterface(LeafSystem):
         self.end()
         self._driver, self._epoch, self._anchor = driver, epoch, anchor or Anchor()
         self._samples, self._taken = InertialSamples(), {}
+        self._sampled = time.monotonic()
         self._held.enter_context(driver.link.reading(self._inertial))
 
     def end(self) -> None:
@@ -170,9 +171,8 @@ class VehicleInterface(LeafSystem):
         self._driver = None
 
     def age(self, name: str) -> float:
-        """Time since a sensor's newest valid reading was taken (s), infinite before the first."""
-        taken = self._taken.get(name)
-        return math.inf if taken is None else time.monotonic() - self._epoch - taken
+        """Time since a sensor's newest valid reading was taken, or else since `begin` (s)."""
+        return time.monotonic() - self._epoch - self._taken.get(name, 0.0)
 
     # ------------------------------------------------------------------------------------- events
 
@@ -199,16 +199,9 @@ class VehicleInterface(LeafSystem):
             return
         t = context.get_time()
         health = value_or_none(self._health, context)
-        ages = {name: age() for name, age in self.ages.items()}
-        ages["loop"] = max(0.0, time.monotonic() - self._epoch - t)
-        aids = [n for n, each in self._sensors.items() if each.observes in ("velocity", "position")]
-        aids = [n for n in aids if not isinstance(self._sensors[n], DepthSensor)]
-        if self._estimated:
-            ages["aid"] = driver.link.age("LOCAL_POSITION_NED")
-        elif aids:
-            ages["aid"] = min(self.age(name) for name in aids)
-        else:
-            health = None  # without them the position is soon lost; controllers are told
+        ages = self._ages(driver, t, health is not None)
+        if not (self._estimated or self._aids):
+            health = None  # velocity is soon lost without them, which is known before the dive
         acted = driver.act(
             t,
             value(self._F, context),
@@ -223,6 +216,27 @@ class VehicleInterface(LeafSystem):
         set_groups(state, [self._pwm], [driver.as_described(acted.expected)])
         self.on_act(t, acted)
 
+    @property
+    def _aids(self) -> list[str]:
+        """Sensors of horizontal motion."""
+        seen = ("velocity", "position")
+        aids = [name for name, each in self._sensors.items() if each.observes in seen]
+        return [name for name in aids if not isinstance(self._sensors[name], DepthSensor)]
+
+    def _ages(self, driver: Driver, t: float, told: bool) -> dict[str, float]:
+        """Ages for the guards (s); `told` says whether the estimate comes with its health."""
+        now = time.monotonic()
+        ages = {name: age() for name, age in self.ages.items()}
+        ages["loop"] = max(0.0, now - self._epoch - t)
+        if self._estimated:
+            ages["aid"] = driver.link.age("LOCAL_POSITION_NED")
+            return ages
+        ages["imu"] = now - self._sampled
+        if self._aids:
+            newest = min(self.age(name) for name in self._aids)
+            ages["dead_reckoning" if told else "aid"] = newest
+        return ages
+
     # ----------------------------------------------------------------------------------- readings
 
     def _inertial(self, found: Received) -> None:
@@ -232,6 +246,7 @@ class VehicleInterface(LeafSystem):
             return
         preferred = next(n for n in telemetry.IMUS if driver.link.latest(n) is not None)
         if found.message.get_type() == preferred:
+            self._sampled = found.arrival
             sample = telemetry.inertial(driver.link, found)
             if not np.array_equal(sample.value, self._raw):
                 self._raw, self._changed = sample.value, sample.arrival

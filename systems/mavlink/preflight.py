@@ -1,17 +1,19 @@
 """The checks before arming: link, sensors, parameters, frame, failsafes, battery.
 
-Pure functions of what the vehicle has told. Each check gives a finding with its remedy; arming
+Pure functions of what the vehicle has `told`. Each check gives a finding with its remedy; arming
 needs all of them passed.
 """
 
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from . import telemetry
 from .codec import FRAME_THRUSTERS, MOTOR_FUNCTIONS, PASS_THROUGH_FUNCTIONS
 from .config import GROUND_STATION, OBEYED
 from .dialect import mavlink
-from .link import Statistics
+from .link import Link, Statistics
 from .mixer import FRAMES
 
 FAILSAFES: Mapping[str, float] = {
@@ -86,6 +88,31 @@ class Facts(NamedTuple):
     """Whether no parameters of a former run wait to be restored."""
     version: tuple[int, int] | None = None
     """Of its firmware, None if unknown."""
+
+
+def told(
+    link: Link, parameters: Mapping[str, float], version: tuple[int, int] | None, given_back: bool
+) -> Facts:
+    """What a link's vehicle, whose heartbeat has been heard, tells now."""
+    heartbeat, status = link.latest("HEARTBEAT"), telemetry.status(link, time.monotonic())
+    assert heartbeat is not None
+    assert status is not None
+    system, estimator = link.latest("SYS_STATUS"), link.latest("EKF_STATUS_REPORT")
+    return Facts(
+        link.statistics(),
+        parameters,
+        int(heartbeat.message.type),
+        int(heartbeat.message.autopilot),
+        status.armed,
+        status.mode,
+        telemetry.battery(link),
+        None if system is None else int(system.message.onboard_control_sensors_health),
+        None if estimator is None else int(estimator.message.flags),
+        status.leak,
+        len(link.others()),
+        given_back,
+        version,
+    )
 
 
 class Finding(NamedTuple):

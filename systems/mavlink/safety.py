@@ -33,11 +33,17 @@ class SafetyConfig:
         max_depth: greatest depth (m).
         fence: half sides of the box about the start in which Bo stays, along x and y of W (m).
         silence: longest time without any message of the vehicle (s).
-        stale: longest age of attitude and depth (s).
-        stale_aid: longest age of a velocity or position aid, if the estimate needs one (s).
+        stale: longest age of attitude and depth, and for an own estimate of inertial samples (s).
+        stale_aid: longest age of what a horizontal estimate without a covariance rests on (s): the
+            autopilot's position; the velocity or position aid of a filter that tells no health.
+        dead_reckoning: longest time for which a filter that tells its health bridges the lack of a
+            velocity or position aid (s). With the shipped sensors σ of the position grows by 0.2 m
+            in 6 s and by 0.5 to 0.7 m in 10 s; the errors are within 2 σ until 12 s and beyond that
+            they are not (`tests/test_dead_reckoning.py`).
         plan_age: longest age of the plan that is followed (s).
         late: longest time by which the loop may be late (s): the computer is too busy.
-        lost: longest time for which the estimator may be lost (s).
+        lost: longest time for which the estimator may be lost (s): its velocity or its attitude is
+            more uncertain than `lost_velocity` or `lost_attitude` of the filter.
         outputs: longest time for which the vehicle's outputs may differ from the commanded ones
             (s); the verticals' do for half a second after arming.
         min_voltage: least battery voltage under load (V); 0 switches the guard off.
@@ -54,6 +60,7 @@ class SafetyConfig:
     silence: float = 1.0
     stale: float = 0.5
     stale_aid: float = 2.0
+    dead_reckoning: float = 6.0
     plan_age: float = 2.0
     late: float = 0.5
     lost: float = 1.0
@@ -68,8 +75,8 @@ class SafetyConfig:
         check_numbers(self)
         for name in ("max_wrench", "max_wrench_rate", "fence"):
             require(min(getattr(self, name)) > 0, self, name, "give numbers above zero")
-        times = ("silence", "stale", "stale_aid", "plan_age", "late", "lost", "outputs", "hold")
-        for name in times:
+        times = ("silence", "stale", "stale_aid", "dead_reckoning", "plan_age", "late")
+        for name in (*times, "lost", "outputs", "hold"):
             require(getattr(self, name) > 0, self, name, "give a time above zero")
         for name in ("min_voltage", "dead_man"):
             require(getattr(self, name) >= 0, self, name, "give zero or more")
@@ -88,8 +95,8 @@ class Snapshot(NamedTuple):
     health: int
     """Of the estimator: 0 good, 1 degraded, 2 lost."""
     ages: Mapping[str, float]
-    """Of `vehicle` (any message), `attitude`, `depth`; `aid`, `plan`, `loop`, `dead_man` where
-    there is one."""
+    """Of `vehicle` (any message), `attitude`, `depth`; where there is one, of `imu`, of `aid` or
+    `dead_reckoning`, of `plan`, `loop`, `dead_man`."""
     armed: bool
     mode: str
     voltage: float
@@ -220,7 +227,13 @@ AGED: dict[str, tuple[str, str, str]] = {
     "silence": ("vehicle", "silence", "the vehicle was not heard"),
     "attitude": ("attitude", "stale", "no new attitude came"),
     "depth": ("depth", "stale", "no new depth came"),
+    "imu": ("imu", "stale", "no new inertial sample came"),
     "aid": ("aid", "stale_aid", "no new velocity or position came"),
+    "dead_reckoning": (
+        "dead_reckoning",
+        "dead_reckoning",
+        "the filter has bridged the lack of a velocity or position",
+    ),
     "loop": ("loop", "late", "the loop on this computer has been late"),
     "plan": ("plan", "plan_age", "the planner made no new plan"),
     "dead_man": ("dead_man", "dead_man", "the dead-man key was not pressed"),
@@ -237,7 +250,9 @@ GUARDS: dict[str, Guard] = {
     "attitude": _stale(*AGED["attitude"]),
     "depth": _stale(*AGED["depth"]),
     "depth_sensor": _depth_sensor,
+    "imu": _stale(*AGED["imu"]),
     "aid": _stale(*AGED["aid"]),
+    "dead_reckoning": _stale(*AGED["dead_reckoning"]),
     "loop": _stale(*AGED["loop"]),
     "estimate": _estimate,
     "plan": _stale(*AGED["plan"]),

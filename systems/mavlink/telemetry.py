@@ -23,6 +23,17 @@ _PRESSURES = ("SCALED_PRESSURE2", "SCALED_PRESSURE3")
 _DOWN = mavlink.MAV_SENSOR_ROTATION_PITCH_270
 _BODY_FRAMES = (mavlink.MAV_FRAME_BODY_FRD, mavlink.MAV_FRAME_LOCAL_FRD)
 _LATE, _APART = 1.0, 0.05  # s between a time on the vehicle's clock and the arrival
+STREAMS = {
+    "HEARTBEAT": 5.0,
+    "ATTITUDE_QUATERNION": 50.0,
+    "SCALED_PRESSURE2": 25.0,  # above the sensor's own rate: a change tells when it measured
+    "SERVO_OUTPUT_RAW": 20.0,
+    "LOCAL_POSITION_NED": 10.0,
+    "BATTERY_STATUS": 2.0,
+    "SYS_STATUS": 2.0,
+    "EKF_STATUS_REPORT": 2.0,
+}
+"""Rates that are asked for (Hz)."""
 IMUS = ("RAW_IMU", "SCALED_IMU2", "SCALED_IMU")
 """Messages with inertial samples, the preferred first."""
 

@@ -51,6 +51,10 @@ class Path(abc.ABC):
     def pose(self, t: Float[Array, " n"]) -> Float[Array, "7 n"]:
         """X_WB at times t."""
 
+    def place(self) -> tuple[float, float] | None:
+        """The x and y in W (m) at which it stays; None if it moves horizontally."""
+        return None
+
     def motion(self, t: Float[Array, " n"]) -> Motion:
         """Poses with their twists and accelerations.
 
@@ -79,6 +83,9 @@ class HoldPose(Path):
 
     def pose(self, t: Float[Array, " n"]) -> Float[Array, "7 n"]:
         return jnp.broadcast_to(self.at.pose(t.dtype)[:, None], (7, *t.shape))
+
+    def place(self) -> tuple[float, float] | None:
+        return self.at.position[0], self.at.position[1]
 
 
 @dataclass(frozen=True)
@@ -128,6 +135,10 @@ class Waypoints(Path):
         s = jnp.clip((t - begins[leg]) / lengths[leg], 0, 1)
         s = s**3 * (10 - 15 * s + 6 * s * s)
         return se3.interpolate(X[:, leg], X[:, leg + 1], s[None])
+
+    def place(self) -> tuple[float, float] | None:
+        places = {each.position[:2] for each in self.poses}
+        return places.pop() if len(places) == 1 else None
 
 
 @dataclass(frozen=True)

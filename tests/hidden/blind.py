@@ -309,6 +309,10 @@ def table(
             yield Blind(f"null-{variety}-{i}", "null", case, data=variety)
         if variety not in REAL:
             continue
+        for i in range(seeds):
+            effect, when = draw_episode("steel", given["plan"], streams(54_000 + i, 6))
+            case = Case(54_000 + i, (effect,), **given)
+            yield Blind(f"part-steel-{variety}-{i}", "part", case, data=variety, when=when)
         for i in range(nulls // 5):
             case = draw(52_000 + i, "null", wrong=True, **given)
             yield Blind(f"wrong-{variety}-{i}", "wrong", case, data=variety)

@@ -89,9 +89,9 @@ class When:
     end: float = 0.0
 
 
-PARTS = ("fouled", "entangled", "leak", "ballast", "battery", "compass")
+PARTS = ("fouled", "entangled", "leak", "ballast", "battery", "compass", "steel")
 """A thruster fouled for seconds, and from a time on; a slow leak; ballast lost; less thrust, and a
-turned compass, from a run on."""
+turned compass, from a run on; a compass that steel beside the vehicle turns for seconds."""
 
 
 def draw_episode(name: str, plan: Plan, rng: np.random.Generator) -> tuple[Episode, When]:
@@ -104,6 +104,10 @@ def draw_episode(name: str, plan: Plan, rng: np.random.Generator) -> tuple[Episo
     if name == "fouled":
         end = round(start + float(rng.uniform(0.3, 0.5)) * plan.seconds, 1)
         return Episode(weak, within(runs, run, start, end)), When("window", run + 1, start, end)
+    if name == "steel":
+        end = round(start + float(rng.uniform(0.3, 0.5)) * plan.seconds, 1)
+        turned = HeadingError(constant=sign * float(rng.uniform(0.1, 0.3)))
+        return Episode(turned, within(runs, run, start, end)), When("window", run + 1, start, end)
     if name == "leak":
         length = APART * (runs - 1) + plan.seconds
         leak = NetBuoyancy(force=-float(rng.uniform(3.0, 6.0)))

@@ -25,8 +25,9 @@ from .causes import (
     supported,
 )
 from .config import DiagnoseConfig
-from .data.arrays import Data
+from .data.arrays import Data, run_labels
 from .data.checks import limits, problems, require_enough, settled, unexcited, without_faults
+from .data.heading_steps import in_words, turned_back
 from .data.readings import with_velocity
 from .disturbance.found import OF_OTHERS, all_laws, reported_laws
 from .disturbance.laws import Law
@@ -34,6 +35,7 @@ from .disturbance.levels import LEVEL
 from .filter.problem import DiagnosisProblem, Evaluation
 from .findings import reported, result
 from .findings.conclusion import conclude
+from .findings.heading_off import off_causes
 from .findings.ratios import ratios
 from .findings.small_speeds import zone_causes
 from .selection.hypotheses import Fit
@@ -99,7 +101,10 @@ class Diagnoser:
         self.furthest = 0.0
         self.report = progress
         recording, self.left_out = with_velocity(recording)
+        recording, self.heading_off = turned_back(recording)
+        self.labels = run_labels(recording)
         self.faults, faulty = problems(recording)
+        self.faults += in_words(self.heading_off, self.labels)
         if faulty and len(faulty) == (recording.lengths > 0).sum():
             recording, faulty = without_faults(recording), []
         self.checked = [
@@ -161,7 +166,7 @@ class Diagnoser:
             problem, found, fitted, rows, groups, random_effects, bool(causes)
         )
         read_off, of_instruments = zone_causes(problem.data.zones, problem.library.effects)
-        causes += read_off
+        causes += [*off_causes(self.heading_off, self.labels), *read_off]
         residual = reported.residual(problem, final)
         left = reported.left_over(residual, causes, problem, final, least)
         if not self.driven:

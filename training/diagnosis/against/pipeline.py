@@ -10,6 +10,7 @@ from ....models.recordings.store import Recording
 from ....models.vehicles.vehicle import Vehicle
 from ..causes import Progress
 from ..config import DiagnoseConfig
+from ..data.heading_steps import turned_back
 from ..disturbance.laws import Law
 from ..filter.problem import DiagnosisProblem, Evaluation
 from ..findings import result
@@ -47,7 +48,8 @@ class ChangeDiagnoser(Diagnoser):
         super().__init__(recording, vehicle, healthy.model, config, progress)
         self.healthy = healthy
         shortest = self._shortest(self.problem)
-        self.baseline = Baseline(healthy.recording, recording, vehicle, healthy.model, shortest)
+        both = (turned_back(given)[0] for given in (healthy.recording, recording))
+        self.baseline = Baseline(*both, vehicle, healthy.model, shortest)
         self.problem = self.baseline.new
 
     def run(self) -> Finding:
@@ -87,6 +89,7 @@ class ChangeDiagnoser(Diagnoser):
 
     def _against(self, theta: np.ndarray, causes: list[result.Cause]) -> result.Against:
         side, baseline, limits = self.baseline.side(theta), self.baseline, self.limits
+        causes = [c for c in causes if c.when is None]  # what acts in a part is read off
         names = [(c.name, c.where) for c in causes]
         changes = []
         for cause, h in zip(causes, names, strict=True):

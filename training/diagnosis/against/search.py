@@ -9,6 +9,7 @@ from ....models.effects.library import kind
 from ..filter.problem import DiagnosisProblem
 from ..selection.hypotheses import Fit
 from ..selection.model_selection import (
+    Choice,
     Hypothesis,
     acts_unseen,
     admissible,
@@ -17,7 +18,7 @@ from ..selection.model_selection import (
     parameters_of,
 )
 from ..selection.search import Search, asks_for_commands
-from ..selection.state import Selection
+from ..selection.state import Fits, Selection
 from .baseline import Baseline, Limits
 
 
@@ -78,20 +79,14 @@ class ChangeSearch(Search):
             self.scores.update({h: found[h].score for h, _ in choice.rivals})
         return replace(state, proposal=(choice, fits))
 
-    def step(self, state: Selection) -> Selection:
-        """One more change, or none if no further one passes; one that does not hold is dropped."""
-        state = self.propose(state)
-        choice, fits = state.proposed
-        state = replace(state, fits=state.fits or fits, left=fits)
-        if choice is None:
-            return replace(state, done=True)
-        choice, theta = self._refine(state, choice, fits)
-        h, seen = choice.hypothesis, state.problem.evaluate(theta)
-        if not self._holds(state, seen, h):
-            return replace(state, dropped=state.dropped | {h}, proposal=None)
-        p = min(1.0, math.exp(-self.scores[h]) * len(fits))
-        state = state.at(seen, accepted=(*state.accepted, replace(choice, p_value=p)))
-        return self.without_redundant(state)
+    def _significance(self, state: Selection, choice: Choice, fits: Fits) -> tuple[float, bool]:
+        """The p value of a score among all tried; exact predictions are always tested."""
+        del state
+        return min(1.0, math.exp(-self.scores[choice.hypothesis]) * len(fits)), False
+
+    def _rejected(self, state: Selection, h: Hypothesis) -> Selection:
+        """The selection without a change that does not hold; others are tried."""
+        return replace(state, dropped=state.dropped | {h}, proposal=None)
 
     def _holds_up(self, state: Selection, h: Hypothesis, fit: Fit) -> bool:
         """Whether a change lies in its range, is one of the cause itself, and is no short time."""

@@ -280,7 +280,7 @@ def make_data(
         has_voltage="voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any()),
         unmeasured=unmeasured,
         started=_started(recording, kept, run),
-        labels=_labels(recording, kept),
+        labels=run_labels(recording, kept),
         zones=zones,
     )
 
@@ -314,8 +314,9 @@ def _started(
     return start[list(run)] if np.isfinite(start).all() and apart else None
 
 
-def _labels(recording: Recording, kept: np.ndarray) -> tuple[str, ...]:
+def run_labels(recording: Recording, kept: np.ndarray | None = None) -> tuple[str, ...]:
     """A name of each run that is kept: its scenario, with its number there if there are several."""
+    kept = recording.lengths > 0 if kept is None else kept
     several = (recording.lengths > 0).sum(axis=1) > 1
     return tuple(
         f"{recording.scenarios[j]}, run {k + 1}" if several[j] else str(recording.scenarios[j])

@@ -125,14 +125,22 @@ class Search:
         if choice is None:
             return replace(state, done=True)
         choice, theta = self._refine(state, choice, fits)
-        h, p = choice.hypothesis, p_value(choice.fit, len(fits), state.chance)
-        seen = state.problem.evaluate(theta)
-        doubtful = choice.fit.p_value * len(fits) >= self.alpha
-        if doubtful and not self._holds(state, seen, h):
-            return replace(state, dropped=state.dropped | {h}, done=True)
+        h, seen = choice.hypothesis, state.problem.evaluate(theta)
+        p, sure = self._significance(state, choice, fits)
+        if not (sure or self._holds(state, seen, h)):
+            return self._rejected(state, h)
         state = state.at(seen, accepted=(*state.accepted, replace(choice, p_value=p)))
         state = self.without_redundant(state)
         return replace(state, redundant=state.redundant + 1 if h in state.dropped else 0)
+
+    def _significance(self, state: Selection, choice: Choice, fits: Fits) -> tuple[float, bool]:
+        """The p value of a choice, and whether it needs no test of exact predictions."""
+        p = p_value(choice.fit, len(fits), state.chance)
+        return p, choice.fit.p_value * len(fits) < self.alpha
+
+    def _rejected(self, state: Selection, h: Hypothesis) -> Selection:
+        """The selection without a cause that exact predictions do not bear out."""
+        return replace(state, dropped=state.dropped | {h}, done=True)
 
     def propose(self, state: Selection) -> Selection:
         """The cause that explains most of the residual, and the fits of all causes."""

@@ -9,7 +9,7 @@ Forecast errors are root sums of squares over position, rotation and velocity, w
 counted alike; intervals are by bootstrap over folds, the same ones for both models.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -168,21 +168,15 @@ def improves(new: Judged, old: Judged, rng: np.random.Generator) -> bool:
 
     By the mean logarithm of the ratio over parts and horizons, which must clearly be below zero.
     """
-    values, draws = [], []
-    for g in range(len(GROUPS)):
-        if old.square[:, g].any():
-            value, drawn = _saved(new.square[:, g], old.square[:, g], rng)
-            values.append(value)
-            draws.append(drawn)
-    if not np.isfinite(values).all():
+    parts = [
+        _saved(new.square[:, g], old.square[:, g], rng)
+        for g in range(len(GROUPS))
+        if old.square[:, g].any()
+    ]
+    if not all(np.isfinite(value).all() for value, _ in parts):
         return False
-    with np.errstate(divide="ignore"):
-        mean, spread = (
-            np.log(np.maximum(1 - np.array(a), 1e-12)).mean(axis=axis)
-            for a, axis in ((values, None), (draws, (0, 2)))
-        )
-    bar = np.log(1 - PRACTICAL) / len(values)
-    return bool(mean < bar and np.nanpercentile(spread, 97.5) < 0)
+    mean, high = _mean_logarithm(parts)
+    return bool(mean < np.log(1 - PRACTICAL) / len(parts) and high < 0)
 
 
 def clearly_better(new: Judged, old: Judged, seed: int) -> bool:
@@ -190,9 +184,18 @@ def clearly_better(new: Judged, old: Judged, seed: int) -> bool:
 
     By the mean logarithm of the ratio over the horizons.
     """
-    value, draws = saved(new, old, np.random.default_rng(seed))
-    if not np.isfinite(value).all():
+    both = saved(new, old, np.random.default_rng(seed))
+    if not np.isfinite(both[0]).all():
         return bool(np.isfinite(new.square).all())
-    with np.errstate(divide="ignore"):
-        mean, spread = (np.log(np.maximum(1 - a, 1e-12)).mean(axis=-1) for a in (value, draws))
-    return bool(mean < np.log(1 - PRACTICAL) and np.nanpercentile(spread, 97.5) < 0)
+    mean, high = _mean_logarithm([both])
+    return bool(mean < np.log(1 - PRACTICAL) and high < 0)
+
+
+def _mean_logarithm(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float]:
+    """Mean over parts and horizons of log(error / error before), and the end of its interval.
+
+    Of each part the shares saved (h) with their draws (d, h); the end is that of 97.5 %.
+    """
+    value, draws = (np.concatenate(shares, axis=-1) for shares in zip(*parts, strict=True))
+    mean, drawn = (np.log(np.maximum(1 - a, 1e-12)).mean(axis=-1) for a in (value, draws))
+    return float(mean), float(np.nanpercentile(drawn, 97.5))

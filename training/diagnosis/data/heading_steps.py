@@ -153,7 +153,7 @@ def heading_steps(chains: Sequence[Chain]) -> tuple[list[list[HeadingStep]], flo
 def _kinematics(chain: Chain) -> Kinematics:
     """Heading against rates; a step over a lost sample adds nothing."""
     q, rates = chain.X_WB[:, [1, 2, 3, 0]], chain.V_WB_B[:, 3:]
-    known = np.isfinite(np.concatenate([q, rates], axis=1)).all(axis=1)
+    known = np.asarray(np.isfinite(np.concatenate([q, rates], axis=1)).all(axis=1))
     R = Rotation.from_quat(np.where(known[:, None], q, [0.0, 0, 0, 1]))
     rates = np.where(known[:, None], rates, 0.0)
     turn = (R[:-1].inv() * R[1:]).as_rotvec()
@@ -271,9 +271,9 @@ def _turned(
     X_WB: Float[np.ndarray, "N 7"], angle: Float[np.ndarray, " N"], reckoned: bool
 ) -> Float[np.ndarray, "N 7"]:
     """Poses with attitudes turned about the vertical, and if `reckoned` the path with them."""
-    found, turn = X_WB.copy(), Rotation.from_rotvec(angle[:, None] * [0.0, 0.0, 1.0])
-    known = np.isfinite(X_WB[:, :4]).all(axis=1)
-    attitude = turn[known] * Rotation.from_quat(X_WB[known][:, [1, 2, 3, 0]])
+    found, known = X_WB.copy(), np.asarray(np.isfinite(X_WB[:, :4]).all(axis=1))
+    turn = Rotation.from_rotvec(angle[known][:, None] * [0.0, 0.0, 1.0])
+    attitude = turn * Rotation.from_quat(X_WB[known][:, [1, 2, 3, 0]])
     found[known, :4] = attitude.as_quat()[:, [3, 0, 1, 2]]
     if reckoned and np.isfinite(X_WB).all():
         halfway = Rotation.from_rotvec((angle[1:] + angle[:-1])[:, None] / 2 * [0.0, 0.0, 1.0])

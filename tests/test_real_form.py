@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hidden.blind import DATA, ESTIMATED, NOISE
-from hidden.draw import draw
+from hidden.draw import Case, draw
+from hidden.effects_actuation import ThrusterGain
 from hidden.scenarios import Plan
 from hidden.telemetry import Streams, write_tlog
 
@@ -125,6 +126,19 @@ def test_a_dive_through_an_autopilot_is_adequate_with_the_truth_and_refitted_wit
         if r.where in truth.get(r.name, ()):
             assert r.found.value == pytest.approx(truth[r.name][r.where], rel=0.03), r
     assert min(s.value for s in found.explained.values()) > 0.85
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gain", [-1.0, 0.0])
+def test_a_thruster_that_is_reversed_or_dead_is_named_alone(tmp_path, gain):
+    """Its errors are large and last, so that states look estimated, and structure imitates it."""
+    plan, noise = DATA["dive"](Plan()), NOISE["dive"]
+    case = Case(3003, (ThrusterGain(3, gain),), plan, noise)
+    write_tlog(tmp_path / "dive.tlog", case.simulate(), Streams.draw(3003), noise.rate_filter)
+    found = diagnose(load_data(tmp_path / "dive.tlog", resample=False), VEHICLE).diagnosis
+    assert [(c.name, c.where) for c in found.causes] == [("thruster_gain", "3")], found.sentence
+    assert found.verdict == "explained", found.sentence
+    assert found.causes[0].parameters["gain"].value == pytest.approx(gain - 1, abs=0.03)
 
 
 @pytest.mark.slow

@@ -309,7 +309,7 @@ def table(
             yield Blind(f"null-{variety}-{i}", "null", case, data=variety)
         if variety not in REAL:
             continue
-        for i in range(seeds):
+        for i in range(0 if variety in TLOG else seeds):  # a log is cut at large steps
             effect, when = draw_episode("steel", given["plan"], streams(54_000 + i, 6))
             case = Case(54_000 + i, (effect,), **given)
             yield Blind(f"part-steel-{variety}-{i}", "part", case, data=variety, when=when)

@@ -104,7 +104,7 @@ class Diagnoser:
         recording, self.heading_off = turned_back(recording)
         self.labels = run_labels(recording)
         self.faults, faulty = problems(recording)
-        self.faults += in_words(self.heading_off, self.labels)
+        self.faults += in_words(self.heading_off, self.labels, recording.notes)
         if faulty and len(faulty) == (recording.lengths > 0).sum():
             recording, faulty = without_faults(recording), []
         self.checked = [

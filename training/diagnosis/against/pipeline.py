@@ -48,8 +48,8 @@ class ChangeDiagnoser(Diagnoser):
         super().__init__(recording, vehicle, healthy.model, config, progress)
         self.healthy = healthy
         shortest = self._shortest(self.problem)
-        both = (turned_back(given)[0] for given in (healthy.recording, recording))
-        self.baseline = Baseline(*both, vehicle, healthy.model, shortest)
+        runs, new = (turned_back(given)[0] for given in (healthy.recording, recording))
+        self.baseline = Baseline(runs, new, vehicle, healthy.model, shortest)
         self.problem = self.baseline.new
 
     def run(self) -> Finding:

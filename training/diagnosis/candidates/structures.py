@@ -149,7 +149,9 @@ class Screen:
             jnp.asarray(data.own_steps(self.kept)),
             _carried(evaluation, self.kept),
         )
-        z = evaluation.z[..., self.kept].reshape(len(data.u) * 12, -1)
+        # correlated innovations count for fewer, as in the filter that sensitivities pass
+        z = evaluation.z[..., self.kept] / np.sqrt(evaluation.kalman.memory)[:, None]
+        z = z.astype(np.float32).reshape(len(data.u) * 12, -1)
         self.z = z[None] if free is None else np.concatenate([z[None], free[..., self.kept]])
         self.inverse = np.linalg.inv(problem.mass(evaluation.theta))
 

@@ -81,11 +81,6 @@ def problems(recording: Recording) -> tuple[list[str], list[int]]:
         for note in recording.notes
         if "cut at" in note
     ]
-    found += [
-        f"the attitude jumps against the rates: {note}"
-        for note in recording.notes
-        if "attitude reset" in note
-    ]
     found += [str(zone) for zone in zones]
     bad = sorted({*jumps, *clock, *filled, *spiked, *(n for runs in stuck.values() for n in runs)})
     if bad and len(bad) < len(names):

@@ -144,8 +144,8 @@ def heading_steps(chains: Sequence[Chain]) -> tuple[list[list[HeadingStep]], flo
     error = 1.4826 * float(np.median(sizes)) if len(sizes) else 0.0
     least = max(LEAST, _CLEARLY * error)
     found = [
-        sorted(_steps(*both, np.diff(chain.t), m, least))
-        for *both, chain, m in zip(seen, differences, chains, beside, strict=True)
+        sorted(_steps(k, D, np.diff(chain.t), m, least))
+        for k, D, chain, m in zip(seen, differences, chains, beside, strict=True)
     ]
     return found, error
 
@@ -153,7 +153,7 @@ def heading_steps(chains: Sequence[Chain]) -> tuple[list[list[HeadingStep]], flo
 def _kinematics(chain: Chain) -> Kinematics:
     """Heading against rates; a step over a lost sample adds nothing."""
     q, rates = chain.X_WB[:, [1, 2, 3, 0]], chain.V_WB_B[:, 3:]
-    known = np.isfinite(q).all(axis=1) & np.isfinite(rates).all(axis=1)
+    known = np.asarray(np.isfinite(np.concatenate([q, rates], axis=1)).all(axis=1))
     R = Rotation.from_quat(np.where(known[:, None], q, [0.0, 0, 0, 1]))
     rates = np.where(known[:, None], rates, 0.0)
     turn = (R[:-1].inv() * R[1:]).as_rotvec()
@@ -271,9 +271,9 @@ def _turned(
     X_WB: Float[np.ndarray, "N 7"], angle: Float[np.ndarray, " N"], reckoned: bool
 ) -> Float[np.ndarray, "N 7"]:
     """Poses with attitudes turned about the vertical, and if `reckoned` the path with them."""
-    found, turn = X_WB.copy(), Rotation.from_rotvec(angle[:, None] * [0.0, 0.0, 1.0])
-    known = np.isfinite(X_WB[:, :4]).all(axis=1)
-    attitude = turn[known] * Rotation.from_quat(X_WB[known][:, [1, 2, 3, 0]])
+    found, known = X_WB.copy(), np.asarray(np.isfinite(X_WB[:, :4]).all(axis=1))
+    turn = Rotation.from_rotvec(angle[known][:, None] * [0.0, 0.0, 1.0])
+    attitude = turn * Rotation.from_quat(X_WB[known][:, [1, 2, 3, 0]])
     found[known, :4] = attitude.as_quat()[:, [3, 0, 1, 2]]
     if reckoned and np.isfinite(X_WB).all():
         halfway = Rotation.from_rotvec((angle[1:] + angle[:-1])[:, None] / 2 * [0.0, 0.0, 1.0])
@@ -291,15 +291,18 @@ def _reckoned(chains: Sequence[Chain], offsets: Sequence[Float[np.ndarray, " N"]
             R = Rotation.from_quat(np.nan_to_num(X[:, [1, 2, 3, 0]], nan=1.0))
             v = R.apply(chain.V_WB_B[:, :3])
             apart = moved - (v[1:] + v[:-1]) / 2 * np.diff(chain.t)[:, None]
-            there = (offset[1:] != 0) & np.isfinite(apart).all(axis=1)
+            there = np.flatnonzero((offset[1:] != 0) & np.isfinite(apart).all(axis=1))
             lost[k] += float((apart[there] ** 2).sum())
     return bool(lost[0] < lost[1])
 
 
-def in_words(off: Sequence[HeadingOff], labels: Sequence[str]) -> list[str]:
-    """One sentence, if the heading is off anywhere."""
+def in_words(
+    off: Sequence[HeadingOff], labels: Sequence[str], notes: Sequence[str] = ()
+) -> list[str]:
+    """A sentence where the heading is off, or `notes` of an import tell that the attitude jumps."""
     if not off:
-        return []
+        jumps = (note for note in notes if "attitude reset" in note)
+        return [f"the attitude jumps against the rates: {note}" for note in jumps]
     runs = [labels[n] for n in dict.fromkeys(one.first_run for one in off)]
     more = f" and {len(runs) - 3} more runs" if len(runs) > 3 else ""
     largest = max(off, key=lambda one: abs(one.offset))

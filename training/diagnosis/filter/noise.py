@@ -30,7 +30,7 @@ with dominant white noise, do not."""
 _INDEPENDENT = -0.15
 """Correlation of neighbouring kinematic errors below which a pose has independent errors (−0.5 for
 them alone), and does not slip."""
-_OVER = 4.0
+OVER = 4.0
 """Time (s) over which slip is measured: an estimator's errors last for seconds."""
 _DRIFTS = 3e-4
 """Slip of an attitude (rad/√s) above which the poses are an estimator's. Exact states have a tenth
@@ -257,7 +257,7 @@ def slip_of(
     k = (error[:, :6] - dt / 2 * error[:, 6:]) * weight[:, None]
     square = np.maximum((k**2).sum(axis=(0, 2)), 1e-300)
     independent = (k[1:] * k[:-1]).sum(axis=(0, 2)) < _INDEPENDENT * square
-    length = max(1, min(round(_OVER / dt), len(k)))
+    length = max(1, min(round(OVER / dt), len(k)))
     whole = len(k) // length * length
     sums = k[:whole].reshape(-1, length, *k.shape[1:]).sum(axis=1)
     there = weight[:whole].sum() * dt

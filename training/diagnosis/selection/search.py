@@ -18,6 +18,7 @@ from ..filter.problem import DiagnosisProblem, Evaluation
 from ..validation.validation import Contender, scores
 from .forecasting import forecast_better
 from .hypotheses import Fit
+from .kinematic import borne_out
 from .model_selection import (
     Choice,
     Hypothesis,
@@ -244,6 +245,7 @@ class Search:
             if first is None or not current.noise.estimated or _halves(state, first):
                 return first
             enough = best(max(least, OF_ESTIMATES * problem.data.steps), fits)
+            enough = enough or best(least, borne_out(state, fits, self.alpha))
             if enough is not None:
                 return enough
             names = [first.hypothesis, *(h for h, _ in first.rivals)][:_FORECAST]

@@ -51,8 +51,8 @@ def off(run, dt, origin=START):
 def test_stamps_of_headers_are_used_whatever_the_latency(tmp_path):
     rng = np.random.default_rng(0)
     messages = Messages("mcap")
-    rows = pulses(messages, 10.0)
-    for t in times(10.0):
+    rows = pulses(messages, 7.0)
+    for t in times(7.0):
         rows.append((ns(t + 0.05 * rng.exponential()), "/odom", odometry(messages, t, t)))
     recording, found, _ = imported(messages.write(tmp_path / "bag", rows))
     assert not found.keys() & {"clock-jitter", "clock-rate"}
@@ -158,6 +158,7 @@ def test_parameters_that_change_the_outputs_in_mid_bag_cut_there(kind, tmp_path)
         assert np.abs(run.commands["pwm"][:, 2] - expected).max() < 2.0
 
 
+@pytest.mark.slow
 def test_parts_with_pauses_are_stretches_of_their_own(tmp_path):
     """Three recordings in one bag, with a minute between."""
     messages, rows = Messages("mcap"), []

@@ -262,3 +262,28 @@ def test_an_axis_that_never_answers_is_named(dive):
 
 def test_too_little_data_say_nothing(dive):
     assert words(changed(dive.cut(0.0, 2.0), "pwm", mirrored(3))) == []
+
+
+@pytest.mark.parametrize(
+    ("mirror", "said"),
+    [
+        ([[0, 1], [1, 0]], "x and y look exchanged"),
+        ([[1, 0], [0, -1]], "the motion along y has the other sign"),
+        ([[-1, 0], [0, 1]], "the motion along x has the other sign"),
+    ],
+)
+def test_a_horizontal_plane_that_is_mirrored_is_named(dive, mirror, said):
+    """Position and velocity alike, so that they agree; the heading is right."""
+
+    def change(V):
+        V = V.copy()
+        for j in range(V.shape[0]):
+            R = rotations(dive.dataset["X_WB"].to_numpy()[j, 0, :, :4].T)
+            v = R.apply(V[j, 0, :, :3])
+            v[:, :2] = v[:, :2] @ np.array(mirror)
+            V[j, 0, :, :3] = R.inv().apply(v)
+        return V
+
+    (found,) = command_findings(changed(dive, "V_WB_B", change), HEAVY)
+    assert found.word == "plane-mirrored"
+    assert said in found.text

@@ -42,7 +42,10 @@ def test_stretches_that_stand_still_are_much_longer_than_the_usual_holds():
     assert stands(np.ones((100, 2)), 0.05).all()
 
 
-@pytest.mark.parametrize(("thruster", "value"), [(1, 1500.0), (3, 1580.0), (6, 1500.0)])
+@pytest.mark.parametrize(
+    ("thruster", "value"),
+    [(3, 1580.0), *(pytest.param(k, 1500.0, marks=pytest.mark.slow) for k in (1, 6))],
+)
 def test_a_column_that_stands_still_while_the_motion_shows_its_thrust(dive, thruster, value):
     stuck = changed(dive.select(dive.scenarios[0]), "pwm", held(thruster, value))
     (found,) = command_findings(stuck, HEAVY)

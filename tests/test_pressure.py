@@ -102,3 +102,21 @@ def test_a_depth_is_compared_with_the_height_where_it_moves():
     for unknown in (None, idle, position(0.05 * z), position(np.full(t.size, np.nan))):
         found = followed(hull, unknown)
         assert (found.depth, found.sure) == (hull, False)
+
+
+@pytest.mark.parametrize(("unit", "size"), [("feet", 0.3048), ("cm", 0.01), ("mm", 0.001)])
+def test_units_of_height_and_depth_are_named(unit, size):
+    """A pressure is in Pa for sure, so the height is in the unit; a number may be in any."""
+    t = np.arange(0, 60, 0.1)
+    z = -8 + np.sin(0.3 * t)
+    height = Series(t, np.stack([np.full(t.size, np.nan)] * 2 + [z]), "estimate")
+    wrong = Series(t, height.x / size, "estimate")
+    (found,) = followed(Series(t, -z, "pressure"), wrong).findings
+    assert found.word == "motion-contradiction"
+    assert f"estimate looks like {unit}" in found.text
+    seen = followed(Series(t, -z / size, "/depth"), height, pressed=False)
+    assert seen.depth is None
+    assert f"look like {unit}" in seen.findings[0].text
+    assert f"`scale: {size:g}`" in seen.findings[0].remedy
+    hull = followed(Series(t, -0.01 * z, "hull"), height)  # gives way, and follows the depth
+    assert (hull.depth, hull.findings) == (None, ())

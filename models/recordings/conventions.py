@@ -7,7 +7,7 @@ d = k P i is |d|² - 2 k tr(Pᵀ Σ d iᵀ) + k² |i|² for a signed permutation
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -22,6 +22,8 @@ SPEEDS = {"mm/s": 1e-3, "cm/s": 1e-2, "ft/s": 0.3048, "knots": 0.514444, "km/h":
 _DEGREE = np.pi / 180
 _NEAR = 2.0
 """A simpler reading is taken if it leaves at most twice of what the best one leaves."""
+MOST = 0.7
+"""Share of the motion that a reading must explain in each half of the record."""
 _ROUNDING = 1e-3
 """Share of the squared motion below which readings fit equally well."""
 
@@ -159,13 +161,33 @@ def exchanged(groups: Sequence[Axes], least: float, even: bool = False) -> Expla
     The simplest is that with the fewest changes, of those that leave nearly as little as the best.
     With `even` each axis that moves counts alike, else by its motion.
     """
-    found = [one for axes in groups for one in _orders(axes, even)]
+    found = [one for axes in groups for one in _throughout(axes, even)]
     fits = [(cost, one) for cost, one in found if cost and one.share > least]
     if not fits:
         return None
     left = min(1 - one.share for _, one in fits)
     near = [(cost, one) for cost, one in fits if 1 - one.share <= _NEAR * left + _ROUNDING]
     return min(near, key=lambda pair: (pair[0], -pair[1].share))[1]
+
+
+def _throughout(axes: Axes, even: bool) -> Iterator[tuple[int, Explained]]:
+    """Changes and fits that explain most of the motion in both halves: conventions stay."""
+    whole, *halves = (
+        list(
+            _orders(
+                replace(axes, moved=axes.moved[:, part], integrals=axes.integrals[:, part]), even
+            )
+        )
+        for part in _parts(axes.moved.shape[1])
+    )
+    for n, one in enumerate(whole):
+        if all(half[n][1].share > MOST for half in halves if half):
+            yield one
+
+
+def _parts(count: int) -> tuple[slice, slice, slice]:
+    """All windows, and their halves."""
+    return slice(None), slice(0, count // 2), slice(count // 2, None)
 
 
 def as_given(axes: Axes) -> float:
@@ -242,6 +264,12 @@ def along_axis(
     }
     signs = f"{name} and the velocity along it have opposite signs; give all in one convention"
     tried[signs] = -1.0
-    shares = {how: 1 - float(np.sum((d - k * i) ** 2)) / size for how, k in tried.items()}
-    best = max(shares, key=lambda how: shares[how])
-    return Explained(best, shares[best]), 1 - float(np.sum((d - i) ** 2)) / size
+    best = max(tried, key=lambda how: _share(d, tried[how] * i))
+    worst = min(_share(d[part], tried[best] * i[part]) for part in _parts(d.size))
+    share = _share(d, tried[best] * i) if worst > MOST else -np.inf
+    return Explained(best, share), _share(d, i)
+
+
+def _share(d: Float[np.ndarray, " n"], i: Float[np.ndarray, " n"]) -> float:
+    """Share of the squared displacements that integrals explain; 1 without displacements."""
+    return 1 - float(np.sum((d - i) ** 2)) / max(float(np.sum(d**2)), 1e-12) if d.size else 1.0

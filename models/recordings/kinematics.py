@@ -267,7 +267,7 @@ def _reading(
         return named
     groups = _angular_axes(t, X, V) if part else _linear_axes(t, X, V)
     found = exchanged(groups, max(_EXPLAINED, 1 - _BETTER * (1 - now)))
-    if found is not None:
+    if found is not None and _clear(1 - found.share, 1 - now, groups[0].moved.shape[1]):
         return found.reading
     turned = _best(t, X, V, part, list(quaternions()), now) if part else None
     return turned or _by_axes(t, X, V, part) or None

@@ -3,7 +3,8 @@
 A source that samples at t0 + k T gives stamps t0 + k T + j with a latency j of its own each time.
 The stamps alone do not tell whether the source or its stamps are uneven. The motion does: a smooth
 signal at wrong times looks rough. With e the error of each value against the line through its
-neighbours, steady times are right where they leave clearly less of Σ e² (a ratio of variances).
+neighbours, steady times are right where they leave clearly less of Σ e² (a ratio of variances), and
+of the median of e² too: single outliers decide nothing.
 """
 
 from collections.abc import Sequence
@@ -33,7 +34,8 @@ _TOGETHER, _APART = 51, 5.0
 only where the source changes its rate or stops; their stamps are kept."""
 _COUNTED = 0.25
 """Median deviation of an interval, in steps, up to which lost messages are counted: that of normal
-jitter of a quarter step, whose least values of 25 differ by less than half a step."""
+jitter of a quarter step, whose least values of 25 differ by less than half a step. Beyond it the
+phase must be told by several independent lines."""
 
 
 @dataclass(frozen=True)
@@ -92,11 +94,12 @@ def _steady(t: np.ndarray, late: bool) -> tuple[np.ndarray, float] | None:
     """Times of a steady source for one stretch, and its step; None if there is no step."""
     n = np.arange(t.size)
     step = _first_step(t)
-    if step <= 0:
+    counted = float(np.median(np.abs(np.diff(t) - step))) <= _COUNTED * step
+    if step <= 0 or (not counted and t.size < 4 * _WIDE):
         return None
     index = n
     for _ in range(_ROUNDS):
-        index = n + _lost(t, n, step)
+        index = n + _lost(t, n, step) if counted else n
         step = float(np.polyfit(index, t, 1)[0])
         if step <= 0:
             return None
@@ -131,13 +134,7 @@ def _first_step(t: np.ndarray) -> float:
 
 
 def _lost(t: np.ndarray, n: np.ndarray, step: float) -> np.ndarray:
-    """Messages that were lost before each: the earliest that follow stay behind by so many.
-
-    None are counted where stamps jitter by so much that a step of one message is not seen.
-    """
-    jitter = np.abs(np.diff(t) - step)
-    if float(np.median(jitter)) > _COUNTED * step:
-        return np.zeros(n.size, int)
+    """Messages that were lost before each: the earliest that follow stay behind by so many."""
     behind = t - step * n
     padded = np.concatenate([behind, np.full(_AHEAD, np.inf)])
     ahead = np.lib.stride_tricks.sliding_window_view(padded, _AHEAD + 1).min(axis=1)
@@ -162,10 +159,11 @@ def _clearly_smoother(t: np.ndarray, steady: np.ndarray, x: np.ndarray) -> bool:
     order, other = np.argsort(t, kind="stable"), np.argsort(steady, kind="stable")
     ratios = []
     for row in _changing(x):
-        given = _roughness(t[order], row[order])
-        found = _roughness(steady[other], row[other])
-        if given > 0 and found > 0:
-            ratios.append(np.log(found / given))
+        given = _errors(t[order], row[order])
+        found = _errors(steady[other], row[other])
+        pairs = [(np.mean(x), np.median(x)) for x in (given, found) if x.size]
+        if len(pairs) == 2 and min(*pairs[0], *pairs[1]) > 0:
+            ratios.append(float(np.max(np.log(pairs[1]) - np.log(pairs[0]))))
     if not ratios:
         return False
     mean = float(np.mean(ratios))
@@ -181,10 +179,10 @@ def _changing(x: np.ndarray) -> Sequence[np.ndarray]:
     ]
 
 
-def _roughness(t: np.ndarray, row: np.ndarray) -> float:
-    """Mean squared error of each value against the line through both its neighbours."""
+def _errors(t: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Squared errors of the values against the line through both neighbours of each."""
     span = t[2:] - t[:-2]
     inside = (span > 0) & (span < _PAUSE_S)
     part = np.where(inside, (t[1:-1] - t[:-2]) / np.where(inside, span, 1.0), 0.0)
     off = row[1:-1] - row[:-2] - part * (row[2:] - row[:-2])
-    return float(np.mean(off[inside] ** 2)) if inside.any() else 0.0
+    return off[inside] ** 2

@@ -30,6 +30,11 @@ class Quantities:
     clock: Clock
     notes: list[str] = field(default_factory=list)
 
+    @property
+    def told(self) -> tuple[str, ...]:
+        """All sentences for the report."""
+        return (*self.clock.notes, *self.notes)
+
     def note(self, sentence: str) -> None:
         """Add a sentence for the report, once."""
         if sentence not in self.notes:

@@ -78,16 +78,7 @@ def _signals(
     density: float | None,
     proposed: bool,
 ) -> Signals:
-    reference = used.of("attitude")
-    if reference is None or reference.topic not in columns:
-        raise UserError(f"no topic tells the attitude ({listed(bag)}); {_HOW}")
-    taken = Quantities(columns, used, Clock(columns[reference.topic]))
-    attitude = taken.attitude()
-    if attitude is None or not np.isfinite(attitude.x).all():
-        raise UserError(
-            f"{reference.topic}: its quaternions are not of unit length; take the attitude from "
-            "another topic (`--topics`)"
-        )
+    taken, attitude = _reference(bag, used, columns)
     first, last = float(attitude.t[0]), float(attitude.t[-1])
     parameters, strange = _parameters(taken)
     known = {p.name: p.value for p in parameters}
@@ -127,18 +118,27 @@ def _signals(
         rc=_rc(taken),
         spans=spans,
         cuts=(*((t, "step back of the clock") for t in taken.clock.cuts), *wired.cuts),
-        notes=(
-            *taken.clock.notes,
-            *taken.notes,
-            *strange,
-            *wire_notes,
-            *motion_notes,
-            *delays,
-            *below.told,
-        ),
+        notes=(*taken.told, *strange, *wire_notes, *motion_notes, *delays, *below.told),
         findings=tuple(findings),
         **_wired(wired, command, columns[outputs.source]),
     )
+
+
+def _reference(
+    bag: Bag, used: TopicMap, columns: Mapping[str, Column]
+) -> tuple[Quantities, Series]:
+    """The quantities on the clock of the attitude, and the attitude."""
+    reference = used.of("attitude")
+    if reference is None or reference.topic not in columns:
+        raise UserError(f"no topic tells the attitude ({listed(bag)}); {_HOW}")
+    taken = Quantities(columns, used, Clock(columns[reference.topic]))
+    attitude = taken.attitude()
+    if attitude is None or not np.isfinite(attitude.x).all():
+        raise UserError(
+            f"{reference.topic}: its quaternions are not of unit length; take the attitude from "
+            "another topic (`--topics`)"
+        )
+    return taken, attitude
 
 
 def _wired(wired: Wiring, command: str, column: Column) -> dict[str, Any]:

@@ -11,8 +11,10 @@ import pytest
 from ardusub_binary import BINARY, ArduSub
 
 from spinndrift.sims.scenarios.scenario import load_scenario
-from spinndrift.systems.mavlink import codec, commands
+from spinndrift.systems.mavlink import codec, commands, telemetry
+from spinndrift.systems.mavlink.actuation import Command, as_wired, make_actuation
 from spinndrift.systems.mavlink.dialect import mavlink
+from spinndrift.systems.mavlink.parameters import Parameters
 
 pytestmark = pytest.mark.skipif(not BINARY, reason="SPINNDRIFT_ARDUSUB names no binary")
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
@@ -58,6 +60,7 @@ RATES = {
     "ATTITUDE_QUATERNION": 20.0,
     "RAW_IMU": 20.0,
     "SCALED_PRESSURE": 10.0,
+    "SERVO_OUTPUT_RAW": 20.0,
 }
 
 
@@ -107,6 +110,63 @@ def test_each_axis_moves_as_it_is_told(flown: Flown, axis: str, sign: float):
     half = slice(0, 3) if number < 3 else slice(3, 6)
     assert np.argmax(np.abs(change[half])) == number % 3
     assert np.sign(change[number]) == sign
+
+
+PUSHES = np.diag([25.0, 25.0, 25.0, 3.0, 3.0, 5.0])
+"""A wrench along each axis (N, N·m)."""
+
+
+@pytest.fixture(scope="module", params=["manual_control", "rc_override", "thruster_passthrough"])
+def commanded(flown: Flown, request: pytest.FixtureRequest) -> Iterator[Callable[..., Command]]:
+    """Commands of an actuation in our own driver's form, for an armed vehicle."""
+    parameters = Parameters(flown.link)
+    thrusters, _ = as_wired(SCENARIO.station.load_vehicle().thrusters(), parameters.read_all())
+    actuation = make_actuation(request.param, thrusters, parameters.read_all())
+    former = {name: parameters.read(name) for name in actuation.borrowed}
+    vehicle = flown.link.find_vehicle()
+
+    def command(F: np.ndarray) -> Command:
+        volts = flown.backend.physics.battery()[0]
+        return actuation.command(vehicle, F, volts, telemetry.pilot_gain(flown.link, {}))
+
+    commands.set_mode(flown.link, "MANUAL")
+    flown.simulated(0.5, lambda: flown.link.send(actuation.neutral(vehicle)))
+    for name, value in actuation.borrowed.items():
+        parameters.write(name, value)
+        flown.link.send(actuation.neutral(vehicle))
+    heartbeat = flown.link.latest("HEARTBEAT")
+    if heartbeat is None or not commands.is_armed(heartbeat.message):
+        commands.arm(flown.link)
+    yield command
+    flown.simulated(0.5, lambda: flown.link.send(actuation.neutral(vehicle)))
+    for name, value in former.items():
+        assert value is not None
+        parameters.write(name, value)
+
+
+@pytest.mark.parametrize("axis", range(6), ids=AXES)
+def test_every_actuation_gives_the_outputs_and_the_push_that_it_foresees(
+    flown: Flown, commanded: Callable[..., Command], axis: int
+):
+    still, F = np.zeros(6), PUSHES[axis]
+    flown.simulated(1.0, lambda: flown.link.send(commanded(still).message))
+    before = flown.backend.physics.truth()[1]
+    sent: list[Command] = []
+
+    def push() -> None:
+        sent.append(commanded(F))
+        flown.link.send(sent[-1].message)
+
+    flown.simulated(0.6, push)
+    change = flown.backend.physics.truth()[1] - before
+    shown = telemetry.outputs(flown.link, 8)
+    assert shown is not None
+    # whole numbers on the way, and the battery's voltage of the last commands
+    assert min(np.abs(c.pwm - shown.value).max() for c in sent[-10:]) < 6.0
+    np.testing.assert_allclose(sent[-1].F_Bo_B, F, atol=1e-6)
+    half = slice(0, 3) if axis < 3 else slice(3, 6)
+    assert np.argmax(np.abs(change[half])) == axis % 3
+    assert change[axis] > 0
 
 
 def test_it_holds_its_depth(flown: Flown):

@@ -24,7 +24,7 @@ from spinndrift.sims.run.collection import COLLECTION, collect, maneuver_scenari
 from spinndrift.sims.run.dead_man import dead_man_key
 from spinndrift.sims.run.flight import fly
 from spinndrift.sims.run.flight_log import AGES
-from spinndrift.sims.run.folder import write_files
+from spinndrift.sims.run.folder import telemetry_log, write_files
 from spinndrift.sims.run.live import LivePage
 from spinndrift.sims.scenarios.maneuvers import Maneuvers
 from spinndrift.sims.scenarios.scenario import Scenario, load_scenario, overridden
@@ -38,7 +38,10 @@ from spinndrift.systems.mavlink.transport import Connection
 pytestmark = pytest.mark.whole
 
 # a loaded machine is late and loses its estimate for a while, which has tests of its own
-PATIENT = "late: 20, lost: 20, silence: 5, stale: 5, stale_aid: 20, outputs: 20, plan_age: 20"
+PATIENT = (
+    "late: 20, lost: 20, silence: 5, stale: 5, stale_aid: 20, dead_reckoning: 20, outputs: 20, "
+    "plan_age: 20"
+)
 
 
 @contextmanager
@@ -280,3 +283,19 @@ def test_a_vehicle_with_another_frame_is_refused(port: int):
 def test_a_scenario_without_a_vehicle_says_what_to_add():
     with pytest.raises(UserError, match="has no vehicle_link: add vehicle_link: !Mavlink"):
         fly(load_scenario("station_keeping_calm"), arm=True)
+
+
+def test_an_attempt_that_never_flew_leaves_no_telemetry_and_a_flight_keeps_its_own(tmp_path: Path):
+    def failing() -> None:
+        with telemetry_log(tmp_path) as record:
+            record.write_bytes(b"heard")
+            raise UserError("nobody there")
+
+    with pytest.raises(UserError, match="nobody there"):
+        failing()
+    assert not list(tmp_path.iterdir())
+    with telemetry_log(tmp_path) as record:
+        record.write_bytes(b"flown")
+    with pytest.raises(UserError, match="ended early; name another folder"):
+        telemetry_log(tmp_path).__enter__()
+    assert record.read_bytes() == b"flown"

@@ -77,7 +77,7 @@ def test_guards_show_how_much_of_their_limits_is_used():
     assert rows["depth_limits"]["share"] == pytest.approx(0.5)
     assert rows["fence x"]["share"] == pytest.approx(0.4)
     assert rows["fence y"]["share"] == pytest.approx(0.2)
-    assert rows["battery"]["share"] == pytest.approx(13.2 / 14)
+    assert rows["battery"]["share"] == pytest.approx((16.8 - 14.0) / (16.8 - 13.2))
     assert "dead_man" not in rows, "there is none"
 
 

@@ -47,12 +47,13 @@ class Driven:
 
     def __init__(self, health: int | None = 5):
         self.system = sequence(health)
-        self.state = np.array([0.0, 0, 0, -1, 0])
+        self.state, self.mean = np.array([0.0, 0, 0, -1, 0]), np.full(12, np.nan)
         self.n = 0
 
     def step(self, X: np.ndarray, V: np.ndarray = REST, health: float = 0.0) -> np.ndarray:
         t = np.array([self.n * STEP / 2])
-        F, self.state = self.system._step(t, X, V, np.array([health]), self.state)
+        seen = X, V, np.array([health])
+        F, self.state, self.mean = self.system._step(t, *seen, self.state, self.mean)
         self.n += 1
         return F
 
@@ -101,9 +102,11 @@ def test_nothing_begins_before_all_errors_are_small(X: np.ndarray, V: np.ndarray
 
 def test_the_maneuver_is_flown_open_loop_from_a_sample_on():
     driven = Driven()
-    driven.step(pose(0.5))  # steady from the second call on, at 0.05 s
+    driven.step(pose(0.5))
     begin = driven.until(Phase.OPEN_LOOP, pose())
-    assert begin == pytest.approx(0.4)  # 0.3 s at rest, and a multiple of 0.1 s
+    # 0.5 m exp(-t / 0.15 s) is below 0.2 m from the third call on, at 0.15 s; then 0.3 s at rest
+    # and a multiple of 0.1 s
+    assert begin == pytest.approx(0.5)
     rng, wanted = np.random.default_rng(0), driven.system.program.F_Bo_B[0]
     given = [
         driven.step(pose(rng.normal(), rng.normal()), rng.normal(size=6))
@@ -121,12 +124,26 @@ def test_the_maneuver_is_flown_open_loop_from_a_sample_on():
 
 def test_motion_at_the_start_begins_the_rest_anew():
     driven = Driven()
-    for _ in range(6):
+    for _ in range(4):
         driven.step(pose())
     assert driven.phase == Phase.HOLD
-    driven.step(pose(), np.array([0.2, 0, 0, 0, 0, 0]))
+    for _ in range(4):
+        driven.step(pose(), np.array([0.2, 0, 0, 0, 0, 0]))
     assert driven.phase == Phase.APPROACH
-    assert driven.until(Phase.OPEN_LOOP, pose()) == pytest.approx(0.7)
+    # 0.2 m/s (1 - exp(-0.2 / 0.15)) falls below 0.08 m/s within 0.1 s, at 0.45 s
+    assert driven.until(Phase.OPEN_LOOP, pose()) == pytest.approx(0.8)
+
+
+def test_noise_is_no_motion_and_motion_is_none_the_less():
+    """A gyroscope beside running thrusters: 0.05 rad/s of noise, against a bound of 0.08 rad/s."""
+    rng = np.random.default_rng(4)
+    for drift, begins in ((0.0, True), (0.15, False)):
+        driven, phases = Driven(), set()
+        for _ in range(39):
+            V = np.array([0, 0, 0, *rng.normal(size=3) * 0.05 + [0, 0, drift]])
+            driven.step(pose(), V)
+            phases.add(driven.phase)
+        assert (Phase.OPEN_LOOP in phases) == begins
 
 
 def test_a_lost_estimate_stops_the_vehicle_and_voids_its_trajectory():

@@ -1,5 +1,6 @@
 """`spinndrift run`: the closed-loop simulation of a scenario."""
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -104,6 +105,7 @@ class Run:
         """Fly on the vehicle."""
         with interrupts_held():
             from ..run.flight import fly
+            from ..run.folder import telemetry_log
 
         def say(text: str) -> None:
             self._say(text)
@@ -111,13 +113,13 @@ class Run:
                 live.say(text)
 
         settings: dict[str, Any] = {
-            "arm": self.arm, "dry_run": self.dry_run, "record": out / "telemetry.tlog",
-            "say": say, "live": live,
+            "arm": self.arm, "dry_run": self.dry_run, "say": say, "live": live,
         }  # fmt: skip
-        if self.quiet:
+        with ExitStack() as held:
+            settings["record"] = held.enter_context(telemetry_log(out))
+            if not self.quiet:
+                settings["progress"] = held.enter_context(progress_bar(f"flying {scenario.name}"))
             return fly(scenario, **settings)
-        with progress_bar(f"flying {scenario.name}") as update:
-            return fly(scenario, **settings, progress=update)
 
     def _say(self, text: str) -> None:
         if not self.quiet:

@@ -20,7 +20,7 @@ from ..scenarios.maneuvers import Bounds, Maneuvers
 from ..scenarios.scenario import LogSettings, Scenario
 from .before_flight import Tell
 from .flight import fly
-from .folder import RUN, write_files
+from .folder import RUN, telemetry_log, write_files
 from .live import LivePage
 from .loop import Engine, Progress, simulate
 
@@ -201,16 +201,9 @@ def collect(
     number = next(n for n in range(1, 100_000) if not (folder / f"dive-{n}").exists())
     with run_folder(folder / f"dive-{number}", RUN, "", new=True) as dive, collection.written():
         if left.vehicle_link is not None:
-            record = dive / "telemetry.tlog"
-            run = fly(
-                left,
-                arm=arm,
-                record=record,
-                say=say,
-                progress=progress,
-                keep=collection.keep,
-                live=live,
-            )
+            told: dict[str, Any] = {"say": say, "progress": progress, "live": live}
+            with telemetry_log(dive) as record:
+                run = fly(left, arm=arm, record=record, keep=collection.keep, **told)
         else:
             seeded = left.with_changes(seed=(left.seed + number - 1) % 2**32)
             run = simulate(seeded, progress, engine, collection.keep, live)

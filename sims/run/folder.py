@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...models.config import typed_yaml
+from ...models.config.errors import UserError
 from ...models.files.atomic import atomic_files
 from ...models.files.locks import BusyError
 from ...models.files.owned import FolderKind, run_folder
@@ -44,6 +45,27 @@ def write_run(run: Run, folder: str | os.PathLike[str], report: bool = True) -> 
     """
     with run_folder(folder, RUN, "", new=True) as held:
         return write_files(run, held, report)
+
+
+@contextmanager
+def telemetry_log(folder: Path) -> Iterator[Path]:
+    """The path of a flight's telemetry log, which is removed if nothing was flown (`fly`).
+
+    The same command can then be given again.
+
+    Raises:
+        UserError: it is there, of a flight that ended early.
+    """
+    record = folder / "telemetry.tlog"
+    if record.exists():
+        raise UserError(
+            f"--out {folder}: holds telemetry.tlog of a run that ended early; name another folder"
+        )
+    try:
+        yield record
+    except UserError:
+        record.unlink(missing_ok=True)
+        raise
 
 
 def write_files(run: Run, folder: Path, report: bool = True) -> dict[str, Any]:

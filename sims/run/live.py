@@ -27,6 +27,7 @@ from .signals import PlanTap
 
 _PAGE = Path(__file__).with_name("live.html")
 _PERIOD = 0.2  # s between the states that are taken in
+_FULL = 4.2 / 3.3 - 1  # a full lithium cell above one at the least voltage, as a share of that
 _FORESEEN = ("goal", "duration", "finished")
 """Ends of a run that are not shown as an alarm."""
 
@@ -175,7 +176,7 @@ def guard_rows(
     if safety.min_voltage > 0:
         rows.append(
             {"name": "battery", "value": entry.voltage, "limit": f"{safety.min_voltage:g} V",
-             "share": safety.min_voltage / entry.voltage if entry.voltage > 0 else math.nan}
+             "share": 1 - (entry.voltage / safety.min_voltage - 1) / _FULL}
         )  # fmt: skip
     return rows
 

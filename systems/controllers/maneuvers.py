@@ -39,6 +39,9 @@ class Phase(enum.IntEnum):
 class Steadiness:
     """When a vehicle is at rest at its start pose.
 
+    Its deviation is averaged with the time constant `time` / 2: the noise of a gyroscope beside
+    running thrusters, or that of a depth gauge, is no motion.
+
     Attributes:
         position: largest distance from the start (m).
         angle: largest rotation from it (degrees).
@@ -90,13 +93,17 @@ class ManeuverProgram(eqx.Module):
     names: tuple[tuple[str, int], ...] = eqx.field(static=True)
 
 
-def errors(
+def deviation(
     X_WB: Float[Array, "7"], V_WB_B: Float[Array, "6"], start: Float[Array, "7"]
-) -> Float[Array, "4"]:
-    """Distance (m), angle (rad), speed (m/s) and turn rate (rad/s) relative to rest at a pose."""
+) -> Float[Array, "12"]:
+    """Distance vector (m), rotation vector (rad) and twist relative to rest at a pose."""
     turned = se3.local(X_WB, jnp.concatenate([start[:4], X_WB[4:]]))[3:]
-    parts = (start[4:] - X_WB[4:], turned, V_WB_B[:3], V_WB_B[3:])
-    return jnp.stack([jnp.linalg.norm(part) for part in parts])
+    return jnp.concatenate([start[4:] - X_WB[4:], turned, V_WB_B])
+
+
+def errors(deviation: Float[Array, "12"]) -> Float[Array, "4"]:
+    """Distance (m), angle (rad), speed (m/s) and turn rate (rad/s) of a deviation."""
+    return jnp.linalg.norm(deviation.reshape(4, 3), axis=1)
 
 
 class ManeuverSequence(LeafSystem):
@@ -146,12 +153,16 @@ class ManeuverSequence(LeafSystem):
         self._health = None if health is None else self.DeclareVectorInputPort("health", health)
         self._F = self.DeclareDiscreteState(6)
         self._state = self.DeclareDiscreteState(drake_array([0.0, 0.0, 0.0, -1.0, 0.0]))
+        self._mean = self.DeclareDiscreteState(drake_array(np.full(12, np.nan)))
+        self._gain = -math.expm1(-2 * period / steady.time)
         self.DeclareStateOutputPort("F_Bo_B", self._F)
         self.DeclareStateOutputPort("maneuver", self._state)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-        self._step = VectorFunction(self._call, [1, 7, 6, 1, 5], [6, 5])
+        self._step = VectorFunction(self._call, [1, 7, 6, 1, 5, 12], [6, 5, 12])
 
-    def _call(self, t: Array, X: Array, V: Array, health: Array, state: Array) -> tuple[Array, ...]:
+    def _call(
+        self, t: Array, X: Array, V: Array, health: Array, state: Array, mean: Array
+    ) -> tuple[Array, ...]:
         program, steady, now = self.program, self.steady, t[0]
         phase, index, since, rested, left_out = state
         count, steps = len(program.start), program.F_Bo_B.shape[1]
@@ -159,7 +170,7 @@ class ManeuverSequence(LeafSystem):
         start = starts[jnp.clip(index, 0, count - 1).astype(jnp.int32)]
         known = jnp.all(jnp.isfinite(X)) & jnp.all(jnp.isfinite(V)) & (health[0] < LOST)
         seen, aim = (V, start) if self._horizontal else horizontal_left_out(X, V, start)
-        inside = known & jnp.all(errors(X, seen, aim) <= jnp.asarray(steady.bounds))
+        mean, inside = self._averaged(mean, deviation(X, seen, aim), known)
         rested = jnp.where(inside, jnp.where(rested < 0, now, rested), -1.0)
         step = jnp.asarray(program.step)
         instant = jnp.abs(now / step - jnp.round(now / step)) < 1e-6
@@ -191,15 +202,22 @@ class ManeuverSequence(LeafSystem):
         number = jnp.clip(jnp.floor(k), 0, steps - 1).astype(jnp.int32)
         open_loop = jnp.asarray(program.F_Bo_B)[jnp.asarray(program.which)[at], number]
         F = jnp.where(phase == Phase.OPEN_LOOP, open_loop, driven)
-        return jnp.where(known, F, 0), jnp.stack([phase, index, since, rested, left_out])
+        new = jnp.stack([phase, index, since, rested, left_out])
+        return jnp.where(known, F, 0), new, jnp.where(following, jnp.nan, mean)
+
+    def _averaged(self, mean: Array, now: Array, known: Array) -> tuple[Array, Array]:
+        """The mean deviation, NaN before the first, and whether it is within its bounds."""
+        mean = jnp.where(jnp.isnan(mean), now, mean + self._gain * (now - mean))
+        mean = jnp.where(known, mean, jnp.nan)
+        return mean, known & jnp.all(errors(mean) <= jnp.asarray(self.steady.bounds))
 
     def pure(self) -> Pure:
         """The update as a pure function."""
 
         def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
             health = inputs["health"][:1] if "health" in inputs else jnp.zeros(1)
-            F, new = self._call(t[None], inputs["X_WB"], inputs["V_WB_B"], health, state[1])
-            return {0: F, 1: new}
+            seen = inputs["X_WB"], inputs["V_WB_B"], health
+            return dict(enumerate(self._call(t[None], *seen, *state[1:])))
 
         outputs = {"F_Bo_B": shown(0), "maneuver": shown(1)}
         return Pure((Event(self.period, update),), outputs)
@@ -212,5 +230,6 @@ class ManeuverSequence(LeafSystem):
             value(self._V, context),
             np.zeros(1) if health is None else health[:1],
             group(context, self._state),
+            group(context, self._mean),
         )
-        set_groups(state, [self._F, self._state], found)
+        set_groups(state, [self._F, self._state, self._mean], found)

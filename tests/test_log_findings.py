@@ -69,11 +69,16 @@ def test_the_frame_that_the_autopilot_names_counts_where_the_parameter_is_missin
         imported(tmp_path, named_frame(b"VECTORED", {}), vehicle="bluerov2_heavy")
 
 
-def test_a_frame_that_was_changed_without_a_start_is_refused(tmp_path):
-    """The motors of FRAME_CONFIG were not in force."""
+def test_a_frame_that_was_changed_without_a_start_is_refused_unless_outputs_have_it(tmp_path):
+    """The motors of FRAME_CONFIG were not in force, or the functions of all outputs say so too."""
     changed = named_frame(b"VECTORED_6DOF", {"FRAME_CONFIG": 1.0})
     with pytest.raises(UserError, match=r"FRAME_CONFIG 1.*VECTORED, and the autopilot started as"):
         imported(tmp_path, changed)
+    outputs_too = {f"SERVO{n}_FUNCTION": 32.0 + n for n in range(1, 7)}
+    outputs_too |= {"FRAME_CONFIG": 1.0, "SERVO7_FUNCTION": 0.0, "SERVO8_FUNCTION": 0.0}
+    recording, found, report = imported(tmp_path, named_frame(b"VECTORED_6DOF", outputs_too))
+    assert (recording.vehicle, found) == ("bluerov2", [])
+    assert any("started as Frame: VECTORED_6DOF" in line for line in report.done)
     same = named_frame(b"VECTORED", {"FRAME_CONFIG": 1.0})
     assert imported(tmp_path, same)[1] == []
 

@@ -93,6 +93,17 @@ def _not_a_submarine(place: str, said: list[str]) -> Finding:
     )
 
 
+def outvoted(frame: int | None, said: int | None, motors: Mapping[int, int]) -> bool:
+    """Whether parameter and functions of outputs agree, and the frame that was named does not.
+
+    `motors` are those that functions assign to output channels (from 1); none without functions.
+    """
+    if frame not in _FRAMES or said not in _FRAMES:
+        return False
+    count = _FRAMES[frame][1]
+    return set(motors.values()) == set(range(1, count + 1)) and _FRAMES[said][1] != count
+
+
 def frame_findings(
     frame: int | None,
     source: str,
@@ -109,15 +120,6 @@ def frame_findings(
     if frame not in _FRAMES:
         return []
     name, count = _FRAMES[frame]
-    if said is not None and said != frame:
-        return [
-            Finding(
-                "frame-contradiction",
-                source,
-                f"the parameter is frame {name}, and the autopilot started as {_FRAMES[said][0]}",
-                "correct FRAME_CONFIG and start the autopilot anew before the next dive",
-            )
-        ]
     extra = [c for c, motor in sorted(motors.items()) if motor > count and moves(outputs_us[c - 1])]
     if extra:
         which = ", ".join(str(c) for c in extra)
@@ -127,6 +129,15 @@ def frame_findings(
                 source,
                 f"frame {name} has {count} thrusters, and outputs {which} drive more of them",
                 "correct FRAME_CONFIG or SERVOn_FUNCTION in the log's parameters",
+            )
+        ]
+    if said is not None and said != frame and not outvoted(frame, said, motors):
+        return [
+            Finding(
+                "frame-contradiction",
+                source,
+                f"the parameter is frame {name}, and the autopilot started as {_FRAMES[said][0]}",
+                "correct FRAME_CONFIG and start the autopilot anew before the next dive",
             )
         ]
     if frame not in FRAME_THRUSTERS and not named:

@@ -20,7 +20,7 @@ from ..mavlink.codec import (
     thruster_pwm,
 )
 from .drives import CHANGED, SETTLING_S, Drive, drive_findings, drives
-from .frame import frame_findings, frame_in_words, moves
+from .frame import frame_findings, frame_in_words, moves, outvoted
 from .signals import Parameter, Series, Spans, series
 
 PRESETS, _USUAL = {6: "bluerov2", 8: "bluerov2_heavy"}, 8
@@ -115,6 +115,12 @@ def wiring(
     if frame is None and said is not None:
         frame, source = said, frame_in_words(said)
     name, notes = _vehicle(vehicle, frame, source, channel_of, functions, pulses)
+    motors = {channel: motor for channel, motor in motor_of.items() if motor is not None}
+    if said is not None and outvoted(frame, said, motors):
+        notes.append(
+            f"{source} and SERVOn_FUNCTION agree and count, though the autopilot started as "
+            f"{frame_in_words(said)}."
+        )
     mounts = load_vehicle(name).propulsion.mounts
     _, told = _channels(len(mounts), channel_of, functions)
     if not any(re.fullmatch(r"MOT_[1-8]_DIRECTION", p.name) for p in parameters):
@@ -132,7 +138,7 @@ def wiring(
         frame,
         source,
         said,
-        {channel: motor for channel, motor in motor_of.items() if motor is not None},
+        motors,
     )
 
 

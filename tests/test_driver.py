@@ -70,6 +70,14 @@ def until(true: Callable[[], bool], seconds: float = 10.0) -> bool:
     return False
 
 
+def pilot_disarms(port: int) -> None:
+    """What a pilot does who has been left an armed vehicle."""
+    with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
+        link.find_vehicle(15.0)
+        commands.disarm(link)
+        commands.set_mode(link, "MANUAL")
+
+
 @pytest.mark.parametrize(
     "way", [WAYS[0], *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS[1:])]
 )
@@ -210,6 +218,7 @@ def test_a_pilot_s_station_is_obeyed_again_after_the_dive(served: Served, port: 
         assert fly(driver, WRENCHES[0], 1.0).order == "yield"
     assert values["SYSID_MYGCS"] == 255
     assert values["FS_PILOT_TIMEOUT"] == 3.0
+    pilot_disarms(port)
 
 
 def test_a_depth_sensor_that_fails_ends_the_dive(served: Served, port: int, monkeypatch):
@@ -230,6 +239,7 @@ def test_a_pilot_who_changes_the_mode_is_left_alone(port: int):
         acted = fly(driver, WRENCHES[0], 2.0)
         assert acted.order == "yield"
         assert "STABILIZE" in acted.reason
+    pilot_disarms(port)
 
 
 @pytest.mark.parametrize(
@@ -262,10 +272,7 @@ def test_a_vehicle_that_a_pilot_takes_before_arming_is_left_alone(
             driver.prepare()
     assert autopilot.armed == (command[0] == 400)
     assert served.simulation.vehicle.parameters["FS_PILOT_TIMEOUT"] == 3.0, "given back"
-    with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
-        link.find_vehicle(15.0)
-        commands.disarm(link)
-        commands.set_mode(link, "MANUAL")
+    pilot_disarms(port)
 
 
 @pytest.mark.slow

@@ -18,7 +18,9 @@ import pytest
 
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.files.owned import run_folder
+from spinndrift.models.recordings.checks.examine import examine
 from spinndrift.models.recordings.store import Recording
+from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.run import flight
 from spinndrift.sims.run.collection import COLLECTION, collect, maneuver_scenario
 from spinndrift.sims.run.dead_man import dead_man_key
@@ -149,6 +151,33 @@ def test_a_guard_ends_a_collection_and_voids_the_trajectory_it_was_in(
     assert run.commands["F_Bo_B"][20:, 0].mean() > 20
     assert run.V_WB_B[-1, 0] > run.V_WB_B[0, 0] + 0.2, "it moved as it was pushed"
     assert (folder / "dive-1" / "telemetry.tlog").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_without_a_dvl_depth_is_held_and_what_is_collected_can_be_learned_from(
+    port: int, tmp_path: Path
+):
+    base = overridden(scenario(port, 8.0), "station: {sensing: {dvl: null}}")
+    run = fly(base, arm=True)
+    assert run.outcome.reason == "duration"
+    X, late = run.log["X_WB"], run.log.time > 6.0
+    assert np.isnan(X[:, 4:6]).all()
+    assert np.isnan(run.log["V_WB_B"][:, :2]).all()
+    assert np.abs(X[late, 6] + 1.5).max() < 0.3, run.numbers["loop"]
+    assert np.abs(run.log["F_Bo_B"][:, :2]).max() < 5.0
+    (tmp_path / "run").mkdir()
+    values = write_files(run, tmp_path / "run", report=True)
+    assert "the place is not known" in values["outcome"]["words"]
+
+    settings = Maneuvers(("heave-down", "yaw-left"), 1, duration=2.0)
+    with run_folder(tmp_path / "out", COLLECTION) as folder:
+        found = collect(maneuver_scenario(base, settings), folder, arm=True, report=False)
+    assert (found.added, found.wanted) == (2, 2)
+    recording = Recording.load(folder / "recording.nc")
+    heave, yaw = recording.trajectories()
+    assert heave.X_WB[-1, 6] < heave.X_WB[0, 6] - 0.1
+    assert yaw.V_WB_B[-1, 5] > 0.2
+    assert examine(recording, load_vehicle("bluerov2_heavy"), "recording", ()).duration > 4
 
 
 @pytest.mark.slow

@@ -92,6 +92,11 @@ def test_smooth_motion_converges_with_second_order():
     assert np.log2(errors[0] / errors[1]) > 1.9
 
 
+def test_no_times_have_no_rotations():
+    q = np.array([[1.0, 1], [0, 0], [0, 0], [0, 0]])
+    assert slerp(np.zeros(0), np.array([0.0, 1.0]), q).shape == (4, 0)
+
+
 def test_signs_of_quaternions_are_made_continuous():
     X = smooth_motion(np.arange(0, 10, 0.05))[0]
     flipped = X[:4] * RNG.choice([-1.0, 1.0], X.shape[1])

@@ -114,7 +114,7 @@ def geodesic(
 def continuous(q: Float[np.ndarray, "4 n"]) -> Float[np.ndarray, "4 n"]:
     """Unit quaternions with signs chosen so that neighbours are close; the first has w ≥ 0."""
     q = q / np.linalg.norm(q, axis=0)
-    flips = np.concatenate([[q[0, 0] < 0], (q[:, 1:] * q[:, :-1]).sum(axis=0) < 0])
+    flips = np.concatenate([q[0, :1] < 0, (q[:, 1:] * q[:, :-1]).sum(axis=0) < 0])
     return q * np.where(np.cumsum(flips) % 2, -1.0, 1.0)
 
 

@@ -103,9 +103,9 @@ class _Rows:
             x = (np.nan,) * len(self.x[0])
         header = getattr(message, "header", None)
         frame, child = getattr(header, "frame_id", ""), getattr(message, "child_frame_id", "")
-        self.frames.append((str(frame), str(child)))
         stamp = 0 if header is None else header.stamp.sec * _NANOSECONDS + header.stamp.nanosec
         at, text = min(max(int(received), -_LATEST_NS), _LATEST_NS), str(self.form.text(message))
+        self.frames.append((str(frame), str(child)))  # all or none, whatever a message lacks
         self.x.append(x)
         self.received.append(at)
         self.stamps.append(int(stamp))

@@ -89,6 +89,7 @@ def test_a_cause_forecasts_better_by_a_practical_share_of_one_part():
     assert better(judged(1.0), judged(np.inf))
     unseen = judged(1.0)._replace(square=judged(1.0).square * [[[0.0], [1.0], [1.0]]])
     assert better(judged(np.array([0.0, 0.9, 0.93])), unseen), "a part without records counts not"
+    assert not better(judged(0.0), judged(0.0)), "an exact forecast leaves nothing to save"
 
 
 def ratio(name, where, believed, found, half=0.01):

@@ -173,8 +173,8 @@ def improves(new: Judged, old: Judged, rng: np.random.Generator) -> bool:
         for g in range(len(GROUPS))
         if old.square[:, g].any()
     ]
-    if not all(np.isfinite(value).all() for value, _ in parts):
-        return False
+    if not parts or not all(np.isfinite(value).all() for value, _ in parts):
+        return False  # without errors there is nothing to save
     mean, high = _mean_logarithm(parts)
     return bool(mean < np.log(1 - PRACTICAL) / len(parts) and high < 0)
 

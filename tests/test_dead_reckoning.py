@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
+from spinndrift.sims.run.estimate import nees
 from spinndrift.sims.run.log import RunLog
-from spinndrift.sims.run.loop import simulate
+from spinndrift.sims.run.loop import simulate, simulate_seeds
 from spinndrift.sims.scenarios.scenario import load_scenario
 from spinndrift.systems.mavlink.interface import RESOLUTION
 from spinndrift.systems.mavlink.safety import SafetyConfig, Snapshot, State, Supervisor
@@ -103,3 +105,23 @@ def test_the_longest_bridge_is_one_that_the_covariance_covers(flown: RunLog):
         claimed = float(np.linalg.norm(flown["error_std"][n, :2]))
         assert np.linalg.norm(place) < 3 * claimed
         assert claimed < most
+
+
+@pytest.mark.slow
+def test_without_a_dvl_velocity_is_less_known_from_second_to_second():
+    """Depth and heading say nothing of the horizontal, however far its estimate is off."""
+    text = f"""
+duration: 40
+station:
+  sensing:
+    imu: {{rate: 40, integrating: false, accelerometer_density: {1.6 * DENSITY[0]}}}
+    dvl: {{dropout_share: 0, outlier_share: 0}}
+    faults: [{{sensor: dvl, fault: dropout, start: 10}}]
+"""
+    within = []
+    for run in simulate_seeds(load_scenario("station_keeping_calm", text), range(8)):
+        log = run.log
+        std = log["error_std"][np.searchsorted(log.time, np.arange(11.0, 40.0)), 6:8]
+        assert np.all(np.diff(std, axis=0) > 0)
+        within.append(nees(log)[log.time > 11] < chi2(3).ppf(0.9973))
+    assert np.mean(within) > 0.95

@@ -102,6 +102,7 @@ def follow(given: tuple[Dives, Array]) -> tuple[Array, Array, Array]:
     truth, key = given
     state = FILTER.init(truth.X_WB[0], truth.V_WB_B[0])
     off = jnp.where(jnp.arange(18) < 9, jax.random.normal(key, (18,)), 0) * FILTER.deviations()
+    off = error_state.body_axes(state.nominal)[1] @ off
     state = state._replace(nominal=error_state.retract(state.nominal, off))
 
     def told(state, rows):

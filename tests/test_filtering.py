@@ -100,8 +100,10 @@ def test_without_a_force_the_transition_is_the_derivative_of_a_velocity_that_is_
     angle = float(jnp.linalg.norm(rate) * T)
     size = angle * max(float(jnp.linalg.norm(x.v_B)), imu.gravity * float(T))
     np.testing.assert_allclose(F[es.VELOCITY], exact[es.VELOCITY], atol=size)
-    np.testing.assert_array_equal(F[es.VELOCITY, es.ROTATION], 0)
-    np.testing.assert_allclose(jnp.diag(Q)[es.VELOCITY], 0.3, rtol=1e-3)
+    to_B = es.body_axes(after)[0]
+    in_body = to_B @ F @ es.body_axes(x)[1]
+    np.testing.assert_allclose(in_body[es.VELOCITY, es.ROTATION], 0, atol=1e-15)
+    np.testing.assert_allclose(jnp.diag(to_B @ Q @ to_B.T)[es.VELOCITY], 0.3, rtol=1e-3)
 
 
 def test_the_transitions_noise_is_that_of_many_small_steps():
@@ -175,12 +177,48 @@ def test_an_update_is_the_conditional_gaussian(used):
     S = H @ P @ H.T + R
     K = P @ H.T @ jnp.linalg.inv(S)
     np.testing.assert_allclose(es.error(x, after), K @ r, atol=1e-9)
-    gamma = jnp.eye(18).at[:6, :6].add(-se3.ad((K @ r)[:6]) / 2)
+    gamma = es.moved(x, K @ r)
     np.testing.assert_allclose(P_after, gamma @ (P - K @ S @ K.T) @ gamma.T, atol=1e-11)
     for each, score in zip(found, nis, strict=True):
         S = each.H @ P @ each.H.T + each.R
         expected = each.residual @ jnp.linalg.solve(S, each.residual)
         np.testing.assert_allclose(score, expected, rtol=1e-9)
+
+
+def test_the_covariance_moves_by_the_derivative_of_the_error():
+    x, d = navigation(), jnp.asarray(0.01 * RNG.standard_normal(ERRORS))
+    for scale in (1.0, 0.1):
+        after = es.retract(x, scale * d)
+        exact = jax.jacfwd(lambda e: es.error(after, es.retract(x, e)))(scale * d)  # noqa: B023
+        error = jnp.abs(es.moved(x, scale * d) - exact).max()
+        assert error < scale**2 * jnp.abs(d).max() ** 2
+
+
+def test_body_axes_are_those_of_pose_and_velocity_in_the_body():
+    x = navigation()
+    R = se3.rotation_matrix(x.X_WB)
+
+    def in_body(e: Array) -> Array:
+        y = es.retract(x, e)
+        place = R.T @ (y.X_WB[4:] - x.X_WB[4:])
+        turned = se3.local(x.X_WB, y.X_WB)[3:]
+        return jnp.concatenate([place, turned, y.v_B - x.v_B, e[9:]])
+
+    C, C_inverse = es.body_axes(x)
+    np.testing.assert_allclose(C, jax.jacfwd(in_body)(jnp.zeros(ERRORS)), atol=1e-12)
+    np.testing.assert_allclose(C @ C_inverse, jnp.eye(ERRORS), atol=1e-12)
+
+
+@pytest.mark.parametrize("part", [es.POSITION, es.VELOCITY])
+def test_what_is_unknown_along_the_horizontal_stays_out_of_the_vertical(part: slice):
+    """However large it is, and whatever the errors of attitude and the rotation since."""
+    x, rng = navigation(), np.random.default_rng(4)
+    for _ in range(5):
+        e = jnp.asarray(rng.normal(0, 0.2, ERRORS)).at[part].set([30.0, -50.0, 0.0])
+        y, none = es.retract(x, e), es.retract(x, e.at[part].set(0))
+        climb, still = (se3.rotate(z.X_WB, z.v_B)[2] for z in (y, none))
+        np.testing.assert_allclose(climb, still, atol=1e-12)
+        np.testing.assert_allclose(y.X_WB[6], none.X_WB[6], atol=1e-12)
 
 
 def test_a_gated_reading_changes_nothing():
@@ -235,7 +273,8 @@ def simulate(core: DelayedFilter, key: Array, steps: int, blind_after: Array, gr
     ]
     start = core.init(X0, V0)
     drawn = jnp.where(jnp.arange(18) < 9, jax.random.normal(keys[2], (18,)), 0)
-    nominal = es.retract(start.nominal, drawn * core.deviations())
+    from_B = es.body_axes(start.nominal)[1]
+    nominal = es.retract(start.nominal, from_B @ (drawn * core.deviations()))
     start = start._replace(nominal=nominal)
     every = [round(core.imu.rate / s.rate) for s in sensors]
 

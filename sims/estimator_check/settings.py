@@ -160,6 +160,7 @@ def _faults(t: float) -> list[tuple[str, str, list[SensorFault]]]:
         row("dvl_noise", "DVL: 10 times the noise", "noise", size=10.0),
         row("dvl_dropout", "DVL: 90 % lost", "dropout", share=0.9),
         row("dvl_lost", "DVL: no valid reading for 10 s", "dropout", long),
+        row("dvl_lost_on", "DVL: no valid reading to the end", "dropout"),
         row("dvl_latency", "DVL: 0.5 s of hidden latency", "latency", size=0.5),
         row("dvl_stamp", "DVL: time stamp of arrival, 0.15 s late", "stamp_offset", size=0.15),
         row("dvl_frozen_stamp", "DVL: time stamps frozen for 10 s", "frozen_stamp", long),

@@ -23,14 +23,15 @@ _CONFIDENCE = 0.95
 def estimate_error(log: RunLog) -> tuple[np.ndarray, np.ndarray] | None:
     """The filter's error δ = (δp, δθ, δv) (N, 9) and its estimated standard deviations (N, 9).
 
-    The truth is X̂ exp([δp, δθ]), v̂ + δv (`systems.estimation.error_state`). Without a covariance
-    in the log the deviations are NaN.
+    The truth is p̂ + R̂ δp, R̂ exp(δθ), v̂ + δv, in body axes. Without a covariance in the log the
+    deviations are NaN.
     """
     if "X_WB_estimate" not in log:
         return None
-    pose = local(log["X_WB_estimate"], log["X_WB"])
+    here, true = log["X_WB_estimate"], log["X_WB"]
+    place = se3.rotate_inverse(jnp.asarray(here.T), jnp.asarray((true - here)[:, 4:].T)).T
     velocity = (log["V_WB_B"] - log["V_WB_B_estimate"])[:, :3]
-    error = np.concatenate([pose, velocity], axis=1)
+    error = np.concatenate([place, local(here, true)[:, 3:], velocity], axis=1)
     return error, log["error_std"][:, :9] if "error_std" in log else np.full_like(error, np.nan)
 
 

@@ -25,7 +25,7 @@ from . import error_state, inertial, measurement, recovery
 from .config import EkfConfig
 from .error_state import Navigation
 from .inertial import Motion, Samples
-from .state import FilterState, Readings, health, status
+from .state import SUMS, FilterState, Readings, health, status
 from .trust import (
     Shown,
     Trust,
@@ -42,7 +42,6 @@ from .trust import (
 _SAMPLE = 7
 """Columns of a slot: has sample, force 3, mean rate 3 | has reading, values, for each sensor | rate
 at the end 3 | `inertial.LEFT_OPEN`."""
-_SINCE = 10  # components of `FilterState.since` that are sums
 _LONGEST = 0.1  # s: longest interval between predictions of the covariance
 
 
@@ -129,11 +128,13 @@ class DelayedFilter(eqx.Module):
     def init(self, X_WB: Float[Array, "7"], V_WB_B: Float[Array, "6"]) -> FilterState:
         """The state at time 0 for an estimated pose and twist, biases unknown."""
         zero = jnp.zeros_like(V_WB_B[:3])
+        start = Navigation(X_WB, V_WB_B[:3], zero, zero, jnp.zeros(len(self.aids), zero.dtype))
         return FilterState(
-            Navigation(X_WB, V_WB_B[:3], zero, zero, jnp.zeros(len(self.aids), V_WB_B.dtype)),
-            jnp.diag(self.deviations() ** 2),
+            start,
+            error_state.of_body_axes(jnp.diag(self.deviations() ** 2), start),
             jnp.zeros((self.slots, self.slot), V_WB_B.dtype),
-            jnp.concatenate([jnp.zeros(_SINCE, V_WB_B.dtype), V_WB_B[:3]]),
+            jnp.zeros(SUMS, V_WB_B.dtype),
+            start,
             Samples.start(V_WB_B[3:]),
             Motion.start(V_WB_B.dtype),
             Shown.start(self.aids, V_WB_B.dtype),
@@ -229,7 +230,7 @@ class DelayedFilter(eqx.Module):
             left_open = jnp.where(dt > 0, motion.variances(values[open_:]), 0)
             held = jnp.where(values[open_] > 0, dt, 0)[None]
             gone = jnp.concatenate([dt[None], force * dt, omega * dt, held, left_open])
-            return (x, motion, jnp.concatenate([since[:_SINCE] + gone, since[_SINCE:]])), None
+            return (x, motion, since + gone), None
 
         start = (state.nominal, state.motion, state.since)
         (x, motion, since), _ = jax.lax.scan(over, start, (times, slots))
@@ -288,7 +289,8 @@ class DelayedFilter(eqx.Module):
         return state._replace(
             nominal=done.nominal,
             P=done.P,
-            since=jnp.concatenate([jnp.zeros(_SINCE, P.dtype), done.nominal.v_B]),
+            since=jnp.zeros_like(state.since),
+            before=done.nominal,
             trust=trust,
         )
 
@@ -296,7 +298,7 @@ class DelayedFilter(eqx.Module):
         self, state: FilterState, slot: Float[Array, "row"]
     ) -> tuple[Navigation, Float[Array, "e e"], Float[Array, "e e"]]:
         """State, F and P at the horizon, levelled where roll and pitch are uncertain."""
-        F, P = self._covariance(state, state.nominal, state.since[:_SINCE])
+        F, P = self._covariance(state, state.nominal, state.since)
         x = state.nominal
         x, P, F = recovery.levelled(
             x,
@@ -326,8 +328,8 @@ class DelayedFilter(eqx.Module):
         ]
 
     def covariance(self, state: FilterState) -> Float[Array, "e e"]:
-        """P at the horizon."""
-        return self._covariance(state, state.nominal, state.since[:_SINCE])[1]
+        """P at the horizon, of δ (`systems.estimation.error_state`)."""
+        return self._covariance(state, state.nominal, state.since)[1]
 
     def _covariance(
         self, state: FilterState, after: Navigation, gone: Float[Array, "10"]
@@ -335,10 +337,11 @@ class DelayedFilter(eqx.Module):
         """F and P after an interval with the sums `gone` (as in `FilterState.since`)."""
         time = gone[0]
         some = jnp.maximum(time, self.period)
-        before = state.nominal._replace(v_B=state.since[_SINCE:])
+        turn, push = state.samples.interpolation(self.period)
+        between = None if self.imu.integrating else (turn * time, push * time)
         unmeasured = error_state.Unmeasured(*jnp.unstack(gone[7:]))
         F, Q = error_state.transition(
-            before,
+            state.before,
             after,
             gone[1:4] / some,
             gone[4:7] / some,
@@ -347,12 +350,9 @@ class DelayedFilter(eqx.Module):
             self.aids,
             unmeasured,
             state.trust.imu_factor,
+            between,
         )
         P = F @ state.P @ F.T + Q
-        if not self.imu.integrating:
-            turn, force = state.samples.interpolation(self.period)
-            P = P.at[error_state.ROTATION, error_state.ROTATION].add(time / self.period * turn)
-            P = P.at[error_state.VELOCITY, error_state.VELOCITY].add(time / self.period * force)
         return F, (P + P.T) / 2
 
     def _time(self, k: Float[Array, ""]) -> Float[Array, ""]:
@@ -372,7 +372,7 @@ class DelayedFilter(eqx.Module):
     def present(
         self, state: FilterState, ahead: float | Float[Array, ""]
     ) -> tuple[Float[Array, "7"], Float[Array, "6"], Float[Array, "e e"]]:
-        """Pose, twist and error covariance `ahead` seconds after the newest sample.
+        """Pose, twist and error covariance in body axes `ahead` seconds after the newest sample.
 
         The buffered samples are applied to the state at the horizon; beyond the newest one its rate
         and the mean force of the last few are held. The covariance is predicted over the buffered
@@ -389,12 +389,12 @@ class DelayedFilter(eqx.Module):
         now = error_state.apply(x, increment, self.imu.gravity)
         parts = [jnp.ones_like(force[:1]), force, omega, missing[None].astype(force.dtype)]
         waiting = jnp.concatenate([(jnp.concatenate(parts) * time[None]).T, left_open], 1)
-        _, P = self._covariance(state, now, state.since[:_SINCE] + jnp.sum(waiting, axis=0))
+        _, P = self._covariance(state, now, state.since + jnp.sum(waiting, axis=0))
         foreseen = state.samples.foreseen - jnp.concatenate([x.accel_bias, x.gyro_bias])
         rate = foreseen[3:]
         beyond = error_state.sample_increment(foreseen[:3], rate, ahead * ring[-1, 0])
         now = error_state.apply(now, beyond, self.imu.gravity)
+        suspect = state.trust.suspect((state.samples.count - 1 - self.slots) * self.period)
+        P = error_state.in_body_axes(with_doubt(P, state.trust.pulled, suspect), now)
         P = P + error_state.foreseen_covariance(state.samples.steps, now.v_B, ahead, self.errors)
-        time = (state.samples.count - 1 - self.slots) * self.period
-        P = with_doubt(P, state.trust.pulled, state.trust.suspect(time))
         return now.X_WB, jnp.concatenate([now.v_B, rate]), (P + P.T) / 2

@@ -4,10 +4,19 @@ Nominal state: pose `X_WB`, velocity v of Bo in W expressed in B, biases of gyro
 accelerometer, and one slow error of each other sensor: scale of the DVL, offset of the depth gauge,
 wander of the compass. The true state is `retract(nominal, δ)` with the error δ in R¹⁵⁺ⁿ
 
-    δ = [δp 3, δθ 3 | δv 3 | δb_g 3 | δb_a 3 | slow errors n],    X_WB = X̂_WB exp([δp, δθ]),
+    δ = [δp 3, δθ 3 | δv 3 | δb_g 3 | δb_a 3 | slow errors n],
+    p_WB = p̂_WB + δp,    R_WB = R̂_WB exp(δθ),    v_W = R_z(n̂ᵀ δθ) (v̂_W + δv),
 
-so the pose error is expressed in the body frame (left-invariant; Barrau and Bonnabel 2017) in the
-order of a twist; the other errors are additive. Functions take one state; `vmap` makes batches.
+n̂ the vertical in estimated body axes, R_z a rotation about it; the other errors are additive. So δp
+and δv are in W, and δv is turned by the error of heading alone. Without a horizontal aid both grow
+without bound along the horizontal, while a depth gauge keeps their vertical parts near zero. An
+error whose axes tilt with the body's, such as exp([δp, δθ]) or δv in body axes, mixes the two by
+the error of tilt, a product that a filter linear in δ neglects: the depth gauge then seems to
+measure horizontal velocity. What no sensor observes stays so for all estimates (Huang et al. 2010):
+a heading that is wrong alone leaves the velocity in body axes, which a DVL measures.
+
+`body_axes` expresses δ as [δp, δθ, δv] in body axes, in which covariances are given and shown.
+Functions take one state; `vmap` makes batches.
 """
 
 import math
@@ -64,9 +73,13 @@ class Increment(NamedTuple):
 
 def retract(nominal: Navigation, delta: Float[Array, "e"]) -> Navigation:
     """The state whose error relative to `nominal` is δ."""
+    X = se3.retract(nominal.X_WB, delta.at[POSITION].set(0)[POSE])
+    X = jnp.concatenate([X[:4], X[4:] + delta[POSITION]])
+    v_W = se3.rotate(nominal.X_WB, nominal.v_B) + delta[VELOCITY]
+    v_W = se3.rotate(_turn(_heading(nominal, delta[ROTATION])), v_W)
     return Navigation(
-        se3.retract(nominal.X_WB, delta[POSE]),
-        nominal.v_B + delta[VELOCITY],
+        X,
+        se3.rotate_inverse(X, v_W),
         nominal.gyro_bias + delta[GYRO_BIAS],
         nominal.accel_bias + delta[ACCEL_BIAS],
         nominal.sensors + delta[SENSORS],
@@ -75,8 +88,70 @@ def retract(nominal: Navigation, delta: Float[Array, "e"]) -> Navigation:
 
 def error(nominal: Navigation, true: Navigation) -> Float[Array, "e"]:
     """The δ for which `retract(nominal, δ)` is `true`."""
-    rest = [a - b for a, b in zip(true[1:], nominal[1:], strict=True)]
-    return jnp.concatenate([se3.local(nominal.X_WB, true.X_WB), *rest])
+    turned = se3.local(nominal.X_WB, true.X_WB)[ROTATION]
+    v_W = se3.rotate(true.X_WB, true.v_B)
+    v_W = se3.rotate_inverse(_turn(_heading(nominal, turned)), v_W)
+    rest = [a - b for a, b in zip(true[2:], nominal[2:], strict=True)]
+    return jnp.concatenate(
+        [
+            true.X_WB[4:] - nominal.X_WB[4:],
+            turned,
+            v_W - se3.rotate(nominal.X_WB, nominal.v_B),
+            *rest,
+        ]
+    )
+
+
+def _heading(x: Navigation, turned: Float[Array, "3"]) -> Float[Array, ""]:
+    """Error of heading due to a δθ, its part about the estimated vertical (rad)."""
+    return se3.rotate(x.X_WB, turned)[2]
+
+
+def _turn(angle: Float[Array, ""]) -> Float[Array, "7"]:
+    """A rotation about the vertical by an angle (rad)."""
+    return se3.exp(jnp.zeros(6, angle.dtype).at[5].set(angle))
+
+
+def body_axes(x: Navigation) -> tuple[Float[Array, "e e"], Float[Array, "e e"]]:
+    """C and C⁻¹ with δ_B = C δ: p_WB = p̂_WB + R̂_WB δp_B and v_B = v̂_B + δv_B to first order."""
+    R = se3.rotation_matrix(x.X_WB)
+    eye = jnp.eye(3, dtype=R.dtype)
+    tilting = skew(x.v_B) @ (eye - jnp.outer(R[2], R[2]))
+    C = jnp.eye(INERTIAL + x.sensors.size, dtype=R.dtype)
+    C, C_inverse = (
+        C.at[POSITION, POSITION].set(turn).at[VELOCITY, VELOCITY].set(turn) for turn in (R.T, R)
+    )
+    C = C.at[VELOCITY, ROTATION].set(tilting)
+    return C, C_inverse.at[VELOCITY, ROTATION].set(-R @ tilting)
+
+
+def in_body_axes(P: Float[Array, "e e"], x: Navigation) -> Float[Array, "e e"]:
+    """The covariance of δ_B, of that of δ."""
+    C = body_axes(x)[0]
+    return C @ P @ C.T
+
+
+def of_body_axes(P: Float[Array, "e e"], x: Navigation) -> Float[Array, "e e"]:
+    """The covariance of δ, of that of δ_B."""
+    C_inverse = body_axes(x)[1]
+    return C_inverse @ P @ C_inverse.T
+
+
+def moved(nominal: Navigation, delta: Float[Array, "e"]) -> Float[Array, "e e"]:
+    """Γ, which takes the covariance about `nominal` to that about `retract(nominal, delta)`.
+
+    It is the derivative of the error to the latter in that to the former, at δ, but for squares of
+    the correction.
+    """
+    by = -skew(delta[ROTATION]) / 2
+    up_B = se3.rotate_inverse(nominal.X_WB, jnp.zeros(3, by.dtype).at[2].set(1))
+    turn = _turn(_heading(nominal, delta[ROTATION]))
+    v_W = se3.rotate(nominal.X_WB, nominal.v_B) + delta[VELOCITY]
+    around = jnp.stack([-v_W[1], v_W[0], jnp.zeros_like(v_W[0])])
+    gamma = jnp.eye(delta.size, dtype=delta.dtype)
+    gamma = gamma.at[ROTATION, ROTATION].add(by)
+    gamma = gamma.at[VELOCITY, VELOCITY].set(se3.rotation_matrix(turn))
+    return gamma.at[VELOCITY, ROTATION].set(jnp.outer(around, up_B @ by))
 
 
 def sample_increment(
@@ -163,12 +238,33 @@ def transition(
     aids: Sequence[Sensor],
     unmeasured: Unmeasured | None = None,
     factor: float | Float[Array, ""] = 1.0,
+    between: tuple[Float[Array, "3 3"], Float[Array, "3 3"]] | None = None,
 ) -> tuple[Float[Array, "e e"], Float[Array, "e e"]]:
     """F and Q of δ⁺ = F δ + noise over one sample (bias-free `force`, `rate`), first order in δ.
 
-    `factor` is that on the variances of the IMU's white noise.
+    `factor` is that on the variances of the IMU's white noise; `between` are the covariances of
+    angle and velocity due to motion between samples, in body axes.
+    """
+    F, Q = _transition_of_body_axes(before, after, force, rate, time, imu, aids, unmeasured, factor)
+    if between is not None:
+        Q = Q.at[ROTATION, ROTATION].add(between[0]).at[VELOCITY, VELOCITY].add(between[1])
+    return body_axes(after)[1] @ F @ body_axes(before)[0], of_body_axes(Q, after)
 
-    With φ = rate · time, A = exp(φ)ᵀ and J = J_r(φ):
+
+def _transition_of_body_axes(
+    before: Navigation,
+    after: Navigation,
+    force: Float[Array, "3"],
+    rate: Float[Array, "3"],
+    time: Float[Array, ""],
+    imu: Imu,
+    aids: Sequence[Sensor],
+    unmeasured: Unmeasured | None,
+    factor: float | Float[Array, ""],
+) -> tuple[Float[Array, "e e"], Float[Array, "e e"]]:
+    """F and Q of δ_B.
+
+    With A = R_WB⁺ᵀ R_WB, φ = rate · time and J = J_r(φ):
 
         δθ⁺ = A δθ − T J δb_g
         δv⁺ = A δv − T (A v)^ J δb_g + T g_B⁺^ δθ⁺ − T δb_a
@@ -184,9 +280,8 @@ def transition(
     zero = jnp.zeros_like(eye)
     T = time
     W = skew(rate * T)
-    W2 = W @ W
-    A = eye - W + W2 / 2 - W @ W2 / 6  # exp(φ)ᵀ; the remainder is |φ|⁴/24
-    J = eye - W / 2 + W2 / 6
+    J = eye - W / 2 + W @ W / 6
+    A = se3.rotation_matrix(after.X_WB).T @ se3.rotation_matrix(before.X_WB)
     g_B = se3.rotate_inverse(after.X_WB, _gravity(after.X_WB, imu.gravity))
     G, H = T * skew(g_B), -(T * T / 2) * skew(force)
     C_v = -(1 - m) * (skew(A @ before.v_B) + G) @ J
@@ -210,7 +305,8 @@ def transition(
     s_g = factor * imu.gyroscope_density**2 / 2
     s_a = factor * imu.accelerometer_density**2 / 2
     Q = (s_g * T + of_angle) * (N_g @ N_g.T) + (s_a * T + of_velocity) * (N_a @ N_a.T)
-    return F, Q + _moments(s_g, s_a, g_B, T, Q.shape[0]) + jnp.diag(_walks(imu, aids, rho, T))
+    Q = Q + _moments(s_g, s_a, g_B, T, Q.shape[0]) + jnp.diag(_walks(imu, aids, rho, T))
+    return F, Q
 
 
 def _moments(
@@ -249,7 +345,7 @@ def foreseen_covariance(
     ahead: float | Float[Array, ""],
     size: int,
 ) -> Float[Array, "e e"]:
-    """Covariance due to the error of a predicted mean force and rate over `ahead` (s).
+    """Covariance, in body axes, due to the error of a predicted mean force and rate (s `ahead`).
 
     `steps` is the mean square of the errors of [force, rate].
     """

@@ -83,14 +83,14 @@ class Samples(NamedTuple):
         return jnp.concatenate([jnp.sum(self.forces, axis=0) / known, self.rates[-1]])
 
     def interpolation(self, T: float) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"]]:
-        """Covariances of angle and velocity, interpolated over a period T of point samples.
+        """Covariances per second of angle and velocity, interpolated between point samples.
 
         Between two known values a Brownian rate of density σ² has an integral of variance
         σ² T³ / 12, and second differences of variance 2 σ² T. Independent forces of variance s²
         have second differences of variance 6 s² and add a variance of at most s² T² to velocity.
-        Second differences of smooth motion are near zero.
+        Second differences of smooth motion are near zero. T is the period of the samples.
         """
-        return self.bends[3:, 3:] * T**2 / 24, self.bends[:3, :3] * T**2 / 6
+        return self.bends[3:, 3:] * T / 24, self.bends[:3, :3] * T / 6
 
     def rate_covariance(self, integrating: bool) -> Float[Array, "3 3"]:
         """Covariance of the rate at a sample's end, taken as the mean of the rows before and after.

@@ -9,7 +9,16 @@ from jaxtyping import Array, Bool, Float
 
 from ...models import se3
 from ...models.sensors import Sensor
-from .error_state import GYRO_BIAS, INERTIAL, POSE, VELOCITY, Navigation, retract
+from .error_state import (
+    GYRO_BIAS,
+    INERTIAL,
+    POSE,
+    VELOCITY,
+    Navigation,
+    body_axes,
+    moved,
+    retract,
+)
 
 
 class Innovation(NamedTuple):
@@ -42,6 +51,7 @@ def innovation(
         H = H.at[:, GYRO_BIAS].set(-found.rate)
     if found.slow is not None:
         H = H.at[:, INERTIAL + number].set(found.slow)
+    H = H @ body_axes(nominal)[0]
     R = jnp.diag(jnp.asarray([std**2 for std in sensor.noise_std], V.dtype))
     if found.rate is not None:
         R = R + found.rate @ rate_covariance @ found.rate.T
@@ -128,7 +138,7 @@ def update(
 
     NIS = rᵀ S⁻¹ r with S = H P Hᵀ + R is chi-square with m degrees of freedom (Bar-Shalom et al.
     2001, section 5.4). The covariance takes Joseph's form (I − K H) P (I − K H)ᵀ + K R Kᵀ and
-    moves to the corrected state with Γ = I − ½ ad(δ) on the pose's error.
+    moves to the corrected state (`error_state.moved`).
     """
     r, H, R = together(found)
     PH = P @ H.T
@@ -143,7 +153,7 @@ def update(
     K = jnp.where(mark[None], PH @ jnp.where(both, S_inverse, 0), 0)
     delta = K @ jnp.where(mark, r, 0)
     eye = jnp.eye(P.shape[0], dtype=P.dtype)
-    gamma = eye.at[POSE, POSE].add(-se3.ad(delta[POSE]) / 2)
+    gamma = moved(nominal, delta)
     L = gamma @ (eye - K @ H)
     GK = gamma @ K
     P = L @ P @ L.T + GK @ R @ GK.T

@@ -45,6 +45,7 @@ def levelled(
     H = jnp.zeros((3, P.shape[0]), P.dtype)
     H = H.at[:, error_state.ROTATION].set(error_state.skew(up_B))
     H = H.at[:, error_state.VELOCITY].set(error_state.skew(omega))
+    H = H @ error_state.body_axes(x)[0]
     uncertain = jnp.max(jnp.diag(H @ P @ H.T)) > 4 * usual
 
     def level() -> tuple[Navigation, Array, Array]:

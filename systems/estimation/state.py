@@ -13,6 +13,9 @@ from .error_state import Navigation
 from .inertial import Motion, Samples
 from .trust import Shown, Trust
 
+SUMS = 10
+"""Components of `FilterState.since`."""
+
 
 class FilterState(NamedTuple):
     """The filter's state."""
@@ -20,9 +23,11 @@ class FilterState(NamedTuple):
     nominal: Navigation
     P: Float[Array, "e e"]
     ring: Float[Array, "slots row"]
-    since: Float[Array, "13"]
+    since: Float[Array, "10"]
     """Since the time of P: elapsed time, sums of force · dt and rate · dt, time without force,
-    variances due to missing forces and rates; and v_B at the time of P."""
+    variances due to missing forces and rates."""
+    before: Navigation
+    """The nominal state at the time of P."""
     samples: Samples
     motion: Motion
     shown: Shown

@@ -38,8 +38,8 @@ class SafetyConfig:
             autopilot's position; the velocity or position aid of a filter that tells no health.
         dead_reckoning: longest time for which a filter that tells its health bridges the lack of a
             velocity or position aid (s). With the shipped sensors σ of the position grows by 0.2 m
-            in 6 s and by 0.5 to 0.7 m in 10 s; the errors are within 2 σ until 12 s and beyond that
-            they are not (`tests/test_dead_reckoning.py`).
+            in 6 s and by 0.5 to 0.7 m in 10 s; the covariance covers the errors for as long as the
+            aid is missing (`tests/test_dead_reckoning.py`).
         plan_age: longest age of the plan that is followed (s).
         late: longest time by which the loop may be late (s): the computer is too busy.
         lost: longest time for which the estimator may be lost (s): its velocity or its attitude is

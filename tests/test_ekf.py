@@ -161,7 +161,7 @@ def test_the_initial_error_is_drawn_from_the_noise_port():
 
 
 def test_impossible_settings_are_refused():
-    with pytest.raises(ValueError, match="does not divide"):
+    with pytest.raises(UserError, match="give a rate that divides the IMU's 100 Hz"):
         Ekf(config=EkfConfig(output_rate=30.0))
     with pytest.raises(UserError, match=r"EkfConfig\.horizon.*0\.22 s"):
         Ekf(config=EkfConfig(horizon=0.1))

@@ -12,6 +12,7 @@ from pydrake.common import RandomDistribution
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from ...models import se3
+from ...models.config.checks import require
 from ...models.config.errors import UserError
 from ...models.sensors import SHIPPED, Imu, Sensor
 from ..compiled.jit import VectorFunction
@@ -84,10 +85,9 @@ def _filter(
         )
     core = DelayedFilter(imu, tuple(aids.values()), config)
     ratio = imu.rate / config.output_rate
-    if abs(ratio - round(ratio)) > 1e-6 or ratio < 1 - 1e-6:
-        raise ValueError(
-            f"output_rate {config.output_rate} Hz does not divide the IMU's {imu.rate} Hz"
-        )
+    divides = abs(ratio - round(ratio)) < 1e-6 and ratio > 1 - 1e-6
+    remedy = f"give a rate that divides the IMU's {imu.rate:g} Hz, or change that"
+    require(divides, config, "output_rate", remedy)
     return core, aids
 
 
@@ -136,7 +136,9 @@ class Ekf(LeafSystem):
         """Expect the given sensors by their ports' names and start at `X0_WB`, `V0_WB_B`.
 
         Raises:
-            ValueError: the start is not a state, or the output rate does not divide the IMU's rate.
+            ValueError: the start is not a state.
+            UserError: the output rate does not divide the IMU's rate, or the horizon is shorter
+                than a reading is late.
             UserError: the horizon is shorter than a sensor's latency, there is no IMU, or nothing
                 to fuse with it.
         """

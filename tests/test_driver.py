@@ -276,19 +276,45 @@ def test_a_vehicle_that_a_pilot_takes_before_arming_is_left_alone(
 
 
 @pytest.mark.slow
+def test_a_vehicle_that_boots_before_arming_is_not_armed(
+    served: Served, port: int, monkeypatch: pytest.MonkeyPatch
+):
+    """It has lost its mode, its rates and what it knew of its own state."""
+    with connect(port) as driver:
+        borrow = driver._borrowed.borrow
+
+        def booting(*given) -> None:
+            borrow(*given)
+            driver._ask(246, 1.0)
+            assert until(lambda: driver.link.clock.reboots > 0)
+            commands.set_mode(driver.link, "MANUAL")
+
+        monkeypatch.setattr(driver._borrowed, "borrow", booting)
+        with pytest.raises(commands.VehicleRefused, match="booted anew since its checks"):
+            driver.prepare()
+    assert not served.simulation.vehicle.autopilot.armed
+    assert served.simulation.vehicle.parameters["FS_PILOT_TIMEOUT"] == 3.0, "given back"
+    with connect(port) as driver:
+        assert until(lambda: all(found.passed for found in driver.preflight()), 30.0)
+        driver.prepare()
+        assert fly(driver, WRENCHES[0], 0.5).order == "fly"
+    check_at_rest(port)
+
+
+@pytest.mark.slow
 def test_an_armed_vehicle_keeps_what_a_former_run_has_left(served: Served, port: int):
     """Its thrusters run: nobody changes what their outputs do."""
     with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
         number = commands.identity(link).serial_number
         file = borrowed_file(Connection.parse(f"tcp:127.0.0.1:{port}"), number)
-        Borrowed(Parameters(link), file).borrow({"FS_PILOT_TIMEOUT": 0.5})
+        Borrowed(Parameters(link), file).borrow({"FS_PILOT_TIMEOUT": 60.0})
         commands.arm(link)
     values = served.simulation.vehicle.parameters
     with connect(port) as driver:
         found = {finding.name: finding for finding in driver.preflight()}
         assert not found["disarmed"].passed
         assert not found["outputs"].passed
-        assert values["FS_PILOT_TIMEOUT"] == 0.5
+        assert values["FS_PILOT_TIMEOUT"] == 60.0
         commands.disarm(driver.link)
         found = {finding.name: finding for finding in driver.preflight()}
         assert found["disarmed"].passed

@@ -213,7 +213,14 @@ class Driver:
             raise
 
     def _check_untouched(self, armed: bool) -> None:
-        """Check that nobody has taken the vehicle; it is left alone unless we have armed it."""
+        """Check that the vehicle is the one that was checked, and that nobody has taken it.
+
+        One that was taken is left alone unless we have armed it.
+        """
+        if self.link.clock.reboots != self._boots:
+            raise commands.VehicleRefused(
+                "arming: the vehicle has booted anew since its checks; start the run again"
+            )
         status = self._seen()
         other = "" if status.mode == _FLY else f"the mode was changed to {status.mode}"
         if status.armed and not armed:

@@ -233,38 +233,19 @@ def transition(
     after: Navigation,
     force: Float[Array, "3"],
     rate: Float[Array, "3"],
-    time: Float[Array, ""],
+    T: Float[Array, ""],
     imu: Imu,
     aids: Sequence[Sensor],
     unmeasured: Unmeasured | None = None,
     factor: float | Float[Array, ""] = 1.0,
     between: tuple[Float[Array, "3 3"], Float[Array, "3 3"]] | None = None,
 ) -> tuple[Float[Array, "e e"], Float[Array, "e e"]]:
-    """F and Q of δ⁺ = F δ + noise over one sample (bias-free `force`, `rate`), first order in δ.
+    """F and Q of δ⁺ = F δ + noise over T (s) of a bias-free `force` and `rate`, first order in δ.
 
     `factor` is that on the variances of the IMU's white noise; `between` are the covariances of
     angle and velocity due to motion between samples, in body axes.
-    """
-    F, Q = _transition_of_body_axes(before, after, force, rate, time, imu, aids, unmeasured, factor)
-    if between is not None:
-        Q = Q.at[ROTATION, ROTATION].add(between[0]).at[VELOCITY, VELOCITY].add(between[1])
-    return body_axes(after)[1] @ F @ body_axes(before)[0], of_body_axes(Q, after)
 
-
-def _transition_of_body_axes(
-    before: Navigation,
-    after: Navigation,
-    force: Float[Array, "3"],
-    rate: Float[Array, "3"],
-    time: Float[Array, ""],
-    imu: Imu,
-    aids: Sequence[Sensor],
-    unmeasured: Unmeasured | None,
-    factor: float | Float[Array, ""],
-) -> tuple[Float[Array, "e e"], Float[Array, "e e"]]:
-    """F and Q of δ_B.
-
-    With A = R_WB⁺ᵀ R_WB, φ = rate · time and J = J_r(φ):
+    In `body_axes`, with A = R_WB⁺ᵀ R_WB, φ = rate · T and J = J_r(φ):
 
         δθ⁺ = A δθ − T J δb_g
         δv⁺ = A δv − T (A v)^ J δb_g + T g_B⁺^ δθ⁺ − T δb_a
@@ -274,11 +255,9 @@ def _transition_of_body_axes(
     Readings of velocity then tell nothing of the attitude.
     """
     eye = jnp.eye(3, dtype=force.dtype)
-    nothing = jnp.zeros_like(time)
-    held, of_velocity, of_angle = unmeasured or (nothing, nothing, nothing)
-    m = jnp.clip(held / jnp.maximum(time, 1e-9), 0, 1)
+    held, of_velocity, of_angle = unmeasured or jnp.zeros(3, T.dtype)
+    m = jnp.clip(held / jnp.maximum(T, 1e-9), 0, 1)
     zero = jnp.zeros_like(eye)
-    T = time
     W = skew(rate * T)
     J = eye - W / 2 + W @ W / 6
     A = se3.rotation_matrix(after.X_WB).T @ se3.rotation_matrix(before.X_WB)
@@ -302,25 +281,31 @@ def _transition_of_body_axes(
     rest = jnp.zeros((6 + len(aids), 3), force.dtype)
     N_g = jnp.concatenate([C_p, -J, C_v, rest])
     N_a = jnp.concatenate([-(T / 2) * eye, zero, -eye, rest])
-    s_g = factor * imu.gyroscope_density**2 / 2
-    s_a = factor * imu.accelerometer_density**2 / 2
+    s_g, s_a = (factor * x**2 / 2 for x in (imu.gyroscope_density, imu.accelerometer_density))
     Q = (s_g * T + of_angle) * (N_g @ N_g.T) + (s_a * T + of_velocity) * (N_a @ N_a.T)
-    Q = Q + _moments(s_g, s_a, g_B, T, Q.shape[0]) + jnp.diag(_walks(imu, aids, rho, T))
-    return F, Q
+    Q = _with_moments(Q, s_g, s_a, g_B, T, between) + jnp.diag(_walks(imu, aids, rho, T))
+    return body_axes(after)[1] @ F @ body_axes(before)[0], of_body_axes(Q, after)
 
 
-def _moments(
-    s_g: float | Array, s_a: float | Array, g_B: Float[Array, "3"], time: Array, size: int
+def _with_moments(
+    Q: Float[Array, "e e"],
+    s_g: float | Array,
+    s_a: float | Array,
+    g_B: Float[Array, "3"],
+    time: Array,
+    between: tuple[Float[Array, "3 3"], Float[Array, "3 3"]] | None,
 ) -> Float[Array, "e e"]:
-    """What the first moments of white noise over a time (s) add to Q.
+    """Q with the first moments of white noise over a time (s), and with motion `between` samples.
 
     The noise has a mean and an independent first moment of variance T³ / 12. The moment adds to
     position through the accelerometer and to velocity through the gyroscope and gravity.
     """
     moment = time**3 / 12
-    Q = jnp.zeros((size, size), g_B.dtype)
-    Q = Q.at[POSITION, POSITION].set(s_a * moment * jnp.eye(3, dtype=g_B.dtype))
-    return Q.at[VELOCITY, VELOCITY].set(s_g * moment * (skew(g_B) @ skew(g_B).T))
+    Q = Q.at[POSITION, POSITION].add(s_a * moment * jnp.eye(3, dtype=g_B.dtype))
+    Q = Q.at[VELOCITY, VELOCITY].add(s_g * moment * (skew(g_B) @ skew(g_B).T))
+    if between is None:
+        return Q
+    return Q.at[ROTATION, ROTATION].add(between[0]).at[VELOCITY, VELOCITY].add(between[1])
 
 
 def _walks(

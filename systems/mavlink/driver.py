@@ -213,14 +213,10 @@ class Driver:
             raise
 
     def _check_untouched(self, armed: bool) -> None:
-        """Check that the vehicle is the one that was checked, and that nobody has taken it.
-
-        One that was taken is left alone unless we have armed it.
-        """
+        """Check that nobody has taken the vehicle, which is left alone then unless we armed it."""
         if self.link.clock.reboots != self._boots:
-            raise commands.VehicleRefused(
-                "arming: the vehicle has booted anew since its checks; start the run again"
-            )
+            again = "the vehicle has booted anew since its checks; start the run again"
+            raise commands.VehicleRefused(f"arming: {again}")
         status = self._seen()
         other = "" if status.mode == _FLY else f"the mode was changed to {status.mode}"
         if status.armed and not armed:

@@ -203,8 +203,7 @@ class DelayedFilter(eqx.Module):
 
         Returns the number of that slot, or n.
         """
-        n, h, dtype = slots.shape[0], self.period, slots.dtype
-        order = jnp.arange(n, dtype=dtype)
+        n, h, order = slots.shape[0], self.period, jnp.arange(len(slots), dtype=slots.dtype)
         ahead = order >= first
         due = ahead & jnp.any(slots[:, self.flags] > 0, axis=1)
         late = state.since[0] + h * jnp.sum(jnp.where(ahead, slots[:, 0], 0)) > _LONGEST - h / 2
@@ -395,6 +394,7 @@ class DelayedFilter(eqx.Module):
         beyond = error_state.sample_increment(foreseen[:3], rate, ahead * ring[-1, 0])
         now = error_state.apply(now, beyond, self.imu.gravity)
         suspect = state.trust.suspect((state.samples.count - 1 - self.slots) * self.period)
-        P = error_state.in_body_axes(with_doubt(P, state.trust.pulled, suspect), now)
+        P, pulled = error_state.in_body_axes(now, P, state.trust.pulled)
         P = P + error_state.foreseen_covariance(state.samples.steps, now.v_B, ahead, self.errors)
+        P = with_doubt(P, pulled, suspect)
         return now.X_WB, jnp.concatenate([now.v_B, rate]), (P + P.T) / 2

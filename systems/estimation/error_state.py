@@ -125,10 +125,12 @@ def body_axes(x: Navigation) -> tuple[Float[Array, "e e"], Float[Array, "e e"]]:
     return C, C_inverse.at[VELOCITY, ROTATION].set(-R @ tilting)
 
 
-def in_body_axes(P: Float[Array, "e e"], x: Navigation) -> Float[Array, "e e"]:
-    """The covariance of δ_B, of that of δ."""
+def in_body_axes(
+    x: Navigation, P: Float[Array, "e e"], errors: Float[Array, "n e"]
+) -> tuple[Float[Array, "e e"], Float[Array, "n e"]]:
+    """The covariance and the rows of errors of δ_B, of those of δ."""
     C = body_axes(x)[0]
-    return C @ P @ C.T
+    return C @ P @ C.T, errors @ C.T
 
 
 def of_body_axes(P: Float[Array, "e e"], x: Navigation) -> Float[Array, "e e"]:

@@ -35,6 +35,7 @@ from .finding import Finding
 from .heading import heading_offset, mirrored_plane
 from .held_outputs import held_column, held_throughout
 from .hypotheses import ALL, CAUSAL, EVIDENCE, MOST, PLAUSIBLE, Driven, named
+from .lengths import length_findings
 from .response import LAGS_S, AxisResponse, responses
 
 _HARDLY, _SURE = 10.0, 0.9
@@ -99,7 +100,8 @@ def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Find
     unanswered = [i for i in driven.axes if _unanswered(data, i)]
     if unanswered and not any(_answered(data, i) for i in driven.axes):
         return [no_answer(data, unanswered)]
-    return [silent(data, i) for i in unanswered] + _lags(driven)
+    told = [silent(data, i) for i in unanswered] + _lags(driven)
+    return told + length_findings(driven, vehicle)
 
 
 def _strong(forces: np.ndarray, vehicle: Vehicle) -> tuple[int, ...]:

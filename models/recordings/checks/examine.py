@@ -14,7 +14,7 @@ from .commands import command_findings
 from .finding import Finding, check_accepted, enforce, findings_of, with_findings
 from .held_outputs import all_held
 from .small_speeds import dead_zones
-from .velocity import held_finding, lag_findings, unmeasured, zone_finding
+from .velocity import FASTEST, held_finding, lag_findings, unmeasured, zone_finding
 
 _SHORTEST_S = 1.0
 """A shorter piece beside a cut is left out too."""
@@ -35,12 +35,21 @@ def examine(
         UserError: for severe findings that are not accepted, or if nothing is left.
     """
     check_accepted(accept)
+    enforce(source, _in_other_lengths(recording, vehicle), accept)
     recording, cut = _without_unmeasured(recording, source)
     recording, held = _without_held(recording, vehicle, source)
     found = [*findings_of(recording.dataset), *cut, *held, *lag_findings(recording)]
     found += command_findings(recording, vehicle)
     enforce(source, found, accept)
     return type(recording)(with_findings(recording.dataset, found))
+
+
+def _in_other_lengths(recording: Recording, vehicle: Vehicle | None) -> list[Finding]:
+    """Velocities too fast for a vehicle that the commands explain in another unit: no failure."""
+    speeds = np.abs(recording.dataset["V_WB_B"].to_numpy()[..., :3])
+    if not np.nanmax(speeds, initial=0.0) > FASTEST:
+        return []
+    return [f for f in command_findings(recording, vehicle) if f.word == "length-unit"]
 
 
 def _without_unmeasured(recording: Recording, source: str) -> tuple[Recording, list[Finding]]:

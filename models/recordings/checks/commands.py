@@ -33,14 +33,12 @@ from .command_words import (
 )
 from .finding import Finding
 from .heading import heading_offset, mirrored_plane
-from .held_outputs import held_column, held_throughout
-from .hypotheses import ALL, CAUSAL, EVIDENCE, MOST, PLAUSIBLE, Driven, named
+from .held_columns import held_column
+from .held_outputs import held_throughout
+from .hypotheses import ALL, CAUSAL, EVIDENCE, MOST, PLAUSIBLE, Driven, driven_by, named
 from .lengths import length_findings
-from .response import LAGS_S, AxisResponse, responses
+from .response import LAGS_S, responses
 
-_HARDLY, _SURE = 10.0, 0.9
-"""Commanded force over the force that the motion shows, above which no vehicle's numbers explain
-it; the largest share of a force that a command is expected to make up."""
 _DEAD = 0.15
 _STRONG = 0.04
 """Share of a thruster's largest thrust: that of a fifth of its command, 80 µs, if thrust is
@@ -76,7 +74,7 @@ def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Find
         for i, r in responses(recording, forces, recording.command_period).items()
         if r.count >= _LEAST_COUNT
     }
-    data = _data(axes, weights, names, vehicle)
+    data = driven_by(axes, weights, names, vehicle)
     judged = () if vehicle is None else _strong(forces[mask], vehicle)
     data = replace(data, outputs=outputs_of(recording.dataset), judged=judged)
     # an axis without a command tells nothing of the order of columns
@@ -97,8 +95,8 @@ def command_findings(recording: Recording, vehicle: Vehicle | None) -> list[Find
         found = [mirrored(mirror[1])]
     if found:
         return found
-    unanswered = [i for i in driven.axes if _unanswered(data, i)]
-    if unanswered and not any(_answered(data, i) for i in driven.axes):
+    unanswered = [i for i in driven.axes if data.unanswered(i)]
+    if unanswered and not any(data.answered(i) for i in driven.axes):
         return [no_answer(data, unanswered)]
     told = [silent(data, i) for i in unanswered] + _lags(driven)
     return told + length_findings(driven, vehicle)
@@ -114,53 +112,6 @@ def _strong(forces: np.ndarray, vehicle: Vehicle) -> tuple[int, ...]:
         return ()
     often = np.percentile(np.abs(forces), 95, axis=0)
     return tuple(np.flatnonzero(often > _STRONG * np.minimum(-low, high)).tolist())
-
-
-def _data(
-    axes: dict[int, AxisResponse],
-    weights: np.ndarray,
-    names: tuple[str, ...],
-    vehicle: Vehicle | None,
-) -> Driven:
-    zero = int(np.argmin(np.abs(LAGS_S)))
-    given, needed, masses = {}, {}, {}
-    for i, r in axes.items():
-        given[i] = float(np.sqrt(max(weights[i] @ r.CC[zero] @ weights[i], 0.0) / r.windows))
-        if given[i] < 1e-6:  # what rounding leaves of an axis that thrusters can't actuate
-            given[i] = 0.0
-        if vehicle is None:
-            needed[i], masses[i] = np.inf, 0.0
-            continue
-        rigid = (vehicle.mass,) * 3 + vehicle.inertia
-        c = np.array([
-            rigid[i] + vehicle.added_mass[i],
-            vehicle.linear_damping[i],
-            vehicle.quadratic_damping[i],
-        ])  # fmt: skip
-        masses[i] = float(c[0])
-        needed[i] = float(np.sqrt(max(c @ r.RR @ c, 0.0) / r.windows))
-    return Driven(axes, weights, names, needed, given, masses)
-
-
-def _nats(data: Driven, axis: int) -> float:
-    """Evidence for any relation of an axis' motion to its command, of either sign and any lag."""
-    r = data.axes[axis]
-    shares = [r.fit(s * data.weights[axis], lag)[0] for lag in ALL for s in (1, -1)]
-    return float(-0.5 * r.count * np.log1p(-np.max(shares)))
-
-
-def _answered(data: Driven, axis: int) -> bool:
-    return _nats(data, axis) > EVIDENCE and data.given[axis] < _HARDLY * data.needed[axis]
-
-
-def _unanswered(data: Driven, axis: int) -> bool:
-    """Whether the motion of an axis follows its command not at all, or hardly.
-
-    Of a command that makes up a share ρ² of the force shown, n windows give -n/2 log(1 - ρ²) nats.
-    """
-    times = data.given[axis] / max(data.needed[axis], 1e-12)
-    expected = -0.5 * data.axes[axis].count * np.log1p(-min(times**2, _SURE))
-    return times > _HARDLY or bool(expected > 3 * EVIDENCE and _nats(data, axis) < EVIDENCE)
 
 
 def _orders(data: Driven, wrench: bool) -> tuple[float, list[Finding]]:

@@ -7,6 +7,7 @@ import numpy as np
 from ...config.errors import UserError
 from ...vehicles.vehicle import Vehicle
 from ..build import Trajectory
+from ..pieces import good_pieces
 from ..schema import UNEVEN
 from ..store import Recording
 from .columns import columns_of
@@ -15,9 +16,6 @@ from .finding import Finding, check_accepted, enforce, findings_of, with_finding
 from .held_outputs import all_held
 from .small_speeds import dead_zones
 from .velocity import FASTEST, held_finding, lag_findings, unmeasured, zone_finding
-
-_SHORTEST_S = 1.0
-"""A shorter piece beside a cut is left out too."""
 
 
 def examine(
@@ -105,24 +103,3 @@ def _of_pieces(
         raise UserError(f"{source}: {found[-1]} Nothing is left of it")
     kept = Recording.from_trajectories(pieces, recording.dt)
     return Recording(kept.dataset.assign_attrs(recording.dataset.attrs))
-
-
-def good_pieces(run: Trajectory, t: np.ndarray, good: np.ndarray) -> list[Trajectory]:
-    """The stretches of good samples that are not too short."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]])))
-    found = []
-    for a, b in edges.reshape(-1, 2).tolist():
-        if t[b - 1] - t[a] < _SHORTEST_S:
-            continue
-        part = slice(a, b)
-        found.append(
-            Trajectory(
-                run.scenario,
-                run.X_WB[part],
-                run.V_WB_B[part],
-                {name: values[part] for name, values in run.commands.items()},
-                {name: values[part] for name, values in run.sensors.items()},
-                run.start + float(t[a] - t[0]),
-            )
-        )
-    return found

@@ -37,6 +37,7 @@ WORDS: dict[str, tuple[Severity, str]] = {
     "messages-unreadable": ("cut", "messages of a bag can't be read"),
     "frame-changes": ("cut", "messages of a topic are in another frame than the others"),
     "output-direction": ("cut", "a thruster's direction or output was changed in mid-log"),
+    "clock-order": ("cut", "times of records of a log run back or jump"),
     "output-reversed": ("note", "an output is turned by SERVOn_REVERSED"),
     "thruster-dead": ("note", "a thruster has no effect"),
     "axis-silent": ("note", "an axis does not answer its command"),

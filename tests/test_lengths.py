@@ -30,7 +30,9 @@ def in_unit(recording: Recording, size: float) -> Recording:
     return changed(moved, "V_WB_B", lambda V: V * np.where(np.arange(6) < 3, 1 / size, 1.0))
 
 
-@pytest.mark.parametrize("unit", LENGTHS)
+@pytest.mark.parametrize(
+    "unit", ["feet", "cm", *(pytest.param(u, marks=pytest.mark.slow) for u in ("inches", "mm"))]
+)
 @pytest.mark.parametrize("vehicle", [HEAVY, pytest.param(SITL, marks=pytest.mark.slow)])
 def test_all_lengths_in_another_unit(dive, unit, vehicle):
     """Also with numbers of a vehicle that is three times as heavy: thrust then explains it too."""

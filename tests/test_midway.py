@@ -32,7 +32,7 @@ def exchanged(a, b, part):
     return change
 
 
-@pytest.mark.parametrize("late", [True, False])
+@pytest.mark.parametrize("late", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_channels_that_are_exchanged_in_a_part_are_named_with_the_time(dive, late):
     n = round(AFTER_S / dive.dt)
     part = slice(n, None) if late else slice(n)
@@ -45,6 +45,7 @@ def test_channels_that_are_exchanged_in_a_part_are_named_with_the_time(dive, lat
     assert "in this part of the record alone" in found.text
 
 
+@pytest.mark.slow
 def test_columns_of_a_wrench_that_are_exchanged_in_a_part(dive):
     wrench = as_wrench(dive, HEAVY)
     part = slice(round(AFTER_S / dive.dt), None)

@@ -13,6 +13,7 @@ from ..store import Recording
 from .columns import columns_of
 from .commands import command_findings
 from .finding import Finding, check_accepted, enforce, findings_of, with_findings
+from .flickers import flicker_finding, mended
 from .held_outputs import all_held
 from .small_speeds import dead_zones
 from .velocity import FASTEST, held_finding, lag_findings, unmeasured, zone_finding
@@ -34,9 +35,10 @@ def examine(
     """
     check_accepted(accept)
     enforce(source, _in_other_lengths(recording, vehicle), accept)
+    recording, mended_ = _without_flickers(recording)
     recording, cut = _without_unmeasured(recording, source)
     recording, held = _without_held(recording, vehicle, source)
-    found = [*findings_of(recording.dataset), *cut, *held, *lag_findings(recording)]
+    found = [*findings_of(recording.dataset), *mended_, *cut, *held, *lag_findings(recording)]
     found += command_findings(recording, vehicle)
     enforce(source, found, accept)
     return type(recording)(with_findings(recording.dataset, found))
@@ -48,6 +50,29 @@ def _in_other_lengths(recording: Recording, vehicle: Vehicle | None) -> list[Fin
     if not np.nanmax(speeds, initial=0.0) > FASTEST:
         return []
     return [f for f in command_findings(recording, vehicle) if f.word == "length-unit"]
+
+
+def _without_flickers(recording: Recording) -> tuple[Recording, list[Finding]]:
+    """The recording with single poses that lie elsewhere replaced."""
+    X, V = (recording.dataset[name].to_numpy() for name in ("X_WB", "V_WB_B"))
+    found: list[Finding] = []
+    for j, r in np.argwhere(recording.lengths > 1).tolist():
+        n, t = int(recording.lengths[j, r]), recording.elapsed(j, r)
+        whole = mended(t, X[j, r, :n].T, V[j, r, :n].T)
+        if whole is None:
+            continue
+        if not found:
+            X, V = X.copy(), V.copy()
+        X[j, r, :n], V[j, r, :n] = whole.X.T, whole.V.T
+        start = float(np.nan_to_num(recording.dataset["start_time"].to_numpy()[j, r]))
+        found.append(flicker_finding(str(recording.scenarios[j]), start + t[whole.bad]))
+    if not found:
+        return recording, []
+    changed = {
+        name: (recording.dataset[name].dims, values, recording.dataset[name].attrs)
+        for name, values in (("X_WB", X), ("V_WB_B", V))
+    }
+    return Recording(recording.dataset.assign(changed)), found
 
 
 def _without_unmeasured(recording: Recording, source: str) -> tuple[Recording, list[Finding]]:

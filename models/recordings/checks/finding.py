@@ -32,6 +32,7 @@ WORDS: dict[str, tuple[Severity, str]] = {
     "velocity-held": ("cut", "velocity stands still at a value while the vehicle moves"),
     "velocity-impossible": ("cut", "velocities that no underwater vehicle has"),
     "attitude-held": ("cut", "attitude or rates stand still while the rest of the motion goes on"),
+    "pose-flicker": ("cut", "single poses lie elsewhere than those before and after"),
     "sensor-left-out": ("cut", "readings of a sensor can't be right"),
     "dead-reckoning": ("cut", "the aid of the horizontal estimate stopped"),
     "messages-unreadable": ("cut", "messages of a bag can't be read"),

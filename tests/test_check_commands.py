@@ -6,8 +6,9 @@ from recordings_changed import as_wrench, changed
 
 from helpers import ROOT
 from spinndrift.models.recordings.build import Trajectory
-from spinndrift.models.recordings.checks.commands import command_findings, loses
+from spinndrift.models.recordings.checks.commands import command_findings
 from spinndrift.models.recordings.checks.hypotheses import Driven
+from spinndrift.models.recordings.checks.orders import loses
 from spinndrift.models.recordings.checks.response import LAGS_S, responses
 from spinndrift.models.recordings.outputs import with_outputs
 from spinndrift.models.recordings.resample import rotations

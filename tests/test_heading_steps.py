@@ -13,8 +13,8 @@ from hidden.write import write_folder
 from scipy.spatial.transform import Rotation
 
 from spinndrift.models.recordings.build import Trajectory
-from spinndrift.models.recordings.checks.examine import good_pieces
 from spinndrift.models.recordings.csv import read_csv
+from spinndrift.models.recordings.pieces import good_pieces
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.diagnosis.data.heading_steps import HeadingOff, in_words, turned_back

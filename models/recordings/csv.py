@@ -21,6 +21,7 @@ from ..frames import pose_to_enu, twist_frd_to_flu
 from ..se3 import TWIST, WRENCH, XYZ
 from .build import Trajectory
 from .checks.finding import Finding, with_findings
+from .checks.flickers import flicker_finding, mended
 from .csv_columns import METADATA, STATE, STEMS, checked_groups, unit_quaternions
 from .csv_runs import Run, as_recorded, common_step, cut, on_grid
 from .csv_table import Table, read_table
@@ -154,6 +155,9 @@ def _run(
         if "F_Bo_B" in commands:
             commands["F_Bo_B"] = twist_frd_to_flu(commands["F_Bo_B"])
     X[:4] = continuous(X[:4])
+    if meta.check and (whole := mended(t, X, V)) is not None:
+        X, V = whole.X, whole.V
+        findings.append(flicker_finding(table.path.name, t[whole.bad]))
     steady = steady_times(t, np.concatenate([X, V])) if meta.check else None
     if steady is not None and (np.diff(steady.t) > 0).all():
         t = steady.t

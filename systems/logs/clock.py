@@ -118,8 +118,10 @@ def in_words(starts: tuple[float, ...], steps: int) -> list[str]:
     return told
 
 
-def rate_findings(own: Float[np.ndarray, " n"], stamps: Float[np.ndarray, " n"]) -> list[Finding]:
-    """A clock that runs faster or slower than the one of the logger (both s)."""
+def rate_findings(
+    own: Float[np.ndarray, " n"], stamps: Float[np.ndarray, " n"], other: str = "the logger's"
+) -> list[Finding]:
+    """A clock that runs faster or slower than another one, by default the logger's (both s)."""
     edges = np.arange(own[0], own[-1], _PIECE_S)
     at = np.searchsorted(own, edges)
     apart, real = np.diff(own[at]), np.diff(stamps[at])
@@ -134,7 +136,7 @@ def rate_findings(own: Float[np.ndarray, " n"], stamps: Float[np.ndarray, " n"])
         Finding(
             "clock-rate",
             "",
-            f"the vehicle's clock runs {100 * abs(rate - 1):.0f} % {how} than the logger's, and "
+            f"the vehicle's clock runs {100 * abs(rate - 1):.0f} % {how} than {other}, and "
             "masses and drags depend on it: a simulator at another speed, or a faulty clock",
             "record in real time, or make sure that the vehicle's clock is the right one",
         )

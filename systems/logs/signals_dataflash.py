@@ -9,6 +9,7 @@ from ...models.config.errors import UserError
 from ...models.recordings.checks.finding import Finding
 from ...models.recordings.resample import linear
 from ..mavlink import codec
+from .clock_dataflash import gps_findings, ordered
 from .dataflash import BinLog
 from .depth import in_water
 from .frame import firmware_findings, frame_said
@@ -34,6 +35,7 @@ _FILTERS = {
 }
 """Records of EKF3 and EKF2 (AHRS_EKF_TYPE), also of versions that name each core's records, by
 today's names of EKF3."""
+_NAMES = {**_FILTERS[2], **_FILTERS[3]}
 WANTED = (
     "ACC",
     "ARM",
@@ -43,6 +45,7 @@ WANTED = (
     "BARO",
     "BAT",
     "EV",
+    "GPS",
     "GYR",
     "IMU",
     "MODE",
@@ -78,8 +81,7 @@ def signals_from_bin(
         UserError: if attitude, rates or thruster outputs are not in the log, or the vehicle is
             another.
     """
-    usable = {name: _usable(table) for name, table in log.tables.items()}
-    tables = one_filter({name: table for name, table in usable.items() if table["t"].size})
+    tables, clocks = _in_time(log.tables)
     core = _primary_core(tables)
     attitude = _attitude(tables, core)
     first, last = float(attitude.t[0]), float(attitude.t[-1])
@@ -109,7 +111,7 @@ def signals_from_bin(
     batteries = [name for name in ("BAT",) if name in tables]
     findings = [*firmware_findings("MSG", texts), *frame, *stops]
     findings += [*missing_states(spans, voltage, batteries), *direction_findings(wired)]
-    findings += depth.findings
+    findings += [*clocks, *depth.findings]
     return Signals(
         attitude=attitude,
         rates=rates,
@@ -156,7 +158,16 @@ def one_filter(tables: dict[str, Table]) -> dict[str, Table]:
     return found
 
 
-def _usable(table: Table) -> Table:
+def _in_time(given: Mapping[str, Table]) -> tuple[dict[str, Table], list[Finding]]:
+    """The usable tables of one filter, and what is wrong with their times."""
+    usable, found = dict[str, Table](), gps_findings(given)
+    for name, table in given.items():
+        usable[name], told = _usable(table)
+        found += told
+    return one_filter({name: table for name, table in usable.items() if table["t"].size}), found
+
+
+def _usable(table: Table) -> tuple[Table, list[Finding]]:
     """Messages with a valid time, in time order; numeric columns only (and the names of PARM)."""
     kept = Table(table.name)
     for column, values in table.items():
@@ -166,8 +177,9 @@ def _usable(table: Table) -> Table:
     kept["t"] = kept["SampleUS" if "SampleUS" in kept else "TimeUS"] * 1e-6
     if "shift" in kept:
         kept["t"] = kept["t"] + kept["shift"]
-    order = np.argsort(kept["t"], kind="stable")
-    return kept.rows(order[(kept["t"][order] >= 0) & (kept["t"][order] < _LATEST_S)])
+    kept = kept.rows((kept["t"] >= 0) & (kept["t"] < _LATEST_S))
+    kept, found = ordered(kept, _NAMES.get(table.name, table.name))
+    return kept.rows(np.argsort(kept["t"], kind="stable")), found
 
 
 def _columns(tables: Mapping[str, Table], name: str, *columns: str) -> Sequence[tuple]:

@@ -7,17 +7,16 @@ import numpy as np
 from ...config.errors import UserError
 from ...vehicles.vehicle import Vehicle
 from ..build import Trajectory
+from ..pieces import good_pieces
 from ..schema import UNEVEN
 from ..store import Recording
 from .columns import columns_of
 from .commands import command_findings
 from .finding import Finding, check_accepted, enforce, findings_of, with_findings
+from .flickers import flicker_finding, mended
 from .held_outputs import all_held
 from .small_speeds import dead_zones
-from .velocity import held_finding, lag_findings, unmeasured, zone_finding
-
-_SHORTEST_S = 1.0
-"""A shorter piece beside a cut is left out too."""
+from .velocity import FASTEST, held_finding, lag_findings, unmeasured, zone_finding
 
 
 def examine(
@@ -35,12 +34,45 @@ def examine(
         UserError: for severe findings that are not accepted, or if nothing is left.
     """
     check_accepted(accept)
+    enforce(source, _in_other_lengths(recording, vehicle), accept)
+    recording, mended_ = _without_flickers(recording)
     recording, cut = _without_unmeasured(recording, source)
     recording, held = _without_held(recording, vehicle, source)
-    found = [*findings_of(recording.dataset), *cut, *held, *lag_findings(recording)]
+    found = [*findings_of(recording.dataset), *mended_, *cut, *held, *lag_findings(recording)]
     found += command_findings(recording, vehicle)
     enforce(source, found, accept)
     return type(recording)(with_findings(recording.dataset, found))
+
+
+def _in_other_lengths(recording: Recording, vehicle: Vehicle | None) -> list[Finding]:
+    """Velocities too fast for a vehicle that the commands explain in another unit: no failure."""
+    speeds = np.abs(recording.dataset["V_WB_B"].to_numpy()[..., :3])
+    if not np.nanmax(speeds, initial=0.0) > FASTEST:
+        return []
+    return [f for f in command_findings(recording, vehicle) if f.word == "length-unit"]
+
+
+def _without_flickers(recording: Recording) -> tuple[Recording, list[Finding]]:
+    """The recording with single poses that lie elsewhere replaced."""
+    X, V = (recording.dataset[name].to_numpy() for name in ("X_WB", "V_WB_B"))
+    found: list[Finding] = []
+    for j, r in np.argwhere(recording.lengths > 1).tolist():
+        n, t = int(recording.lengths[j, r]), recording.elapsed(j, r)
+        whole = mended(t, X[j, r, :n].T, V[j, r, :n].T)
+        if whole is None:
+            continue
+        if not found:
+            X, V = X.copy(), V.copy()
+        X[j, r, :n], V[j, r, :n] = whole.X.T, whole.V.T
+        start = float(np.nan_to_num(recording.dataset["start_time"].to_numpy()[j, r]))
+        found.append(flicker_finding(str(recording.scenarios[j]), start + t[whole.bad]))
+    if not found:
+        return recording, []
+    changed = {
+        name: (recording.dataset[name].dims, values, recording.dataset[name].attrs)
+        for name, values in (("X_WB", X), ("V_WB_B", V))
+    }
+    return Recording(recording.dataset.assign(changed)), found
 
 
 def _without_unmeasured(recording: Recording, source: str) -> tuple[Recording, list[Finding]]:
@@ -96,24 +128,3 @@ def _of_pieces(
         raise UserError(f"{source}: {found[-1]} Nothing is left of it")
     kept = Recording.from_trajectories(pieces, recording.dt)
     return Recording(kept.dataset.assign_attrs(recording.dataset.attrs))
-
-
-def good_pieces(run: Trajectory, t: np.ndarray, good: np.ndarray) -> list[Trajectory]:
-    """The stretches of good samples that are not too short."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]])))
-    found = []
-    for a, b in edges.reshape(-1, 2).tolist():
-        if t[b - 1] - t[a] < _SHORTEST_S:
-            continue
-        part = slice(a, b)
-        found.append(
-            Trajectory(
-                run.scenario,
-                run.X_WB[part],
-                run.V_WB_B[part],
-                {name: values[part] for name, values in run.commands.items()},
-                {name: values[part] for name, values in run.sensors.items()},
-                run.start + float(t[a] - t[0]),
-            )
-        )
-    return found

@@ -1,13 +1,11 @@
-"""Outputs that stand still in the record while the motion shows that the thrusters did not.
+"""Commands that all stand still in the record while the motion shows that they did not.
 
-One column: a mixer drives several thrusters for the same axes, so the others tell what it would
-have been. It stood still only in the record if the motion fits what they tell much better. All
-columns together: a body under a constant force shows a constant sum of inertia and drag. Where this
-sum varies as with varying commands, the commands were not recorded.
+A body under a constant force shows a constant sum of inertia and drag. Where this sum varies as
+with varying commands, the commands were not recorded.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -16,13 +14,10 @@ from scipy.optimize import nnls
 from scipy.stats import chi2
 
 from ...se3 import AXES
-from ...thruster_curves import NEUTRAL
 from ...vehicles.vehicle import Vehicle
-from ..outputs import in_words
 from ..store import Recording
-from .columns import columns_of
 from .finding import Finding
-from .hypotheses import CAUSAL, EVIDENCE, MOST, PLAUSIBLE, Driven, named
+from .hypotheses import MOST
 from .response import HALF_WIDTH_S, LAGS_S, AxisResponse, Piece, filtered, responses
 
 _LEAST_COUNT = 20.0
@@ -31,12 +26,8 @@ HELD_S = 2.0
 """s for which a value must stand still: longer than any answer of a thruster."""
 _USUAL_HOLDS = 10.0
 """And longer than so many of the record's usual holds: commands may be rare."""
-_TELLS, _LEARNED = 0.9, 200
-"""Share of a column's variance that others explain if they tell it, and samples for that."""
 _ROUNDING = 1e-6
 """Of a value: what resampling makes of a constant."""
-_MAIN = 0.7
-"""Share of the largest lever on an axis from which on a thruster mainly drives it."""
 _VARIES = 0.25
 """Part of the usual spread of a force, or of its variance, that counts as varying."""
 _FEWEST, _TOGETHER, _CHANCE = 10, 4, 6e-6
@@ -74,127 +65,8 @@ def stands(values: Float[np.ndarray, "N m"], dt: float) -> Bool[np.ndarray, " N"
     return held
 
 
-def held_column(
-    recording: Recording, vehicle: Vehicle | None, data: Driven
-) -> tuple[float, list[Finding]]:
-    """A thruster's column that stands still, whose thrust the motion shows; nats beyond chance.
-
-    Each scenario is judged by itself: in another one thrusters may be driven in another way.
-    """
-    best: tuple[float, list[Finding]] = (0.0, [])
-    if vehicle is None:
-        return best
-    for name in recording.scenarios:
-        own = recording.select(name)
-        now = None
-        for k, _ in enumerate(data.columns):
-            told = _told_by_others(own, vehicle, data.weights, k)
-            if told is None:
-                continue
-            now = now or _judged(own, vehicle, data)
-            worth = _gain(own, told[0], vehicle, *now)
-            if worth > best[0]:
-                best = worth, [_column_finding(data, k, told[1])]
-    return best
-
-
-def _judged(
-    recording: Recording, vehicle: Vehicle, data: Driven
-) -> tuple[Driven, float, dict[int, float]]:
-    """What the commands as they are explain of a scenario: responses, nats and shares."""
-    columns = columns_of(recording, vehicle)
-    assert columns is not None
-    found = responses(recording, columns[0], recording.command_period)
-    kept = {i: r for i, r in found.items() if i in data.axes and r.count >= _LEAST_COUNT}
-    own = replace(data, axes=kept)
-    nats, shares, _ = own.best(data.weights[..., None], PLAUSIBLE)
-    return own, float(np.sum(nats)), {i: float(share[0]) for i, share in shares.items()}
-
-
-def _gain(
-    recording: Recording,
-    changed: Recording,
-    vehicle: Vehicle,
-    own: Driven,
-    usual: float,
-    kept: dict[int, float],
-) -> float:
-    """Nats beyond `EVIDENCE` by which changed commands explain a scenario better; 0 if unclear."""
-    columns = columns_of(changed, vehicle)
-    if columns is None or not own.axes:
-        return 0.0
-    axes = responses(changed, columns[0], recording.command_period)
-    tried = replace(own, axes={i: replace(axes[i], count=r.count) for i, r in own.axes.items()})
-    nats, shares, _ = tried.best(own.weights[..., None], CAUSAL, strict=True)
-    clear = any(named(kept[i], float(shares[i][0]), r.count) for i, r in own.axes.items())
-    return float(nats[0]) - usual - EVIDENCE if clear else 0.0
-
-
-def _told_by_others(
-    recording: Recording, vehicle: Vehicle, weights: np.ndarray, k: int
-) -> tuple[Recording, str] | None:
-    """The recording with column k as the others tell it where it stands still, and that place."""
-    name, dt, mask = recording.thrust_from, recording.dt, recording.mask
-    raw = recording.dataset[name]
-    values = raw.to_numpy()
-    held = np.zeros(mask.shape, bool)
-    for j, r in np.argwhere(recording.lengths > 1).tolist():
-        n = int(recording.lengths[j, r])
-        held[j, r, :n] = stands(values[j, r, :n, [k]].T, dt)
-    if not held.any():
-        return None
-    signs = np.asarray(vehicle.thrusters().motor_directions) if name == "pwm" else 1.0
-    neutral = NEUTRAL if name == "pwm" else 0.0
-    sent = np.nan_to_num(values, nan=neutral) - neutral
-    sent = sent * signs
-    others = np.arange(sent.shape[-1]) != k
-    x, y = sent[..., others], sent[..., k]
-    factors = _factors(x[mask & ~held], y[mask & ~held], weights, k)
-    if factors is None:
-        return None
-    low, high = sent[mask].min(), sent[mask].max()
-    expected = np.clip(x @ factors, low, high)
-    if np.std(expected[held]) < _VARIES * float(np.max(np.std(x[mask], axis=0))):
-        return None
-    sent[..., k] = np.where(held, expected, sent[..., k])
-    changed = np.where(mask[..., None], neutral + sent * signs, np.nan)
-    where = [
-        f"{recording.scenarios[j]}, {_seconds(recording, j, r, held[j, r])}"
-        for j, r in np.argwhere(held.any(axis=-1)).tolist()
-    ]
-    place = where[0] if len(where) == 1 else f"{len(where)} stretches, first {where[0]}"
-    return Recording(recording.dataset.assign({name: (raw.dims, changed, raw.attrs)})), place
-
-
-def _factors(x: np.ndarray, y: np.ndarray, weights: np.ndarray, k: int) -> np.ndarray | None:
-    """Linear factors of the others that give column k: learned where it moves, or by geometry.
-
-    By geometry a mixer gives the thrusters of an axis the same size, with the sign of their levers.
-    """
-    if len(y) >= _LEARNED and np.std(y) > 0:
-        factors = np.linalg.lstsq(x, y, rcond=1e-6)[0]
-        left = float(np.mean((y - x @ factors) ** 2))
-        return factors if left < (1 - _TELLS) * float(np.var(y)) else None
-    arms = weights / np.maximum(np.abs(weights).max(axis=1, keepdims=True), 1e-9)
-    mixer = np.where(np.abs(arms) > _MAIN, np.sign(arms), 0.0).T  # (m, 6)
-    rest = np.delete(mixer, k, axis=0)
-    factors = mixer[k] @ np.linalg.pinv(rest, rcond=1e-6)
-    return factors if np.allclose(factors @ rest, mixer[k], atol=1e-6) else None
-
-
-def _column_finding(data: Driven, k: int, place: str) -> Finding:
-    name = in_words(k + 1, data.outputs)
-    return Finding(
-        "output-held",
-        f"column {data.columns[k]}; {place}",
-        f"the output of {name} stands still at one value, while the other thrusters and the motion "
-        "say that it was driven",
-        f"record the output that drives it, or leave out the stretch in which {data.columns[k]} "
-        "stands still",
-    )
-
-
-def _seconds(recording: Recording, j: int, r: int, samples: np.ndarray) -> str:
+def seconds(recording: Recording, j: int, r: int, samples: np.ndarray) -> str:
+    """From the first to the last of some samples of a run, in words."""
     start = float(recording.dataset["start_time"].to_numpy()[j, r])
     start = start if np.isfinite(start) else 0.0
     at = np.flatnonzero(samples)
@@ -207,9 +79,11 @@ def all_held(
     """Stretches in which every command stands still while the force of the motion varies."""
     if recording.uneven:
         return []
-    runs = [_run(recording, forces, j, r) for j, r in np.argwhere(recording.lengths > 0).tolist()]
-    if not any(run.stretches for run in runs):
+    at = np.argwhere(recording.lengths > 0).tolist()
+    stretches = [_stretches(recording, j, r) for j, r in at]
+    if not any(stretches):
         return []
+    runs = [_run(recording, forces, j, r, own) for (j, r), own in zip(at, stretches, strict=True)]
     laws = {i: law for i in _FREE if (law := _law(runs, weights[i], i)) is not None}
     found = []
     for number, run in enumerate(runs):
@@ -218,7 +92,7 @@ def all_held(
             if axes:
                 samples = np.zeros(run.size, bool)
                 samples[start:stop] = True
-                place = f"{run.name}, {_seconds(recording, *run.at, samples)}"
+                place = f"{run.name}, {seconds(recording, *run.at, samples)}"
                 found.append(Held(number, samples, _all_finding(place, axes)))
     return found
 
@@ -307,20 +181,20 @@ class _Law:
     left: float
 
 
-def _run(recording: Recording, forces: np.ndarray, j: int, r: int) -> _Run:
-    size = int(recording.lengths[j, r])
-    raw = recording.dataset[recording.thrust_from].to_numpy()[j, r, :size]
-    held = stands(raw, recording.dt)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]])))
+def _stretches(recording: Recording, j: int, r: int) -> list[tuple[int, int]]:
+    """First and last sample (exclusive) where no command of a run changes."""
+    raw = recording.dataset[recording.thrust_from].to_numpy()[j, r, : recording.lengths[j, r]]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], stands(raw, recording.dt), [False]])))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _run(
+    recording: Recording, forces: np.ndarray, j: int, r: int, stretches: list[tuple[int, int]]
+) -> _Run:
     half = max(HALF_WIDTH_S, 1.5 * recording.command_period)
-    return _Run(
-        (j, r),
-        str(recording.scenarios[j]),
-        size,
-        filtered(recording, j, r, forces, half),
-        [(int(a), int(b)) for a, b in edges.reshape(-1, 2)],
-        recording.dt,
-    )
+    piece = filtered(recording, j, r, forces, half)
+    name, size = str(recording.scenarios[j]), int(recording.lengths[j, r])
+    return _Run((j, r), name, size, piece, stretches, recording.dt)
 
 
 def _law(runs: Sequence[_Run], weights: np.ndarray, axis: int) -> _Law | None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from ...vehicles.vehicle import Vehicle
 from .response import LAGS_S, AxisResponse
 
 EVIDENCE = 12.0
@@ -21,6 +22,9 @@ PLAUSIBLE = np.flatnonzero((LAGS_S > _EARLIEST) & (LAGS_S < _LATEST)).tolist()
 CAUSAL = [lag for lag in PLAUSIBLE if LAGS_S[lag] > -0.05]
 """Lags of hypotheses: before its command a motion only is where the command answers the motion."""
 ALL = list(range(LAGS_S.size))
+_HARDLY, _SURE = 10.0, 0.9
+"""Commanded force over the force that the motion shows, above which no vehicle's numbers explain
+it; the largest share of a force that a command is expected to make up."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,60 @@ class Driven:
             for i in self.axes
         }
         return nats.max(axis=0), picked, np.asarray(lags)[at]
+
+    def nats(self, axis: int) -> float:
+        """Evidence for any relation of an axis' motion to its command, of either sign, any lag."""
+        r = self.axes[axis]
+        shares = [r.fit(s * self.weights[axis], lag)[0] for lag in ALL for s in (1, -1)]
+        return float(-0.5 * r.count * np.log1p(-np.max(shares)))
+
+    def expected(self, axis: int) -> float:
+        """Evidence that an axis gives whose motion follows its command.
+
+        Of a command that makes up a share ρ² of the force shown, n windows give -n/2 log(1 - ρ²).
+        """
+        share = min(self._times(axis) ** 2, _SURE)
+        return float(-0.5 * self.axes[axis].count * np.log1p(-share))
+
+    def answered(self, axis: int) -> bool:
+        """Whether the motion of an axis follows its command."""
+        return self.nats(axis) > EVIDENCE and self.given[axis] < _HARDLY * self.needed[axis]
+
+    def unanswered(self, axis: int) -> bool:
+        """Whether the motion of an axis follows its command not at all, or hardly."""
+        if self._times(axis) > _HARDLY:
+            return True
+        return bool(self.expected(axis) > 3 * EVIDENCE and self.nats(axis) < EVIDENCE)
+
+    def _times(self, axis: int) -> float:
+        return self.given[axis] / max(self.needed[axis], 1e-12)
+
+
+def driven_by(
+    axes: dict[int, AxisResponse],
+    weights: Float[np.ndarray, "6 m"],
+    names: tuple[str, ...],
+    vehicle: Vehicle | None,
+) -> Driven:
+    """Responses with the sizes of the commanded forces, and of those that the motion shows."""
+    zero = int(np.argmin(np.abs(LAGS_S)))
+    given, needed, masses = {}, {}, {}
+    for i, r in axes.items():
+        given[i] = float(np.sqrt(max(weights[i] @ r.CC[zero] @ weights[i], 0.0) / r.windows))
+        if given[i] < 1e-6:  # what rounding leaves of an axis that thrusters can't actuate
+            given[i] = 0.0
+        if vehicle is None:
+            needed[i], masses[i] = np.inf, 0.0
+            continue
+        rigid = (vehicle.mass,) * 3 + vehicle.inertia
+        c = np.array([
+            rigid[i] + vehicle.added_mass[i],
+            vehicle.linear_damping[i],
+            vehicle.quadratic_damping[i],
+        ])  # fmt: skip
+        masses[i] = float(c[0])
+        needed[i] = float(np.sqrt(max(c @ r.RR @ c, 0.0) / r.windows))
+    return Driven(axes, weights, names, needed, given, masses)
 
 
 def named(usual: float, share: float, count: float) -> bool:

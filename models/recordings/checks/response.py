@@ -14,7 +14,7 @@ Derivatives are avoided: both sides are correlated with a smooth window φ, and 
 linear filter on both sides leaves the coefficients unchanged.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,21 +83,52 @@ def responses(
 
     `period` (s) is the step at which commands are known.
     """
+    pieces = [piece for _, piece in _pieces(recording, commands, period)]
+    return {i: _sums(*_projected(i, own, step)) for i, own, step in _usable(pieces, recording.dt)}
+
+
+def responses_along(
+    recording: Recording, commands: Float[np.ndarray, "J K N m"], period: float, seconds: float
+) -> list[tuple[tuple[int, int], int, dict[int, AxisResponse]]]:
+    """Responses of blocks of some `seconds`, which add up to those of the whole.
+
+    Each with the indices of its run and the sample in it at which the block begins.
+    """
+    found = _pieces(recording, commands, period)
+    size = max(round(seconds / recording.dt), 1)
+    blocks: dict[tuple[int, int, int], dict[int, AxisResponse]] = {}
+    for i, own, step in _usable([piece for _, piece in found], recording.dt):
+        R, C, count = _projected(i, own, step)
+        places = [at for at, piece in found if any(piece is one for one in own)]
+        keys = np.concatenate([
+            np.stack([np.broadcast_to(n, len(p.middle)), p.middle // size], axis=1)
+            for n, p in enumerate(own)
+        ])  # fmt: skip
+        for n, block in np.unique(keys, axis=0).tolist():
+            rows = (keys == (n, block)).all(axis=1)
+            part = _sums(R[rows], C[:, rows], count * rows.mean())
+            blocks.setdefault((*places[n], block), {})[i] = part
+    return [((j, k), block * size, axes) for (j, k, block), axes in sorted(blocks.items())]
+
+
+def _pieces(
+    recording: Recording, commands: np.ndarray, period: float
+) -> list[tuple[tuple[int, int], "Piece"]]:
+    """The filtered runs, each with its indices."""
     half = max(HALF_WIDTH_S, 1.5 * period)
-    pieces = [
-        piece
-        for j, k in np.argwhere(recording.lengths > 1)
-        if (piece := filtered(recording, int(j), int(k), commands, half)) is not None
+    return [
+        ((j, k), piece)
+        for j, k in np.argwhere(recording.lengths > 1).tolist()
+        if (piece := filtered(recording, j, k, commands, half)) is not None
     ]
-    if not pieces:
-        return {}
-    step = max(round(half / 2 / recording.dt), 1) * recording.dt
-    found = {}
+
+
+def _usable(pieces: "Sequence[Piece]", dt: float) -> Iterator[tuple[int, "list[Piece]", float]]:
+    """Each axis with a measured velocity, the runs that have it, and the step of windows (s)."""
     for axis in range(6):
-        usable = [p for p in pieces if np.isfinite(p.rate[:, axis]).all()]
-        if usable:
-            found[axis] = _axis(axis, usable, step)
-    return found
+        own = [p for p in pieces if np.isfinite(p.rate[:, axis]).all()]
+        if own:
+            yield axis, own, max(round(own[0].half / 2), 1) * dt
 
 
 @dataclass(frozen=True)
@@ -162,7 +193,10 @@ def _smoothed(x: np.ndarray, window: np.ndarray, step: int) -> np.ndarray:
     return y - y.mean(axis=0)
 
 
-def _axis(axis: int, pieces: Sequence[Piece], step: float) -> AxisResponse:
+def _projected(
+    axis: int, pieces: Sequence[Piece], step: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Motion (n, 3), commands (L, n, m) without what restoring and Coriolis give; independent n."""
     free = [12, 13, 14, 15 + 2 * axis, 16 + 2 * axis]
     terms = np.concatenate([p.terms for p in pieces])
     R = np.stack(
@@ -178,6 +212,10 @@ def _axis(axis: int, pieces: Sequence[Piece], step: float) -> AxisResponse:
     zero = int(np.argmin(np.abs(LAGS_S)))
     lengths = np.cumsum([len(p.rate) for p in pieces])[:-1]
     count = len(R) / _correlation(np.split(C[zero], lengths), round(_ACF_S / step))
+    return R, C, count
+
+
+def _sums(R: np.ndarray, C: np.ndarray, count: float) -> AxisResponse:
     return AxisResponse(
         R.T @ R,
         np.einsum("na,lnm->lam", R, C),

@@ -190,7 +190,7 @@ def held_finding(word: str, place: str, columns: str) -> Finding:
         word,
         place,
         f"{columns} above {FASTEST:g} m/s, which marks a failure; the samples are left out",
-        "leave such samples empty, or cut there",
+        "leave such samples empty, cut there, or give m/s",
     )
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ....models.config.errors import UserError
-from ....models.recordings.checks.examine import good_pieces
 from ....models.recordings.checks.small_speeds import DeadZone, dead_zones
+from ....models.recordings.pieces import good_pieces
 from ....models.recordings.schema import UNEVEN
 from ....models.recordings.store import Recording
 from ....models.se3 import AXES, TWIST

@@ -506,6 +506,17 @@ def test_records_whose_time_is_no_number_are_left_out():
     assert read.notes == ("Records of unknown layout were left out: BAT.",)
 
 
+def test_two_kinds_of_records_of_one_name_are_not_mixed():
+    """As a damaged FMT record has it."""
+    log = dataflash(duration=1.0).bytes()
+    read = read_bin(log, {"BAT", "RCOU"})
+    at = log.index(b"BAT\0QBf\0")
+    twice = read_bin(log[:at] + b"RCOU" + log[at + 4 :], {"BAT", "RCOU"})
+    assert set(twice.tables) == {"RCOU"}
+    assert len(twice.tables["RCOU"]["t"]) in {len(t["t"]) for t in read.tables.values()}
+    assert twice.notes == ("Records of unknown layout were left out: RCOU.",)
+
+
 def test_compressed_logs_and_cut_off_ones(tmp_path):
     data = dive().bytes()
     for suffix, compress in ((".xz", lzma.compress), (".gz", gzip.compress)):

@@ -100,15 +100,17 @@ def read_bin(data: bytes, wanted: Collection[str], progress: Progress = no_progr
             "download the log again, or give the telemetry log (.tlog) of the dive"
         )
     tables: dict[str, Table] = {}
+    places: dict[str, np.ndarray] = {}
     unreadable = []
     for number, found in offsets.items():
         layout = formats[number]
         dtype = layout.dtype()
-        if dtype is None:
+        if dtype is None or layout.name in tables:  # two kinds of one name: an FMT is damaged
             unreadable.append(layout.name)
             continue
-        tables[layout.name] = _decode(data, np.asarray(found), layout, dtype)
-    boots, notes = _in_order(tables, {formats[n].name: np.asarray(o) for n, o in offsets.items()})
+        places[layout.name] = np.asarray(found)
+        tables[layout.name] = _decode(data, places[layout.name], layout, dtype)
+    boots, notes = _in_order(tables, places)
     if skipped:
         notes.append(f"{skipped} of {len(data)} bytes of the log are damaged and were skipped.")
     lost = {number: count for number, count in unknown.items() if count >= _RECURRING}

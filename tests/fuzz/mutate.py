@@ -226,7 +226,7 @@ def _node_spoiled(rng: Rng, root: yaml.Node) -> yaml.Node:
             del parent.value[i]
         case 5:
             parent.value.insert(i, parent.value[i])
-        case 6 if keyed:
+        case 6 if keyed and isinstance(parent.value[i][0].value, str):
             key = parent.value[i][0]
             name = pick(rng, (*WORDS, key.value + "s", key.value[:-1]))
             parent.value[i] = (_scalar(name), value)

@@ -28,7 +28,7 @@ from .finding import Finding
 from .heading import heading_offset, mirrored_plane
 from .held_columns import held_column
 from .held_outputs import held_throughout
-from .hypotheses import ALL, EVIDENCE, MOST, PLAUSIBLE, Driven, driven_by
+from .hypotheses import ALL, EVIDENCE, LEAST_COUNT, MOST, PLAUSIBLE, Driven, driven_by
 from .lengths import length_findings
 from .midway import ORDERS, changed_midway
 from .orders import orders, thrusters
@@ -39,8 +39,6 @@ _STRONG = 0.04
 quadratic in it. A dead band takes 25 to 30 µs of them."""
 _NO_FORCE = 1e-3
 """N or N·m below which nothing is driven; pulses in a thruster's dead band give up to 1e-6 N."""
-_LEAST_COUNT = 20.0
-"""Independent windows below which nothing is said of an axis."""
 _LINEAR, _ANGULAR = (0, 1, 2), (3, 4, 5)
 _APART_S = 0.25
 """s by which the answers of velocities and of rates may differ: thrusters give both the same lag,
@@ -82,7 +80,7 @@ def _throughout(
     axes = {
         i: r
         for i, r in responses(recording, forces, recording.command_period).items()
-        if r.count >= _LEAST_COUNT
+        if r.count >= LEAST_COUNT
     }
     data = driven_by(axes, weights, names, vehicle)
     judged = () if vehicle is None else _strong(forces[mask], vehicle)

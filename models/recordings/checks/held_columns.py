@@ -18,18 +18,12 @@ from ..outputs import in_words
 from ..store import Recording
 from .columns import columns_of
 from .finding import Finding
-from .held_outputs import seconds, stands
-from .hypotheses import CAUSAL, EVIDENCE, PLAUSIBLE, Driven, driven_by, named
+from .held_outputs import VARIES, seconds, stands
+from .hypotheses import CAUSAL, EVIDENCE, LEAST_COUNT, MAIN, PLAUSIBLE, Driven, driven_by, named
 from .response import responses
 
-_LEAST_COUNT = 20.0
-"""Independent windows below which nothing is said of an axis by shares."""
 _TELLS, _LEARNED = 0.9, 200
 """Share of a column's variance that others explain if they tell it, and samples for that."""
-_MAIN = 0.7
-"""Share of the largest lever on an axis from which on a thruster mainly drives it."""
-_VARIES = 0.25
-"""Part of the usual spread of a force, or of its variance, that counts as varying."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +80,7 @@ def held_column(
 
 def _judged(recording: Recording, vehicle: Vehicle, data: Driven) -> _Judged:
     every = _driven(recording, vehicle)
-    axes = {i: r for i, r in every.axes.items() if i in data.axes and r.count >= _LEAST_COUNT}
+    axes = {i: r for i, r in every.axes.items() if i in data.axes and r.count >= LEAST_COUNT}
     own = replace(data, axes=axes)
     nats, shares, _ = own.best(data.weights[..., None], PLAUSIBLE)
     kept = {i: float(share[0]) for i, share in shares.items()}
@@ -155,7 +149,7 @@ def _told_by_others(
     low, high = sent[mask].min(), sent[mask].max()
     for factors, open_axis in _factors(x[mask & ~held], y[mask & ~held], weights, k):
         expected = np.clip(x @ factors, low, high)
-        if np.std(expected[held]) < _VARIES * float(np.max(np.std(x[mask], axis=0))):
+        if np.std(expected[held]) < VARIES * float(np.max(np.std(x[mask], axis=0))):
             continue
         told = sent.copy()
         told[..., k] = np.where(held, expected, sent[..., k])
@@ -190,7 +184,7 @@ def _factors(
 def _mixer(weights: np.ndarray) -> np.ndarray:
     """Signs with which a mixer drives the thrusters (m) of each axis (6): those of their levers."""
     arms = weights / np.maximum(np.abs(weights).max(axis=1, keepdims=True), 1e-9)
-    return np.where(np.abs(arms) > _MAIN, np.sign(arms), 0.0).T
+    return np.where(np.abs(arms) > MAIN, np.sign(arms), 0.0).T
 
 
 def _solved(mixer: np.ndarray, k: int) -> np.ndarray | None:

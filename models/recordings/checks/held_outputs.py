@@ -17,18 +17,16 @@ from ...se3 import AXES
 from ...vehicles.vehicle import Vehicle
 from ..store import Recording
 from .finding import Finding
-from .hypotheses import MOST
+from .hypotheses import LEAST_COUNT, MOST
 from .response import HALF_WIDTH_S, LAGS_S, AxisResponse, Piece, filtered, responses
 
-_LEAST_COUNT = 20.0
-"""Independent windows below which nothing is said of an axis."""
 HELD_S = 2.0
 """s for which a value must stand still: longer than any answer of a thruster."""
 _USUAL_HOLDS = 10.0
 """And longer than so many of the record's usual holds: commands may be rare."""
 _ROUNDING = 1e-6
 """Of a value: what resampling makes of a constant."""
-_VARIES = 0.25
+VARIES = 0.25
 """Part of the usual spread of a force, or of its variance, that counts as varying."""
 _FEWEST, _TOGETHER, _CHANCE = 10, 4, 6e-6
 """Windows of a stretch; overlapping windows for one independent one; probability by chance of the
@@ -207,7 +205,7 @@ def _law(runs: Sequence[_Run], weights: np.ndarray, axis: int) -> _Law | None:
     ]
     R = np.concatenate([p for p, _ in parts]) if parts else np.zeros((0, 3))
     c = np.concatenate([q for _, q in parts]) if parts else np.zeros(0)
-    if len(c) < _LEAST_COUNT * _TOGETHER or not np.var(c) > 0:
+    if len(c) < LEAST_COUNT * _TOGETHER or not np.var(c) > 0:
         return None
     size = np.maximum(R.std(axis=0), 1e-12)
     theta = nnls(R / size, c)[0] / size
@@ -230,7 +228,7 @@ def _varies(run: _Run, start: int, stop: int, law: _Law, axis: int) -> bool:
     shown = float(np.var(_terms(run.piece, axis)[inside] @ law.coefficients))
     count = np.count_nonzero(inside) / _TOGETHER
     chance = float(chi2.isf(_CHANCE, count)) / count
-    return bool(shown > max(_VARIES * law.given, chance * law.left))
+    return bool(shown > max(VARIES * law.given, chance * law.left))
 
 
 def _turning_points(v: Float[np.ndarray, " N"]) -> int:

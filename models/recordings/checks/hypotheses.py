@@ -22,6 +22,10 @@ PLAUSIBLE = np.flatnonzero((LAGS_S > _EARLIEST) & (LAGS_S < _LATEST)).tolist()
 CAUSAL = [lag for lag in PLAUSIBLE if LAGS_S[lag] > -0.05]
 """Lags of hypotheses: before its command a motion only is where the command answers the motion."""
 ALL = list(range(LAGS_S.size))
+LEAST_COUNT = 20.0
+"""Independent windows below which nothing is said of an axis."""
+MAIN = 0.7
+"""Share of the largest lever on an axis from which on a thruster mainly drives it."""
 _HARDLY, _SURE = 10.0, 0.9
 """Commanded force over the force that the motion shows, above which no vehicle's numbers explain
 it; the largest share of a force that a command is expected to make up."""

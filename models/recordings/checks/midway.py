@@ -16,7 +16,7 @@ from ..pieces import good_pieces
 from ..store import Recording
 from .columns import columns_of
 from .finding import Finding
-from .hypotheses import CAUSAL, EVIDENCE, PLAUSIBLE, Driven
+from .hypotheses import CAUSAL, EVIDENCE, LEAST_COUNT, PLAUSIBLE, Driven
 from .orders import with_changes
 from .response import AxisResponse, responses_along
 
@@ -24,8 +24,6 @@ ORDERS = ("columns-exchanged", "axis-reversed", "thruster-reversed", "thruster-e
 """Words of what may change in mid-record."""
 _BLOCK_S, _MOST, _COARSE = 5.0, 60, 10
 """s of a block; most blocks, which are longer in long records; places that are tried first."""
-_LEAST_COUNT = 20.0
-"""Independent windows on each side below which nothing is said of an axis."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ def changed_midway(recording: Recording, vehicle: Vehicle | None, data: Driven) 
 
 
 def _judged(side: dict[int, AxisResponse], data: Driven) -> dict[int, AxisResponse]:
-    return {i: r for i, r in side.items() if i in data.axes and r.count >= _LEAST_COUNT}
+    return {i: r for i, r in side.items() if i in data.axes and r.count >= LEAST_COUNT}
 
 
 def _gains(data: Driven, weights: np.ndarray) -> np.ndarray:

@@ -14,14 +14,12 @@ from .command_words import (
     reversed_thruster,
 )
 from .finding import Finding
-from .hypotheses import CAUSAL, EVIDENCE, PLAUSIBLE, Driven, named
+from .hypotheses import CAUSAL, EVIDENCE, MAIN, PLAUSIBLE, Driven, named
 
 _DEAD = 0.15
 _CONTRARY = 3.0
 """Nats that an axis may lose by chance under a hypothesis that is true: less than 1 in 20."""
 _FACTORS = np.round(np.arange(-1.5, 1.51, 0.05), 2)
-_MAIN = 0.7
-"""Share of the largest lever on an axis from which on a thruster mainly drives it."""
 
 
 def orders(data: Driven, wrench: bool) -> tuple[float, list[Finding]]:
@@ -95,7 +93,7 @@ def loses(
     """
     largest = np.maximum(np.abs(data.weights).max(axis=1), 1e-12)
     change = np.abs(weights - data.weights).max(axis=1) / largest
-    main = [i for i in data.axes if change[i] >= _MAIN * change.max()]
+    main = [i for i in data.axes if change[i] >= MAIN * change.max()]
     lost = [0.5 * data.axes[i].count * (np.log1p(-shares[i]) - np.log1p(-usual[i])) for i in main]
     return bool(max(lost, default=0.0) > _CONTRARY)
 
@@ -130,7 +128,7 @@ def _needed(data: Driven, changes: list[_Change]) -> list[_Change]:
         rest = [other for other in changes if other is not one]
         both = np.stack([with_changes(data, rest), with_changes(data, changes)], axis=-1)
         _, shares, _ = data.best(both, PLAUSIBLE)
-        main = [i for i in data.axes if max(arms[i, one[1]], arms[i, one[2]]) >= _MAIN]
+        main = [i for i in data.axes if max(arms[i, one[1]], arms[i, one[2]]) >= MAIN]
         if not any(
             named(float(shares[i][0]), float(shares[i][1]), data.axes[i].count) for i in main
         ):

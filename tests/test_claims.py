@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.data.generate import GenerateConfig, generate
+from spinndrift.training.diagnosis.filter.problem import DiagnosisProblem
 from spinndrift.training.diagnosis.findings.result import Interval, Ratio, Refitted, Value
 from spinndrift.training.diagnosis.findings.sentences import (
     coefficients_off,
@@ -19,8 +22,8 @@ from spinndrift.training.diagnosis.validation.claims import (
     outside_bands,
     vetoes,
 )
-from spinndrift.training.diagnosis.validation.simulation import Simulated
-from spinndrift.training.diagnosis.validation.validation import Judged
+from spinndrift.training.diagnosis.validation.simulation import Contender, Simulated
+from spinndrift.training.diagnosis.validation.validation import Judged, forecast_square, judge
 
 FOLDS, AT = 10, ["1", "4"]
 
@@ -74,7 +77,7 @@ def test_the_share_that_is_explained_is_that_of_the_error():
 
 def test_a_cause_forecasts_better_by_a_practical_share_of_one_part():
     def better(new, old=None):
-        return improves(new, old or judged(1.0), np.random.default_rng(0))
+        return improves(new.square, (old or judged(1.0)).square, np.random.default_rng(0))
 
     one_part = np.array([1.0, 0.85, 1.0])
     assert better(judged(one_part))
@@ -132,3 +135,16 @@ def test_thrust_that_a_refit_takes_away_or_turns_is_the_finding(share):
     assert "surge" not in said
     assert commands_lost(rows[1:]) == ""
     assert verdict((), [said]) == "unexplained"
+
+
+def test_forecasts_alone_have_the_errors_of_a_whole_judgement():
+    vehicle = load_vehicle("bluerov2_heavy")
+    made = GenerateConfig(("surge-forward", "yaw-left"), trajectories=2, duration=3.0)
+    problem = DiagnosisProblem.of(generate(made, vehicle), vehicle, None, [])
+    theta = np.repeat(problem.believed[:, None], len(problem.data.fold), axis=1)
+    given = problem, Contender(theta), 1.0
+    whole = judge(*given, 0, [], estimated=True)
+    assert np.isfinite(whole.square).all() and whole.square.any()
+    np.testing.assert_allclose(
+        forecast_square(*given, [], estimated=True), whole.square, rtol=1e-4, atol=1e-12
+    )

@@ -9,10 +9,12 @@ practical size.
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from ..filter.problem import Evaluation
 from ..validation.claims import improves
-from ..validation.validation import Contender, Judged, judge
+from ..validation.simulation import Contender
+from ..validation.validation import forecast_square
 from .model_selection import Hypothesis, parameters_of
 from .state import Fits, Selection
 
@@ -32,15 +34,15 @@ def forecast_better(
     taken = [*nuisance, *parameters_of(problem.library, state.hypotheses)]
     in_use = [*taken, *parameters_of(problem.library, names)]  # so that one program judges all
 
-    def judged(seen: Evaluation, rows: list[int]) -> Judged:
+    def square(seen: Evaluation, rows: list[int]) -> Float[np.ndarray, "h g F"]:
         contender = Contender(problem.without_each(seen, rows))
-        return judge(problem, contender, horizon, 0, in_use, estimated=True)
+        return forecast_square(problem, contender, horizon, in_use, estimated=True)
 
-    before, found = judged(state.current, taken), {}
+    before, found = square(state.current, taken), {}
     for h in names:
         rows = [*problem.library.at(*h), *taken]
         start = fits[h].added_to(state.current.theta)
         _, seen, _ = problem.polish(start, rows, None, origin=state.current)
-        if improves(judged(seen, rows), before, np.random.default_rng(0)):
+        if improves(square(seen, rows), before, np.random.default_rng(0)):
             found[h] = fits[h]
     return found

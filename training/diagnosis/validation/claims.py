@@ -163,16 +163,15 @@ class Judgement(NamedTuple):
         return Claim(vetoes(self.judged, name, at, bands, self.seed), shares)
 
 
-def improves(new: Judged, old: Judged, rng: np.random.Generator) -> bool:
+def improves(
+    new: Float[np.ndarray, "h g F"], old: Float[np.ndarray, "h g F"], rng: np.random.Generator
+) -> bool:
     """Whether a model saves as much as a practical share of the forecast error of one part.
 
-    By the mean logarithm of the ratio over parts and horizons, which must clearly be below zero.
+    By the mean logarithm of the ratio of squared errors over parts and horizons, which must clearly
+    be below zero.
     """
-    parts = [
-        _saved(new.square[:, g], old.square[:, g], rng)
-        for g in range(len(GROUPS))
-        if old.square[:, g].any()
-    ]
+    parts = [_saved(new[:, g], old[:, g], rng) for g in range(len(GROUPS)) if old[:, g].any()]
     if not parts or not all(np.isfinite(value).all() for value, _ in parts):
         return False  # without errors there is nothing to save
     mean, high = _mean_logarithm(parts)

@@ -65,10 +65,12 @@ def simulate(
     horizon: float,
     seed: int,
     kinds: set[tuple[str, str]],
+    samples: int = SAMPLES,
 ) -> Simulated:
     """Simulations of some pieces over `horizon` s at most, with effects of these causes and places.
 
-    `levels` are the noise of the records, the diffusion and the slip of the poses.
+    `levels` are the noise of the records, the diffusion and the slip of the poses. One simulation
+    has no noise; `samples` further ones have it.
     """
     data = problem.data
     every = max(1, min(round(horizon / data.dt), int(data.weight.sum(axis=0).min())))
@@ -82,7 +84,7 @@ def simulate(
         problem.model, used, contender.random_effects, Records.of(data, pieces), box,
         (jnp.asarray(levels[0]), jnp.asarray(levels[1]), jnp.asarray(levels[2])),
         jax.random.key(seed), every,
-        math.ceil(data.longest / _LONGEST - 1e-6), changes,
+        math.ceil(data.longest / _LONGEST - 1e-6), 1 + samples, changes,
     )  # fmt: skip
     return Simulated(np.asarray(e), pieces, every)
 
@@ -141,11 +143,12 @@ def _errors(
     key: Array,
     every: int,
     count: int,
+    lanes: int,
     changes: tuple[Modulated, ...] = (),
 ) -> Float[Array, "N 12 S R"]:
     """Recorded less simulated: lane 0 without noise, the others with it and that of the records."""
     whole = AlongRecords.of(model.with_effects(effects), count, changes)
-    S, R, dtype = 1 + SAMPLES, records.V.shape[2], records.V.dtype
+    S, R, dtype = lanes, records.V.shape[2], records.V.dtype
     on = (jnp.arange(S)[None, :, None] > 0).astype(dtype)
     laws = model.with_effects(random_effects)
     noise = _Noise(laws, on, *(level[:, None] * on for level in levels))

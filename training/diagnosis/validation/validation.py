@@ -4,12 +4,12 @@ All of a model (parameters, diffusion, measurement noise) is fitted without the 
 judged on; of a single scenario runs are left out in turn, of a single run blocks.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ....models.effects.library import whole
 from ....models.effects.noise import DisturbanceImpacts, DisturbanceStateDependence
@@ -123,16 +123,47 @@ def judge(
     with the same ones share a compiled program. `estimated` (the records are states of a filter) is
     the same for all folds and contenders.
     """
-    data, theta = problem.data, contender.theta
+    data = problem.data
     density, record, diffusion, slip, V = scores(problem, contender, estimated)
-    if V is not None:
-        problem = replace(problem, data=replace(data, V=V))
     kept = _spread(data.fold, _PIECES)
     levels = record[:, kept], diffusion[:, kept] * contender.white_share[:, None], slip[:, kept]
-    used = {*in_use, *np.flatnonzero(np.any(theta != 0, axis=1)).tolist()}
-    kinds = {(whole(e.cause), e.where) for e in (problem.library.entries[i] for i in used)}
-    simulated = simulate(problem, contender, levels, kept, horizon, seed, kinds)
+    filtered, kinds = _with_velocities(problem, V), _kinds(problem, contender, in_use)
+    simulated = simulate(filtered, contender, levels, kept, horizon, seed, kinds)
     return _judged(simulated, density + contender.law_gain, data, horizon)
+
+
+def forecast_square(
+    problem: DiagnosisProblem,
+    contender: Contender,
+    horizon: float,
+    in_use: Sequence[int],
+    estimated: bool,
+) -> Float[np.ndarray, "h g F"]:
+    """The squared errors of `judge` alone: forecasts without noise.
+
+    Only where velocities are filtered are the innovations scored as well, for windows start there.
+    """
+    data, kept = problem.data, _spread(problem.data.fold, _PIECES)
+    if data.latent or data.spread is not None:
+        problem = _with_velocities(problem, scores(problem, contender, estimated).latent)
+    none = tuple(np.zeros((rows, len(kept))) for rows in (12, 6, 6))
+    kinds = _kinds(problem, contender, in_use)
+    return _square(simulate(problem, contender, none, kept, horizon, 0, kinds, 0), data, horizon)
+
+
+def _with_velocities(
+    problem: DiagnosisProblem, V: Float[np.ndarray, "M 6 R"] | None
+) -> DiagnosisProblem:
+    """With filtered velocities, if there are any."""
+    return problem if V is None else replace(problem, data=replace(problem.data, V=V))
+
+
+def _kinds(
+    problem: DiagnosisProblem, contender: Contender, in_use: Sequence[int]
+) -> set[tuple[str, str]]:
+    """Causes and places of the parameters in use, or other than zero."""
+    used = {*in_use, *np.flatnonzero(np.any(contender.theta != 0, axis=1)).tolist()}
+    return {(whole(e.cause), e.where) for e in (problem.library.entries[i] for i in used)}
 
 
 def white_part(laws: Sequence[Law], problem: DiagnosisProblem) -> Float[np.ndarray, "6"]:
@@ -165,36 +196,45 @@ def _spread(fold: np.ndarray, most: int) -> np.ndarray:
     return np.array(sorted(chosen))
 
 
+def _errors_at(
+    simulated: Simulated, data: Data, horizon: float
+) -> Iterator[tuple[Float[np.ndarray, "K c S R"], Bool[np.ndarray, "F K R"]]]:
+    """By horizon, errors at the end of each window, and those that exist of each fold."""
+    every, kept = simulated.every, simulated.pieces
+    fold = data.fold[kept] == np.unique(data.fold)[:, None]
+    for steps in horizons(horizon, every, data.dt):
+        rows = np.arange(steps - 1, len(simulated.errors), every)
+        errors = simulated.errors[rows].astype(np.float64)[:, data.compared > 0]
+        yield errors, (data.weight[rows][:, kept] > 0) & fold[:, None]
+
+
+def _square(simulated: Simulated, data: Data, horizon: float) -> Float[np.ndarray, "h g F"]:
+    """Sums of squared errors without noise, by horizon, group and fold."""
+    by_horizon, parts = [], _compared(data)
+    for errors, exists in _errors_at(simulated, data, horizon):
+        total = np.stack([(errors[:, group, 0] ** 2).sum(axis=1) for group in parts])
+        by_horizon.append(np.where(exists, total[:, None], 0).sum(axis=(-2, -1)))
+    return np.stack(by_horizon)
+
+
 def _judged(simulated: Simulated, score: np.ndarray, data: Data, horizon: float) -> Judged:
-    e, every, kept = simulated.errors.astype(np.float64), simulated.every, simulated.pieces
-    at = horizons(horizon, every, data.dt)
-    fold, labels = data.fold[kept], np.unique(data.fold)
-    weight = data.weight[:, kept]
-    square = np.zeros((len(at), len(GROUPS), len(labels)))
+    at, labels = horizons(horizon, simulated.every, data.dt), np.unique(data.fold)
     energy, count = np.zeros((len(at), len(labels))), np.zeros((len(at), len(labels)))
     inside = np.zeros((len(BANDS), len(at), len(labels)))
-    parts = _compared(data)
-    for h, steps in enumerate(at):
-        rows = np.arange(steps - 1, len(e), every)
-        own, exists = e[rows], weight[rows] > 0  # (K, 12, 1 + S, R), (K, R)
-        own = own[:, data.compared > 0]
-        drawn = own[:, :, 1:]
+    for h, (errors, exists) in enumerate(_errors_at(simulated, data, horizon)):
+        drawn = errors[:, :, 1:]
         apart = np.abs(drawn[:, :, 1:] - drawn[:, :, :-1])
         with np.errstate(invalid="ignore", over="ignore"):  # of forecasts that diverge
             far = np.sqrt((drawn**2).sum(axis=1)).mean(axis=1)
             far -= np.sqrt((apart**2).sum(axis=1)).mean(axis=1) / 2
+        count[h] = exists.sum(axis=(1, 2))
+        energy[h] = np.where(exists, far, 0).sum(axis=(1, 2))
         ordered = np.sort(drawn, axis=2)
-        for f, label in enumerate(labels):
-            w = exists * (fold == label)
-            count[h, f] = w.sum()
-            energy[h, f] = (np.where(w, far, 0)).sum()
-            for g, group in enumerate(parts):
-                total = (own[:, group, 0] ** 2).sum(axis=1)
-                square[h, g, f] = np.where(w, total, 0).sum()
-            for b, band in enumerate(BANDS):
-                low, high = order_statistics(SAMPLES, band)
-                hit = (ordered[:, :, low] <= 0) & (ordered[:, :, high] >= 0)
-                inside[b, h, f] = (hit.mean(axis=1) * w).sum()
+        for b, band in enumerate(BANDS):
+            low, high = order_statistics(SAMPLES, band)
+            hit = (ordered[:, :, low] <= 0) & (ordered[:, :, high] >= 0)
+            inside[b, h] = (hit.mean(axis=1) * exists).sum(axis=(1, 2))
+    square = _square(simulated, data, horizon)
     return Judged(score, square, energy, inside, count, simulated)
 
 

@@ -25,6 +25,7 @@ CONTROLLER_PERIODS: Mapping[str, float] = {
     "figures": 0.2,
 }
 """How often each output port of a controller is logged (s); others are not."""
+_SAME = 1e-6  # s
 
 
 class Signal(NamedTuple):
@@ -120,13 +121,16 @@ def seeded(diagram: Diagram, context: Context, seed: int) -> None:
 
 
 def logged(
-    diagram: Diagram, context: Context, names: Container[str] | None = None
+    diagram: Diagram,
+    context: Context,
+    names: Container[str] | None = None,
+    since: float = 0.0,
 ) -> dict[str, Signal]:
     """All logs of a closed loop by the port's name, up to the last row that all of them have.
 
     After `AdvanceTo(t)` the updates of t are still pending, and so is its row. A Drake log that
     `extend` has added under a name `log_…` is returned unchanged. `names` are those to return, if
-    not all.
+    not all; rows before `since` (s) are left out.
 
     Example:
         >>> scenario = load_scenario("trajectory_tracking_calm")
@@ -142,16 +146,19 @@ def logged(
         if isinstance(system, SignalLog | VectorLogSink) and system.get_name().startswith("log_")
     }
     periods = {name: log.period for name, log in found.items() if isinstance(log, SignalLog)}
-    times = {name: found[name].FindLog(context).sample_times() for name in periods}
-    ends = [t[-1] + periods[name] if t.size else 0.0 for name, t in times.items()]
+    rows = {name: log.FindLog(context) for name, log in found.items()}
+    times = {name: log.sample_times() for name, log in rows.items()}
+    ends = [times[n][-1] + period if times[n].size else 0.0 for n, period in periods.items()]
     end = min(ends, default=0.0) - min(periods.values(), default=0.0) / 2
     signals = {}
-    for name, log in found.items():
+    for name, t in times.items():
         if names is not None and name not in names:
             continue
-        rows = log.FindLog(context)
-        n = np.searchsorted(times[name], end) if name in times else None
-        signals[name] = Signal(rows.sample_times()[:n].copy(), rows.data()[:, :n].T.copy())
+        first = int(np.searchsorted(t, since - _SAME))
+        last = int(np.searchsorted(t, end)) if name in periods else t.size
+        own = isinstance(found[name], SignalLog)
+        values = rows[name].data(first) if own else rows[name].data()[:, first:]
+        signals[name] = Signal(t[first:last].copy(), values[:, : last - first].T.copy())
     return signals
 
 

@@ -99,12 +99,14 @@ def test_a_flight_holds_its_pose_and_leaves_the_vehicle_as_it_was(port: int, tmp
     values = write_files(run, tmp_path, report=True)
     assert values["link"]["damaged"] == 0
     telemetry_log = tmp_path / "telemetry.tlog"
-    (told,) = import_log(telemetry_log, options=LogOptions(1.0, align=tmp_path))[0].trajectories()
+    stretches = import_log(telemetry_log, options=LogOptions(1.0, align=tmp_path))[0].trajectories()
     (flown,) = run.log.recording.trajectories()
-    first = round((told.start - flown.start) / run.log.dt)
-    assert first * run.log.dt < 1.0
-    apart = told.X_WB - flown.X_WB[first : first + len(told)]
-    assert np.abs(apart[:, :4]).max() < 0.05  # one dive, one clock, one W
+    for told in stretches:  # one, but for gaps of a busy computer
+        first = round((told.start - flown.start) / run.log.dt)
+        apart = told.X_WB - flown.X_WB[first : first + len(told)]
+        assert np.abs(apart[:, :4]).max() < 0.05  # one dive, one clock, one W
+    assert stretches[0].start - flown.start < 1.0
+    assert sum(len(told) for told in stretches) > 0.5 * len(flown)
     with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
         link.find_vehicle(15.0)
         parameters = Parameters(link)

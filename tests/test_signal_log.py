@@ -1,5 +1,7 @@
 """A row of the logs is one instant, whoever steps the diagram and whatever holds the values."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -99,6 +101,10 @@ def test_logs_belong_to_their_context():
     simulator.AdvanceTo(2.0)
     assert logged(diagram, twin)["truth"].time.size == 5
     assert logged(diagram, simulator.get_context())["truth"].time.size == 10
+    whole = logged(diagram, simulator.get_context())["truth"]
+    late = logged(diagram, simulator.get_context(), since=whole.time[7])["truth"]
+    np.testing.assert_array_equal(late.time, whole.time[7:])
+    np.testing.assert_array_equal(late.value, whole.value[7:])
 
 
 def test_what_shows_the_plants_state_is_its_truth():
@@ -125,11 +131,31 @@ def test_what_shows_the_plants_state_is_its_truth():
     assert holders((constant, 0), {}) == set()
 
 
+def test_a_growing_log_copies_nothing():
+    """So a loop in real time never waits for its own log."""
+    rows, n, size = Rows(100, 0.05), 20_000, 101 * 8
+    value = np.ones(100)
+    tracemalloc.start()
+    try:
+        for k in range(n):
+            rows.AddData(0.05 * k, value)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert n * size < most < 1.1 * n * size
+
+
 def test_rows_grow_and_keep_their_instants():
-    rows = Rows(2, 0.05)
-    for k in range(500):
+    rows, n = Rows(2, 0.05), 3000
+    assert rows.sample_times().size == 0
+    assert rows.data().shape == (2, 0)
+    for k in range(n):
         rows.AddData(0.05 * k + 1e-6, np.full(2, float(k)))
-    np.testing.assert_array_equal(rows.sample_times(), 0.05 * np.arange(500))
-    np.testing.assert_array_equal(rows.data(), np.tile(np.arange(500.0), (2, 1)))
+    for first in (0, 1, 1023, 1024, 2048, n - 1, n):
+        np.testing.assert_array_equal(rows.sample_times(first), 0.05 * np.arange(first, n))
+        np.testing.assert_array_equal(rows.data(first), np.tile(np.arange(first, n), (2, 1)))
+    t, values = rows.newest()
+    assert t == 0.05 * (n - 1)
+    assert values.tolist() == [n - 1, n - 1]
     with pytest.raises(ValueError, match="period"):
         SignalLog(1, 1e-6)

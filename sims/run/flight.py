@@ -33,7 +33,7 @@ from .flight_log import Journal, collect_flight
 from .live import LivePage, flight_view
 from .loop import Progress, Run, Timing, few_collections
 from .real_time import Clockwork, percentiles, short_turns, tick_of
-from .signals import PlanTap, log_commands, log_periods, plan_source
+from .signals import PlanTap, log_periods, plan_source
 from .trajectories import Keep, ManeuverTap
 
 _SHADOW = 3.0  # s in which the loop runs without commanding
@@ -123,7 +123,6 @@ class Cockpit:
             scenario.controller,
             hardware=True,
             log_periods=log_periods(scenario),
-            extend=log_commands(scenario),
             goal=scenario.goal,
             link=scenario.vehicle_link,
         )

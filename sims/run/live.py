@@ -211,12 +211,12 @@ def flight_view(
 
 def simulation_view(diagram: Diagram, context: Context, tap: PlanTap, words: str) -> dict[str, Any]:
     """The newest row of a simulation's log; pose and twist are the estimate."""
-    logs: list[Any] = [
-        _find_log(diagram, name, context) for name in ("X_WB", "V_WB_B", "health", "F_acting")
-    ]
-    *seen, F = (log.data()[:, -1].copy() for log in logs)
-    view = _estimate_view(tap, seen, words)
-    return view | {"F_Bo_B": F, "t": float(logs[0].sample_times()[-1])}
+    times, seen = zip(
+        *(_find_log(diagram, name, context).newest() for name in ("X_WB", "V_WB_B", "health")),
+        strict=True,
+    )
+    F = _find_log(diagram, "F_acting", context).data()[:, -1].copy()
+    return _estimate_view(tap, list(seen), words) | {"F_Bo_B": F, "t": times[0]}
 
 
 def _find_log(diagram: Diagram, name: str, context: Context) -> Any:

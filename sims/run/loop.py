@@ -285,9 +285,10 @@ def _fly(
             spent = time.perf_counter() - started
             timing.add(spent, called(k), stride)
             tap.read(round(k * dt, 9))
-            seen = [sink.FindLog(context).data() for sink in sinks]
-            for n in range(k + 1, k + stride + 1):
-                outcome = outcome or monitor.check(round(n * dt, 9), *(v[:, n] for v in seen))
+            seen = [sink.FindLog(context).data(k + 1) for sink in sinks]
+            for n in range(stride):
+                at = round((k + 1 + n) * dt, 9)
+                outcome = outcome or monitor.check(at, *(v[:, n] for v in seen))
             k, t = k + stride, round((k + stride) * dt, 9)
             outcome = outcome or maneuvers.read(t)
             watch(t)

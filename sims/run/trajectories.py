@@ -43,6 +43,7 @@ class ManeuverTap:
         self._scenario, self._diagram, self._root = scenario, diagram, root
         self._journal, self._keep = journal, keep or (lambda number, trajectory: None)
         self._index, self._left_out = 0, 0
+        self._taken = 0.0  # end of the last trajectory (s)
         if isinstance(scenario.controller, Maneuvers):
             controller: Any = diagram.GetSubsystemByName("controller")
             self.names = controller.program.names
@@ -100,11 +101,13 @@ class ManeuverTap:
 
     def _take(self, index: int) -> None:
         """Hand over the trajectories before the number `index` that were flown to their end."""
-        signals = logged(self._diagram, self._root, _NEEDED)
+        signals = logged(self._diagram, self._root, _NEEDED, self._taken)
         state = signals["maneuver"].value
         for number in range(self._index, index):
             rows = np.flatnonzero((state[:, 1] == number) & (state[:, 0] == Phase.OPEN_LOOP))
             end = rows[-1] + 1 if rows.size else 0
+            if rows.size:
+                self._taken = float(signals["maneuver"].time[end - 1])
             if rows.size and end < len(state) and state[end, 4] == 0:
                 name, repeat = self.names[number]
                 first = max(int(rows[0]) - self._lead, 0)

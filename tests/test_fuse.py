@@ -127,3 +127,14 @@ def test_the_accelerometer_counts_for_the_rate_where_nothing_else_tells_of_surge
     assert rate(25, horizontal=True) == 50
     assert rate(25, horizontal=False) == 25
     assert rate(2, horizontal=False) == 50
+
+
+def test_the_rate_of_a_stream_is_that_without_gaps_however_many_there_are():
+    def rate(steps):
+        t = np.cumsum(steps)
+        return Series(t, np.zeros((1, t.size)), "").rate
+
+    assert rate([0.05] * 40) == pytest.approx(20.0)
+    assert rate([0.05] * 40 + [30.0] * 3) == pytest.approx(20.0)
+    assert rate([0.05] * 40 + [1e5] * 60) == pytest.approx(20.0)  # stamps of a damaged log
+    assert rate([1e5] * 60) == 0.0

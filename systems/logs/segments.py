@@ -7,13 +7,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...models.recordings.resample import rotations
-from .signals import Series, Signals, Spans
+from .signals import LONGEST_STEP_S, Series, Signals, Spans
 
 _GUARD_S = 0.1
 _NOISE_STEPS = 10.0
 """Times the median step, above which a step is not of the noise: 6.7 σ of normal noise."""
-_SLOWEST_S = 60.0
-"""s: longest period of a signal that still describes a motion."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ def _outliers(off: np.ndarray, least: np.ndarray) -> np.ndarray:
 
 
 def _without_gaps(one: Series, gap: float) -> Spans:
-    allowed = max(gap, min(5.0 / one.rate, _SLOWEST_S) if one.rate else gap)
+    allowed = max(gap, min(5.0 / one.rate, LONGEST_STEP_S) if one.rate else gap)
     good = np.isfinite(one.t)
     t = one.t[good]
     breaks = np.flatnonzero(np.diff(t) > allowed)

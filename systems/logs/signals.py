@@ -15,6 +15,9 @@ from ...models.recordings.checks.finding import Finding
 from ...models.recordings.schema import LIMITS
 from ..mavlink.codec import filter_delay
 
+LONGEST_STEP_S = 60.0
+"""s between samples that still describe a motion; longer steps are gaps."""
+
 
 @dataclass(frozen=True)
 class Series:
@@ -30,6 +33,7 @@ class Series:
     def rate(self) -> float:
         """Mean rate without gaps (Hz)."""
         steps = np.diff(self.t)
+        steps = steps[steps <= LONGEST_STEP_S]
         return 1.0 / float(np.mean(steps[steps <= 5 * np.median(steps)])) if steps.size else 0.0
 
 

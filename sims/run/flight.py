@@ -264,6 +264,7 @@ class Cockpit:
         numbers = {
             "loop": {
                 "period_ms": 1e3 * self.clockwork.tick,
+                "real_time_priority": self.clockwork.urgent,
                 **{f"lateness_{k}_ms": v for k, v in percentiles(self.clockwork.late).items()},
                 **{f"duration_{k}_ms": v for k, v in percentiles(self.clockwork.busy).items()},
                 **{f"command_{k}_ms": v for k, v in percentiles(self.journal.late).items()},

@@ -286,9 +286,8 @@ def _fly(
             timing.add(spent, called(k), stride)
             tap.read(round(k * dt, 9))
             seen = [sink.FindLog(context).data(k + 1) for sink in sinks]
-            for n in range(stride):
-                at = round((k + 1 + n) * dt, 9)
-                outcome = outcome or monitor.check(at, *(v[:, n] for v in seen))
+            for n, step in enumerate(range(k + 1, k + stride + 1)):
+                outcome = outcome or monitor.check(round(step * dt, 9), *(v[:, n] for v in seen))
             k, t = k + stride, round((k + stride) * dt, 9)
             outcome = outcome or maneuvers.read(t)
             watch(t)

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
+from ...systems.mavlink.urgent import urgent
+
 _PASS = 1e-3  # s beyond a tick, so that all updates of its time are done
 _TURN = 2e-4  # s
 
@@ -42,6 +44,7 @@ class Clockwork:
         epoch: local monotonic time of time 0 (s).
         late: how late each tick began (s).
         busy: how long its events took (s).
+        urgent: whether the system has given the loop a real-time priority.
     """
 
     simulator: Simulator
@@ -49,6 +52,7 @@ class Clockwork:
     epoch: float
     late: list[float] = field(default_factory=list)
     busy: list[float] = field(default_factory=list)
+    urgent: bool = False
 
     @property
     def time(self) -> float:
@@ -57,6 +61,10 @@ class Clockwork:
 
     def run(self, until: float, each: Callable[[float], bool] = lambda t: True) -> None:
         """Advance tick by tick up to `until` (s), as long as `each` of the tick's time is true."""
+        with urgent() as self.urgent:
+            self._run(until, each)
+
+    def _run(self, until: float, each: Callable[[float], bool]) -> None:
         while (t := self.time) <= until + 1e-9:
             wait = self.epoch + t - time.monotonic()
             if wait > 0:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO, NamedTuple
 
 from ...models.config.errors import UserError
@@ -20,6 +19,7 @@ from .clock import MICROSECONDS_32, MILLISECONDS_32, VehicleClock
 from .config import GROUND_STATION
 from .dialect import Message, Parser, mavlink
 from .transport import Connection, Lost, Transport
+from .urgent import urgent
 
 _HEARTBEAT, _TIMESYNC, _RETRY = 0.5, 0.5, 1.0  # s between heartbeats, TIMESYNC requests, attempts
 _WAIT = 0.05  # s: longest wait for data
@@ -121,12 +121,7 @@ class Link:
     def __enter__(self) -> "Link":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -273,6 +268,7 @@ class Link:
 
     # -------------------------------------------------------------------------------------- thread
 
+    @urgent()
     def _run(self) -> None:
         due = {"heartbeat": 0.0, "timesync": 0.0, "booted": 0.0}
         while not self._closing:

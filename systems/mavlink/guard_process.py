@@ -27,6 +27,7 @@ from .dialect import Message, mavlink
 from .link import Link, Peer
 from .parameters import Borrowed, Parameters
 from .transport import Connection
+from .urgent import urgent
 
 _BEAT, _BUSY, _PILOT, _RELEASE, _LEAVE = b".", b"w", b"p", b"!", b"?"
 _PATIENCE = {_BEAT: 1.0, _BUSY: 30.0, _PILOT: 30.0}  # s without a word, after the last one
@@ -174,6 +175,7 @@ def _tell(*sentences: str) -> None:
     sys.stderr.write("".join(f"spinndrift guard: {sentence}\n" for sentence in sentences))
 
 
+@urgent()
 def main(arguments: list[str]) -> int:
     """Guard; the exit status is 0 after a release, 1 after a rescue, 2 if that failed."""
     where, system, parent, file = arguments

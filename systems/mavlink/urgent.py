@@ -1,7 +1,7 @@
-"""Threads that the computer runs before all others: the loop's and the link's.
+"""Threads that the computer runs before all others: of the loop, the link and the guard.
 
 They need little time, but at once. On a busy computer a thread of usual priority may wait for a
-second, until which guards have stopped the vehicle.
+second, and guards stop the vehicle before that.
 """
 
 import os

@@ -99,7 +99,8 @@ def test_a_flight_holds_its_pose_and_leaves_the_vehicle_as_it_was(port: int, tmp
     values = write_files(run, tmp_path, report=True)
     assert values["link"]["damaged"] == 0
     telemetry_log = tmp_path / "telemetry.tlog"
-    stretches = import_log(telemetry_log, options=LogOptions(1.0, align=tmp_path))[0].trajectories()
+    imported, _ = import_log(telemetry_log, options=LogOptions(1.0, align=tmp_path))
+    stretches = list(imported.trajectories())
     (flown,) = run.log.recording.trajectories()
     for told in stretches:  # one, but for gaps of a busy computer
         first = round((told.start - flown.start) / run.log.dt)

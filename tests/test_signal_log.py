@@ -1,6 +1,7 @@
 """A row of the logs is one instant, whoever steps the diagram and whatever holds the values."""
 
 import tracemalloc
+from bisect import bisect_left
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from spinndrift.systems.compiled.network import flatten, holders
 from spinndrift.systems.compiled.pure import Event, Pure, shown
 from spinndrift.systems.compiled.signal_log import Rows, SignalLog, add_log
 from spinndrift.systems.compiled.simulator import CompiledSimulator
+from spinndrift.systems.growing_rows import GrowingRows
 
 
 class Moves(LeafSystem):
@@ -159,3 +161,16 @@ def test_rows_grow_and_keep_their_instants():
     assert values.tolist() == [n - 1, n - 1]
     with pytest.raises(ValueError, match="period"):
         SignalLog(1, 1e-6)
+
+
+def test_growing_rows_are_a_sequence_of_rows():
+    rows, n = GrowingRows(2), 2500
+    for k in range(n):
+        rows.new()[:] = k, -k
+    assert len(rows) == n
+    for k in (0, 1023, 1024, n - 1, -1, -n):
+        assert rows[k].tolist() == [k % n, -(k % n)]
+    for k in (n, -n - 1):
+        with pytest.raises(IndexError, match=f"row {k} of {n}"):
+            rows[k]
+    assert bisect_left(rows, 1500.5, key=lambda row: row[0]) == 1501

@@ -3,6 +3,7 @@
 import math
 import time
 from bisect import bisect_left
+from collections import deque
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ...systems.closed_loop import Signal
+from ...systems.growing_rows import GrowingRows
 from ...systems.mavlink import telemetry
 from ...systems.mavlink.driver import Acted, Driver
 from ...systems.mavlink.safety import AGED
@@ -23,6 +25,8 @@ ORDERS = ("fly", "neutral", "hold_depth", "disarm", "yield")
 AGES = tuple(age for age, *_ in AGED.values())
 """Names of the ages in the log, in their order."""
 _SAME = 1e-6  # s
+_NOTED = ("t", "order", "voltage", "silence", "F", "expected", "shown", "ages")
+_KEPT = 3  # calls: one of them is that of the newest row of the log
 _RECENT = 60.0  # s for which a text of the vehicle is shown
 _NOTES = (
     "X_WB and V_WB_B are the estimate, flown on a vehicle; there is no truth.",
@@ -50,7 +54,10 @@ class Journal:
 
     def __init__(self, driver: Driver):
         self._driver = driver
-        self.entries: list[Entry] = []
+        n = driver.thrusters
+        self._sizes = (1, 1, 1, 1, 6, n, n, len(AGES))
+        self._rows = GrowingRows(sum(self._sizes))
+        self._newest: deque[Entry] = deque(maxlen=_KEPT)
         self.late: list[float] = []
         """Time from the planned instant of each command to its end (s)."""
         self.reason = ""
@@ -71,15 +78,16 @@ class Journal:
         order, volts = ORDERS.index(acted.order), telemetry.battery(driver.link)
         silence = driver.link.silence
         entry = Entry(t, order, acted.F_Bo_B, sent, shown, volts, silence, acted.ages)
-        self.entries.append(entry)
+        self._newest.append(entry)
+        numbers = t, order, volts, silence
+        self._rows.new()[:] = np.hstack([numbers, acted.F_Bo_B, sent, shown, _ages(entry)])
         self.reason, self.tripped = acted.reason, acted.tripped
         if self.epoch is not None:
             self.late.append(now - self.epoch - t)
 
     def before(self, t: float) -> Entry | None:
         """The newest entry of time t (s) or before, which the log has at t."""
-        newest = reversed(self.entries[-3:])
-        return next((entry for entry in newest if entry.t <= t + _SAME), None)
+        return next((entry for entry in reversed(self._newest) if entry.t <= t + _SAME), None)
 
     @property
     def finished(self) -> bool:
@@ -88,9 +96,9 @@ class Journal:
 
     def words(self) -> str:
         """The present state in a few words."""
-        if not self.entries:
+        if not self._newest:
             return ""
-        last = self.entries[-1]
+        last = self._newest[-1]
         volts = "" if math.isnan(last.voltage) else f", {last.voltage:.1f} V"
         return f"{ORDERS[last.order]}{volts}"
 
@@ -110,21 +118,19 @@ class Journal:
 
     def summary(self) -> dict[str, Any]:
         """Times in each order (s), the reason, the lowest voltage, the longest silence."""
-        times = np.array([entry.t for entry in self.entries])
-        orders = np.array([entry.order for entry in self.entries], int)
+        noted = self._noted()
+        times, orders = noted["t"][:, 0], noted["order"][:, 0]
         spent = np.diff(times, append=times[-1:])
         found: dict[str, Any] = {
             f"{name}_s": float(spent[orders == i].sum())
             for i, name in enumerate(ORDERS)
             if np.any(orders == i)
         }
-        volts = np.array([entry.voltage for entry in self.entries])
-        known = volts[np.isfinite(volts)]
-        silences = [entry.silence for entry in self.entries]
+        known = noted["voltage"][np.isfinite(noted["voltage"])]
         return found | {
             "reason": self.reason or None,
             "lowest_voltage_V": float(known.min()) if known.size else None,
-            "longest_silence_s": max(silences, default=None),
+            "longest_silence_s": float(noted["silence"].max()) if times.size else None,
         }
 
     def steps(self, grid: Float[np.ndarray, " n"], dt: float) -> dict[str, np.ndarray]:
@@ -132,39 +138,42 @@ class Journal:
 
         With the voltage and the outputs that the vehicle showed at the step's begin.
         """
-        entries = self.entries[bisect_left(self.entries, grid[0] - 1.0, key=lambda e: e.t) :]
-        times = np.array([entry.t for entry in entries])
+        noted = self._noted(bisect_left(self._rows, grid[0] - 1.0, key=lambda row: row[0]))
+        times = noted["t"][:, 0]
         index = np.clip(np.searchsorted(times, grid + _SAME, side="right") - 1, 0, None)
         ahead = times - grid[0]
-        sent = {
-            "F_Bo_B": np.stack([entry.F_Bo_B for entry in entries]),
-            "pwm": np.stack([entry.expected for entry in entries]),
-        }
+        sent = {"F_Bo_B": noted["F"], "pwm": noted["expected"]}
         inside = (ahead > -_SAME) & (ahead < grid[-1] - grid[0] + dt - _SAME)
         found = {
             name: mean_over(Signal(ahead[inside], v[inside]), grid - grid[0], dt)
             for name, v in sent.items()
         }
-        volts = np.array([entry.voltage for entry in entries])[index]
+        volts = noted["voltage"][index, 0]
         if np.isfinite(volts).all():
             found["voltage"] = volts
-        return found | {"pwm_shown": np.stack([entry.shown for entry in entries])[index]}
+        return found | {"pwm_shown": noted["shown"][index]}
 
     def at(self, grid: Float[np.ndarray, " n"]) -> dict[str, np.ndarray]:
         """Variables of a log over the times of the grid."""
-        times = np.array([entry.t for entry in self.entries])
+        noted = self._noted()
+        times = noted["t"][:, 0]
         index = np.clip(np.searchsorted(times, grid + _SAME, side="right") - 1, 0, None)
         columns = {
-            "pwm": np.stack([entry.shown for entry in self.entries]),
-            "pwm_commanded": np.stack([entry.expected for entry in self.entries]),
-            "guard_order": np.array([[entry.order] for entry in self.entries], float),
-            "voltage": np.array([entry.voltage for entry in self.entries]),
-            "silence": np.array([[entry.silence] for entry in self.entries]),
-            "guard_ages": np.array([_ages(entry) for entry in self.entries]),
+            "pwm": noted["shown"],
+            "pwm_commanded": noted["expected"],
+            "guard_order": noted["order"],
+            "voltage": noted["voltage"][:, 0],
+            "silence": noted["silence"],
+            "guard_ages": noted["ages"],
         }
-        sent = Signal(times, np.stack([entry.F_Bo_B for entry in self.entries]))
+        sent = Signal(times, noted["F"])
         dt = float(grid[1] - grid[0]) if grid.size > 1 else 1.0
         return {"F_Bo_B": mean_over(sent, grid, dt)} | {n: c[index] for n, c in columns.items()}
+
+    def _noted(self, first: int = 0) -> dict[str, Float[np.ndarray, "n _"]]:
+        """What was noted from one call on, by name."""
+        parts = np.split(self._rows.since(first), np.cumsum(self._sizes)[:-1], axis=1)
+        return dict(zip(_NOTED, parts, strict=True))
 
 
 def without_horizontal(X: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -181,10 +190,10 @@ def without_horizontal(X: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, np.nda
     return X, V, climb
 
 
-def _ages(entry: Entry) -> list[float]:
+def _ages(entry: Entry) -> Float[np.ndarray, " a"]:
     """Ages in the order of `AGES`; NaN for those that there are not, or that are infinite."""
     found = [entry.ages.get(name, math.nan) for name in AGES]
-    return [math.nan if math.isinf(age) else age for age in found]
+    return np.array([math.nan if math.isinf(age) else age for age in found])
 
 
 def collect_flight(

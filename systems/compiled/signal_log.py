@@ -21,54 +21,38 @@ from pydrake.systems.framework import (
 )
 
 from ..drake import value
+from ..growing_rows import GrowingRows
 
 _ASIDE = 1e-6
 """Offset from an instant at which ports are read (s): more than the rounding difference between
 times of simultaneous events (1e-11 s after a day), far less than any period."""
-_BLOCK = 1024
-"""Rows that are allocated at once."""
 
 
 class Rows:
-    """Values of a port at multiples of a period, with the interface of Drake's `VectorLog`.
-
-    They are kept in blocks, so that nothing is copied as the log grows: a loop in real time would
-    wait for that.
-    """
+    """Values of a port at multiples of a period, with the interface of Drake's `VectorLog`."""
 
     def __init__(self, size: int, period: float):
-        self._period, self._size, self._count = period, size, 0
-        self._times: list[Float[np.ndarray, " b"]] = []
-        self._values: list[Float[np.ndarray, "b size"]] = []
+        self._period = period
+        self._rows = GrowingRows(1 + size)  # the instant first
 
     def AddData(self, time: float, value: Float[np.ndarray, " size"]) -> None:
         """Append a row that was read slightly before or after its instant."""
-        at = self._count % _BLOCK
-        if at == 0:
-            self._times.append(np.empty(_BLOCK))
-            self._values.append(np.empty((_BLOCK, self._size)))
-        self._times[-1][at] = round(time / self._period) * self._period
-        self._values[-1][at] = value
-        self._count += 1
+        row = self._rows.new()
+        row[0] = round(time / self._period) * self._period
+        row[1:] = value
 
     def sample_times(self, first: int = 0) -> Float[np.ndarray, " n"]:
         """The instants (s) of the rows from `first` on."""
-        return self._from(self._times, first) if self._times else np.zeros(0)
+        return self._rows.since(first)[:, 0]
 
     def data(self, first: int = 0) -> Float[np.ndarray, "size n"]:
         """The values of the rows from `first` on, one column per instant."""
-        return self._from(self._values, first).T if self._values else np.zeros((self._size, 0))
+        return self._rows.since(first)[:, 1:].T
 
     def newest(self) -> tuple[float, Float[np.ndarray, " size"]]:
         """The last row: its instant (s) and its values."""
-        at = (self._count - 1) % _BLOCK
-        return float(self._times[-1][at]), self._values[-1][at].copy()
-
-    def _from(self, blocks: list[np.ndarray], first: int) -> np.ndarray:
-        start = min(first // _BLOCK, len(blocks) - 1)
-        kept = blocks[start:]
-        whole = kept[0] if len(kept) == 1 else np.concatenate(kept)
-        return whole[first - start * _BLOCK : self._count - start * _BLOCK]
+        row = self._rows[-1].copy()
+        return float(row[0]), row[1:]
 
 
 class SignalLog(LeafSystem):

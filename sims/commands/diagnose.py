@@ -50,7 +50,7 @@ class Diagnose:
     """Disturbance that is believed with a preset: b of surge, sway, heave (N√s), roll, pitch, yaw
     (N·m√s). Without it a wrong level of the disturbance can't be found."""
     against: Path | None = None
-    """Healthy runs: what differs from them in DATA, as changes of causes, or that nothing does. A
+    """Healthy runs, to report what has changed in DATA since them. A
     folder that `diagnose` wrote for them (their data are read again), healthy data in any form that
     DATA may have (diagnosed first, with the options given), or a folder of several recordings."""
     alpha: Annotated[float, RATE_OF_ALARMS] = 0.01
@@ -61,7 +61,8 @@ class Diagnose:
     (`scales`), added mass, drag and buoyancy (`linear`), drag, buoyancy and the scale of each axis'
     command, where commands pass through gains that are not known (`command`), or all of a grey box
     (these, the thrusters' curve, dead band and levers, restoring moment), for a belief that is
-    wrong in most of them. `auto` fits none, or all where left-out data refuse the names."""
+    wrong in most of them. `auto` first fits none; if left-out data reject the result, it
+    repeats with `all`."""
     water_density: Annotated[float | None, WATER_DENSITY] = None
     """kg/m³, if a log's autopilot assumed fresh water in the sea (as in `spinndrift import`)."""
     accept: tuple[str, ...] = ()

@@ -56,7 +56,7 @@ class Import:
     """Topic map of a ROS bag (YAML); without a file, print a proposal and import nothing."""
     align: Path | None = None
     """Recording of the same dive (.nc), or the folder of its run: the log is cut to it, with its
-    samples, times and world frame. So a .BIN that is fetched from the vehicle joins what flew."""
+    samples, times and world frame: a .BIN that is fetched from the vehicle onto those of the run."""
     accept: tuple[str, ...] = ()
     """Words of severe findings on the data that are accepted (docs/checks.md), such as no-commands.
     """
@@ -116,7 +116,7 @@ class Import:
         shown = console()
         shown.print(summarize(recording), markup=False)
         print_findings(shown, recording)
-        shown.print("what the other commands take of it:")
+        shown.print("what the other commands can use of it:")
         for line in acceptance(recording):
             shown.print(f"  {line}", markup=False, soft_wrap=True)
         shown.print(f"wrote {out}")

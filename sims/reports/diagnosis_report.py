@@ -25,8 +25,8 @@ _LEFT_OUT = {
     "nothing": "Nothing could be left out: the models are judged on what they were fitted to.",
 }
 _UNITS = (
-    "Both models are measured in one noise, that estimated with the causes: by noise levels of its "
-    "own, which hold some of its errors, a wrong belief would look like noise."
+    "Both models are measured in one noise, that estimated with the causes: with its own noise "
+    "estimate a wrong model would hide its errors in the noise."
 )
 _NOISE = {
     "position_m": "of positions / m",
@@ -46,7 +46,7 @@ _WORDS = {
     "p": "The probability that noise alone makes one of all names look so good. Runs are counted "
     "as independent, samples are not.",
     "innovation": "The error of a prediction over one step that is not the noise of the record it "
-    "starts from. Of a right model it is noise: 1 in variance, without memory.",
+    "starts from. For a right model it has unit variance and is uncorrelated in time.",
     "belief": "The model that was given, as it is.",
     "refitted": "The belief with its coefficients fitted (added mass, drag and buoyancy, unless "
     "others are asked for) and no cause named: what tuning alone wins.",

@@ -30,7 +30,7 @@ def names_figure(finding: Finding, most: int = 14) -> Figure:
     ax.axvline(finding.diagnosis.threshold, color=PLANNED, lw=1.2, ls="--")
     ax.set_xscale("log")
     ax.set_xlim(left=0.1)
-    ax.set_xlabel("nats won on scenarios left out (dashed: what noise alone can win)")
+    ax.set_xlabel("nats won on left-out data (dashed: what noise alone can win)")
     ax.set_title("Every name tried alone: the best ones")
     return figure
 

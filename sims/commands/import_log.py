@@ -56,7 +56,7 @@ class Import:
     """Topic map of a ROS bag (YAML); without a file, print a proposal and import nothing."""
     align: Path | None = None
     """Recording of the same dive (.nc), or the folder of its run: the log is cut to it, with its
-    samples, times and world frame: a .BIN that is fetched from the vehicle onto those of the run."""
+    samples, times and world frame, as with a .BIN that is fetched from the vehicle."""
     accept: tuple[str, ...] = ()
     """Words of severe findings on the data that are accepted (docs/checks.md), such as no-commands.
     """

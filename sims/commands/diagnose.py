@@ -50,8 +50,9 @@ class Diagnose:
     """Disturbance that is believed with a preset: b of surge, sway, heave (N√s), roll, pitch, yaw
     (N·m√s). Without it a wrong level of the disturbance can't be found."""
     against: Path | None = None
-    """Healthy runs, to report what has changed in DATA since them. A folder that `diagnose` wrote for them (their data are read again), healthy data in any form that
-    DATA may have (diagnosed first, with the options given), or a folder of several recordings."""
+    """Healthy runs, to report what has changed in DATA since them. A folder that `diagnose` wrote
+    for them (their data are read again), healthy data in any form that DATA may have (diagnosed
+    first, with the options given), or a folder of several recordings."""
     alpha: Annotated[float, RATE_OF_ALARMS] = 0.01
     """Rate of false alarms over all names together; with `--against` calibrated on healthy runs,
     each left out in turn."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from helpers import ROOT
 from spinndrift.models import disturbances, se3
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects import KINDS, Extended, Library
@@ -15,6 +16,7 @@ from spinndrift.models.effects.deterministic_step import advance
 from spinndrift.models.effects.drag import COUPLINGS
 from spinndrift.models.effects.following import FOLLOWERS, ramped, taken_up
 from spinndrift.models.effects.library import COEFFICIENTS
+from spinndrift.models.effects.page import effects_page
 from spinndrift.models.effects.recent import Recent
 from spinndrift.models.effects.thrust import REFERENCE
 from spinndrift.models.effects.unknown import Unknown
@@ -649,3 +651,9 @@ def test_no_effect_has_the_class_name_of_a_disturbance():
     """Where both model one thing, the effect's class ends in `Effect`."""
     own = {cls.__name__ for cls in (*KINDS.values(), *COEFFICIENTS.values())}
     assert not own & set(vars(disturbances))
+
+
+def test_the_page_of_effects_is_that_of_their_classes():
+    page = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
+    assert page == effects_page(), "write docs/effects.md anew from effects_page()"
+    assert all(f"| `{name}` |" in page for name in KINDS)

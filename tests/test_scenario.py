@@ -13,6 +13,7 @@ from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects.effect_config import EffectConfig, check_distinct
 from spinndrift.sims.run.loop import simulate
 from spinndrift.sims.scenarios.criteria import FollowPath, ReachGoal
+from spinndrift.sims.scenarios.page import scenario_page
 from spinndrift.sims.scenarios.scenario import Scenario, load_scenario, overridden, scenario_names
 from spinndrift.systems.controllers.kinds import MppiImpedance, TrackReference
 
@@ -198,3 +199,13 @@ def test_an_effect_twice_at_one_place_is_told():
     for twice in ((lag, one, one), (lag, replace(lag, where="all"))):
         with pytest.raises(UserError, match=r"thruster_lag.*is there twice"):
             check_distinct(twice)
+
+
+def test_the_page_of_keys_is_that_of_the_classes_and_each_key_has_a_meaning():
+    page = (ROOT / "docs" / "scenario.md").read_text(encoding="utf-8")
+    assert page == scenario_page(), "write docs/scenario.md anew from scenario_page()"
+    rows = [line for line in page.splitlines() if line.startswith("| `")]
+    assert len(rows) > 200
+    assert [row for row in rows if row.endswith("|  |")] == []
+    linked = set(re.findall(r"\]\(#(\w+)\)", page))
+    assert linked <= {line[3:].lower() for line in page.splitlines() if line.startswith("## ")}

@@ -21,7 +21,12 @@ _from_position_rpy = jax.jit(se3.from_position_rpy)
 
 @dataclass(frozen=True)
 class PoseConfig:
-    """A pose as position (m, W) and roll, pitch, yaw (degrees)."""
+    """A pose as position and roll, pitch, yaw.
+
+    Attributes:
+        position: of Bo in W (m).
+        rpy_deg: roll, pitch and yaw (degrees).
+    """
 
     position: Vector3 = (0.0, 0.0, 0.0)
     rpy_deg: Vector3 = (0.0, 0.0, 0.0)

@@ -37,6 +37,7 @@ class Sensing:
         compass: the compass.
         more: further sensors by the names of their ports.
         faults: of the sensors' outputs (`docs/sensor-faults.md`); the filter does not know of them.
+        ekf: settings of the filter.
         filter: user-defined, in place of the one that `ekf` configures.
     """
 

@@ -283,6 +283,7 @@ def test_a_scenario_names_faults():
         ("{sensor: depth, fault: nan, share: 1.1}", "share is 1.1"),
         ("{sensor: depth, fault: nan, start: -1}", "start is -1"),
         ("{sensor: depth, fault: nan, duration: -1}", "duration is -1.0: .*leave it out"),
+        ("{sensor: compass, fault: offset, size: 40}", "size is 40.0: .*in radians: give -π to π"),
     ],
 )
 def test_what_makes_no_sense_is_refused_with_a_remedy(text, message):

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from spinndrift.models.sensors import Compass, DepthSensor, Dvl, Imu
 from spinndrift.systems.estimation.trust import (
@@ -215,3 +216,15 @@ def test_a_pull_of_a_suspect_is_one_deviation_and_the_shape_stays():
     assert np.linalg.eigvalsh(after).min() > 0
     healthy = with_doubt(jnp.asarray(P), jnp.asarray(pulled), NONE)
     np.testing.assert_allclose(healthy, P)
+
+
+@pytest.mark.parametrize("exact", [slice(9, 12), slice(3, 6), slice(4, 5)])
+def test_what_is_known_exactly_stays_so_under_doubt(exact):
+    """A bias that is said to be zero has no variance; the covariance is not NaN for it."""
+    A = np.random.default_rng(3).standard_normal((18, 18)) * 0.1
+    A[exact] = 0.0
+    pulled = np.random.default_rng(4).standard_normal((3, 18)) @ A.T  # corrections are in P's range
+    after = np.asarray(with_doubt(jnp.asarray(A @ A.T), jnp.asarray(pulled), ALL))
+    assert np.isfinite(after).all()
+    assert not after[exact].any()
+    assert after[0, 0] >= (A @ A.T)[0, 0]

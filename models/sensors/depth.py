@@ -29,6 +29,8 @@ class DepthSensor(Gauge):
         water_density: density of the water (kg/m³).
         assumed_density: density that the reading is computed with (kg/m³); fresh water's 1000 in
             sea water overstates depth by 2.5 %.
+        deepest: the largest depth that it measures (m), by default that of the oceans; a reading
+            that is larger is invalid.
     """
 
     rate: float = 10.0
@@ -37,6 +39,7 @@ class DepthSensor(Gauge):
     offset_std: float = 0.01
     water_density: float = 1025.0
     assumed_density: float = 1025.0
+    deepest: float = 11_000.0
 
     observes: ClassVar[Literal["position"]] = "position"
     stuck_after: ClassVar[int] = 8  # its resolution may be as coarse as its noise
@@ -47,6 +50,7 @@ class DepthSensor(Gauge):
         self._require_not_negative("noise", "offset_std")
         for field in ("water_density", "assumed_density"):
             require(getattr(self, field) > 0, self, field, "give a density above zero")
+        require(self.deepest > 0, self, "deepest", "give a depth above zero")
 
     @property
     def noise_size(self) -> int:
@@ -57,6 +61,11 @@ class DepthSensor(Gauge):
     def slow_error(self) -> tuple[float, float]:
         """The offset."""
         return self.offset_std, math.inf
+
+    @property
+    def largest(self) -> float:
+        """The deepest depth."""
+        return self.deepest
 
     def innovation(
         self,

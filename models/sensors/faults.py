@@ -110,6 +110,13 @@ class SensorFault:
         which = "0 is the only one" if n == 1 else f"take some of 0 to {n - 1}, each once"
         remedy = f"of the values of {self.sensor} {which}"
         require(within and not several, self, "components", remedy)
+        turned = sensor.observes == "attitude" and self.fault in ("offset", "constant")
+        require(
+            not turned or abs(self.size or 0.0) <= math.pi,
+            self,
+            "size",
+            f"angles of {self.sensor} are in radians: give -π to π (40° are 0.698)",
+        )
 
     def readings(self, rate: float) -> tuple[float, float]:
         """Number of the first affected reading, and of the first one after the fault."""

@@ -40,6 +40,7 @@ _MOVES_AGAIN = 3.0  # s for which a sensor that was stuck is suspect: it was rig
 _RECENT = 20.0  # memory, in readings, of the pulls of a sensor that is not suspect
 _ALONE = {"velocity": 10.0, "position": 60.0, "attitude": 60.0}
 """Time (s) for which the IMU alone predicts velocity, depth and yaw accurately enough."""
+_EXACT = 1e-12  # variance, as a share of the block's largest one, of what is said to be exact
 _BIASED = 0.8  # mean of normalised innovations: white ones have a deviation of 0.16 over `_RECENT`
 _OUTLIER = 2.0
 """Bound on each normalised innovation before it enters the mean. In ten hours of a DVL with 1 %
@@ -326,7 +327,11 @@ def with_doubt(
     multiplied by s: the pull is then one standard deviation.
     """
     starts, n = range(0, INERTIAL, 3), pulled.shape[0]
-    inverses = jax.vmap(small_inverse)(jnp.stack([P[k : k + 3, k : k + 3] for k in starts]))
+    blocks = jnp.stack([P[k : k + 3, k : k + 3] for k in starts])
+    largest = jnp.max(jnp.abs(blocks), axis=(1, 2), keepdims=True)
+    # what is known exactly, such as a bias that is said to be zero, has no inverse and no pull
+    blocks += _EXACT * jnp.where(largest > 0, largest, 1) * jnp.eye(3, dtype=P.dtype)[None]
+    inverses = jax.vmap(small_inverse)(blocks)
     d = pulled[:, :INERTIAL].reshape(n, len(starts), 3)
     s = jnp.sum(jnp.sum(d[:, :, None] * inverses[None], axis=3) * d, axis=2)
     s = jnp.maximum(jnp.max(jnp.where(suspect[:, None], s, 1), axis=0), 1)

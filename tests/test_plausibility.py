@@ -70,7 +70,7 @@ def test_forces_in_another_unit_are_refused(name, unit):
 def test_masses_lengths_and_inertias_in_another_unit_are_refused(name):
     vehicle = load_vehicle(name)
     for scale in SCALES.values():
-        with pytest.raises(UserError, match="weight is .*`mass` in kg"):
+        with pytest.raises(UserError, match=r"weight is .*`mass` in kg"):
             replace(vehicle, mass=vehicle.mass * scale)
     for scale in LENGTHS.values():
         size = [scale * a for a in vehicle.size]

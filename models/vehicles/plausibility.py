@@ -108,6 +108,7 @@ def _check_lengths(vehicle: Any) -> None:
         "give length, width and height in m",
     )
     diagonal = float(np.linalg.norm(vehicle.size))
+    places: dict[tuple[str | int, ...], tuple[float, ...]]
     places = {(name,): getattr(vehicle, name) for name in ("center_of_mass", "center_of_buoyancy")}
     for k, mount in enumerate(vehicle.propulsion.mounts):
         places["propulsion", "mounts", k, "position"] = mount.position

@@ -55,6 +55,7 @@ class Evaluate:
         with interrupts_held():
             from ...models.recordings.checks.examine import examine
             from ...models.recordings.checks.finding import check_accepted
+            from ...models.vehicles.places import load_named
             from ...models.vehicles.vehicle import load_vehicle
             from ...systems.logs.load import load_data
             from ..learning import Start, compare, prepared
@@ -64,8 +65,10 @@ class Evaluate:
             raise UserError(f"--out {self.out}: end the name in .csv, .json or .nc")
         check_accepted(self.accept)
         start, metadata = Start.read(self.model)
-        name = self.vehicle or metadata.get("vehicle") or "bluerov2_heavy"
-        vehicle = load_vehicle(name)
+        if self.vehicle is not None:
+            vehicle = load_vehicle(self.vehicle)
+        else:
+            vehicle = load_named(metadata.get("vehicle") or "bluerov2_heavy", str(self.model))
         with progress_bar(f"reading {self.data.name}") as update:
             recording = load_data(
                 self.data, vehicle=self.vehicle, accept=self.accept, progress=update

@@ -56,7 +56,9 @@ class Generate:
         with interrupts_held():
             from ...models.disturbances import preset
             from ...models.files.checkpoint import load_model
+            from ...models.recordings.store import Recording
             from ...models.recordings.summary import summarize
+            from ...models.vehicles.places import absolute
             from ...models.vehicles.vehicle import load_vehicle
             from ...training.data.generate import generate
 
@@ -69,6 +71,7 @@ class Generate:
             recording = generate(
                 GenerateConfig(**vars(self.config)), vehicle, (disturbance,), dynamics
             )
+        recording = Recording(recording.dataset.assign_attrs(vehicle=absolute(self.vehicle)))
         recording.save(self.out)
         shown = console()
         shown.print(summarize(recording))

@@ -15,6 +15,7 @@ from spinndrift.models.recordings.build import Trajectory
 from spinndrift.models.recordings.checks.examine import examine
 from spinndrift.models.recordings.csv import write_csv
 from spinndrift.models.recordings.store import Recording
+from spinndrift.models.recordings.summary import summarize
 from spinndrift.models.vehicles.places import absolute, load_named, named_in
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.acceptance import acceptance
@@ -154,3 +155,44 @@ def test_acceptance_says_which_part_is_too_short():
     told = lines(made())["train"]
     assert "held out (the last 25% of each, less a gap of 1 s) lasts 1.45 s" in told
     assert "a window needs 4 s" in told
+
+
+# ---------------------------------------------------------------------------- what is named wrongly
+
+
+def test_a_folder_and_exchanged_arguments_are_told(tmp_path, capsys):
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    said = refused(capsys, "evaluate", folder, tmp_path / "mine.spinn")
+    assert f"comes first and the data second: spinndrift evaluate {tmp_path / 'mine.spinn'}" in said
+    (folder / "model.spinn").touch()
+    said = refused(capsys, "evaluate", folder, tmp_path / "mine.nc")
+    assert f"{folder}: is a folder; name a model file, such as {folder / 'model.spinn'}" in said
+
+
+def test_options_are_named_as_they_are_given(tmp_path, capsys):
+    made().save(tmp_path / "a.nc")
+    where = tmp_path / "a.nc"
+    said = refused(capsys, "export", where, tmp_path / "a.mcap", "--scenario", "nope")
+    assert said.startswith(
+        f"spinndrift: {where}: --scenario nope: is not here; the recording has a"
+    )
+    said = refused(capsys, "import", where, "--out", tmp_path / "b.nc", "--water-density", "1025")
+    assert said.startswith(f"spinndrift: {where}: --water-density is for logs of a vehicle")
+    said = refused(capsys, "generate", "--out", tmp_path / "c.nc", "--maneuvers")
+    assert said.startswith("spinndrift: --maneuvers: give at least one")
+
+
+def test_an_effect_on_a_thruster_that_is_not_there_is_told_by_its_field(tmp_path):
+    text = (ROOT / "sims/scenarios/station_keeping_calm.yaml").read_text(encoding="utf-8")
+    effect = "{name: thruster_gain, where: '9', parameters: {gain: 0.5}}"
+    path = tmp_path / "s.yaml"
+    path.write_text(text.replace("station:\n", f"station:\n  effects: [{effect}]\n", 1))
+    with pytest.raises(UserError, match=r"s\.yaml: station\.effects\[0\]: .* 8 thrusters; give a"):
+        load_scenario(path)
+
+
+def test_pulses_are_summed_up_as_whole_numbers():
+    pulses = made().dataset["pwm"].to_numpy()
+    expected = f"pwm (us): {pulses.min():.0f} … {pulses.max():.0f}"
+    assert expected in summarize(made()).split("\n")

@@ -256,9 +256,8 @@ class Recording:
         names = [scenarios] if isinstance(scenarios, str) else list(scenarios)
         unknown = [name for name in names if name not in self.scenarios]
         if unknown or not names:
-            raise UserError(
-                f"scenario: no {unknown or 'name given'}; the recording has {list(self.scenarios)}"
-            )
+            told = f"scenario {', '.join(unknown)}: is not here" if unknown else "scenario: no name"
+            raise UserError(f"{told}; the recording has {', '.join(self.scenarios)}")
         rows = [self.scenarios.index(name) for name in names]
         kept = self.dataset.isel(scenario=rows)
         stop = kept["mask"].to_numpy().sum(axis=2)

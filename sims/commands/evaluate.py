@@ -64,6 +64,11 @@ class Evaluate:
         if self.out is not None and self.out.suffix not in (".csv", ".json", ".nc"):
             raise UserError(f"--out {self.out}: end the name in .csv, .json or .nc")
         check_accepted(self.accept)
+        if self.data.suffix == ".spinn" and self.model.suffix != ".spinn":
+            raise UserError(
+                f"{self.model}: the model, a .spinn file, comes first and the data second: "
+                f"spinndrift evaluate {self.data} {self.model}"
+            )
         start, metadata = Start.read(self.model)
         if self.vehicle is not None:
             vehicle = load_vehicle(self.vehicle)

@@ -69,7 +69,10 @@ class Export:
 
         recording, scene, said = self._read()
         if self.scenario:
-            recording = recording.select(self.scenario)
+            try:
+                recording = recording.select(self.scenario)
+            except UserError as error:
+                raise UserError(f"{self.data}: --{error}") from error
         with progress_bar(f"writing {self.out.name}") as update, mcap_file(self.out) as into:
             duration = write_recording(into, recording, scene, said, update)
         shown = console()

@@ -64,6 +64,8 @@ class Generate:
 
         if self.out.suffix != ".nc":
             raise UserError(f"--out {self.out}: a Recording is a NetCDF file; end the name in .nc")
+        if not self.config.maneuvers:
+            raise UserError("--maneuvers: give at least one; without the option all are simulated")
         vehicle = load_vehicle(self.vehicle)
         disturbance = preset(self.disturbances)
         dynamics = None if self.model is None else load_model(self.model, dtype=float)[0]

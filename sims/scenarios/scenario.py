@@ -204,10 +204,17 @@ def load_scenario(name_or_path: str | Path, text: str = "") -> Scenario:
     stated = _located(typed_yaml.load(Scenario, path), path.parent)
     scenario = overridden(stated, text) if text.strip() else stated
     try:
-        scenario.station.load_vehicle()
+        vehicle = scenario.station.load_vehicle()
     except UserError as error:
         same = scenario.station.vehicle == stated.station.vehicle
         raise UserError(f"{name_or_path if same else _TEXT}: {error}") from error
+    for i, effect in enumerate(scenario.station.effects):
+        try:
+            effect.build().for_thrusters(len(vehicle.propulsion.mounts))
+        except UserError as error:
+            same = scenario.station.effects == stated.station.effects
+            where = f"{name_or_path if same else _TEXT}: station.effects[{i}]"
+            raise UserError(f"{where}: {error}") from error
     return scenario
 
 

@@ -118,8 +118,8 @@ def import_log(  # long: a third of it says what it takes and refuses
     if not trajectories:
         raise UserError(
             f"{path}: no stretch of {options.minimum:g} s with attitude and thruster outputs is "
-            f"left ({' '.join(dropped) or 'nothing overlaps'}); allow shorter ones (minimum) or "
-            "longer gaps (gap)"
+            f"left ({' '.join(dropped) or 'nothing overlaps'}); allow shorter ones "
+            "(--minimum) or longer gaps (--gap)"
         )
     progress(0.95)
     report = tell(signals, path.name, trajectories, lines, [*damage, *dropped], 1.0 / rate)
@@ -219,7 +219,8 @@ def load_data(  # long: half of it says what it takes and refuses
         return logged
     for given in fields(options):
         if getattr(options, given.name) != given.default:
-            raise UserError(f"{path}: {given.name} is for logs of a vehicle; leave it out here")
+            option = f"--{given.name.replace('_', '-')}"
+            raise UserError(f"{path}: {option} is for logs of a vehicle; leave it out here")
     progress(1.0)
     if not vehicle:
         return recording

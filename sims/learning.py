@@ -18,6 +18,7 @@ from ..models.integrate import cast
 from ..models.recordings.store import Recording
 from ..models.rigid_body import FossenDynamics
 from ..models.spinn import Spinn
+from ..models.vehicles.places import named_in
 from ..models.vehicles.vehicle import Vehicle
 from ..training.config import TrainingConfig, WindowConfig
 from ..training.data.windows import Normalisation, Windows, make_windows
@@ -84,6 +85,8 @@ class Start:
             UserError: the file is not a model.
         """
         model, metadata = load_model(path, dtype=jnp.float32)
+        if named := metadata.get("vehicle"):
+            metadata = {**metadata, "vehicle": named_in(named, path.parent)}
         return cls(model, int(metadata.get("substeps", FINE_SUBSTEPS))), metadata
 
 

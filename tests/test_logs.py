@@ -135,7 +135,7 @@ def test_only_the_vehicle_is_heard(tmp_path):
     recording, report = imported(tmp_path, two.bytes())
     check_truth(recording)
     assert any("Several autopilots" in line for line in report.done)
-    with pytest.raises(UserError, match="system 9: not an autopilot"):
+    with pytest.raises(UserError, match=r"--system 9: not an autopilot of this log; give one of 1"):
         imported(tmp_path, two.bytes(), system=9)
 
 
@@ -467,7 +467,7 @@ def test_the_command_passes_options_for_logs_on(tmp_path, monkeypatch, capsys):
     assert "no stretch of 60 s" in capsys.readouterr().err
     main(["import", "dive.tlog", "--minimum", "2", "--disarmed", "--out", "dive.nc"])
     capsys.readouterr()
-    with pytest.raises(UserError, match=r"dive\.nc: gap is for logs of a vehicle; leave it out"):
+    with pytest.raises(UserError, match=r"dive\.nc: --gap is for logs of a vehicle; leave it out"):
         load_data(tmp_path / "dive.nc", options=LogOptions(gap=2.0))
 
 

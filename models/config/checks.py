@@ -7,7 +7,7 @@ from typing import Annotated, Any, get_args, get_origin
 
 import jax
 
-from .errors import UserError
+from .errors import FieldError, UserError
 
 Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
@@ -49,7 +49,7 @@ def require(condition: bool, config: Any, field: str, remedy: str) -> None:
     """Raise `UserError` with kind, field, value and remedy unless `condition` holds."""
     if not condition:
         value = getattr(config, field)
-        raise UserError(f"{type(config).__name__}.{field} is {value!r}: {remedy}.")
+        raise FieldError(type(config).__name__, (field,), f"is {value!r}: {remedy}.")
 
 
 def require_rate(value: float, named: str) -> None:

@@ -41,7 +41,7 @@ from cattrs.gen import make_dict_structure_fn
 
 from .checks import LARGEST
 from .errors import UserError
-from .yaml_messages import dotted, fault, faults, fields, is_array, is_union, needed, wanted
+from .yaml_messages import fault, faults, fields, is_array, is_union, needed, wanted
 from .yaml_text import Tagged, emit, line_of, parse
 
 T = TypeVar("T")
@@ -96,7 +96,7 @@ def structured(cls: type[T], data: Any, source: str, node: Any = None) -> T:
         for path, message in faults(error, (), cls):
             line = line_of(node, path)
             where = source if line is None else f"{source}:{line}"
-            lines.append(": ".join(part for part in (where, dotted(path), message) if part))
+            lines.append(f"{where}: {message}")
         raise UserError("\n".join(lines)) from error
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from cattrs import ForbiddenExtraKeysError
 from cattrs.errors import AttributeValidationNote, BaseValidationError, IterableValidationNote
 
+from .errors import FieldError
 from .yaml_text import Tagged
 
 FieldPath = tuple[str | int, ...]
@@ -49,7 +50,7 @@ def fault(value: Any, remedy: str) -> ValueError:
 
 
 def faults(error: BaseException, path: FieldPath, cls: Any) -> list[tuple[FieldPath, str]]:
-    """Every leaf of the exception tree as (path of the field, message)."""
+    """Every leaf of the exception tree as (path of the field, message that names it)."""
     names = [
         note.name if isinstance(note, AttributeValidationNote) else note.index
         for note in getattr(error, "__notes__", ())
@@ -61,11 +62,30 @@ def faults(error: BaseException, path: FieldPath, cls: Any) -> list[tuple[FieldP
     if isinstance(error, ForbiddenExtraKeysError):
         known = fields(error.cl)
         strange = sorted(map(str, error.extra_fields))
-        return [((*path, key), _unknown(key, known)) for key in strange]
+        return [_named((*path, key), _unknown(key, known)) for key in strange]
     if isinstance(error, KeyError) and names:
         kind = next((f.type for f in dataclasses.fields(cls) if f.name == names[-1]), str)
-        return [(path, f"is missing; write {wanted(kind)}")]
-    return [(path, str(error))]
+        return [_named(path, f"is missing; write {wanted(kind)}")]
+    if isinstance(error, FieldError) and (within := _place(error, cls)) is not None:
+        path = (*path, *within)
+        return [(path, f"{dotted(path)} {error.told}")]
+    return [_named(path, str(error))]
+
+
+def _named(path: FieldPath, message: str) -> tuple[FieldPath, str]:
+    return path, f"{dotted(path)}: {message}" if path else message
+
+
+def _place(error: FieldError, cls: Any) -> FieldPath | None:
+    """The field's path from a `cls`, which the error names or which has one of what it names."""
+    if getattr(cls, "__name__", "") == error.kind:
+        return error.path
+    parts = dataclasses.fields(cls) if dataclasses.is_dataclass(cls) else ()
+    for part in parts:
+        kinds = (part.type, *get_args(part.type))
+        if any(getattr(kind, "__name__", "") == error.kind for kind in kinds):
+            return (part.name, *error.path)
+    return None
 
 
 def needed(cls: Any) -> list[str]:

@@ -368,7 +368,8 @@ class ByThruster(Effect):
             return self
         if more < 0:
             raise UserError(
-                f"{self.name}.where is {self.thrusters}: the vehicle has {count} thrusters"
+                f"{self.name}.where is {self.thrusters}: the vehicle has {count} thrusters; give a "
+                f"number from 1 to {count}"
             )
         padding = [(0, more), *((0, 0) for _ in self.values.shape[1:])]
         return dataclasses.replace(self, values=jnp.pad(self.values, padding))

@@ -24,6 +24,10 @@ def read_archive(path: str | PathLike[str], called: str) -> tuple[dict[str, Any]
         UserError: the file is missing, or is not a complete archive of this kind.
     """
     path = Path(path)
+    if path.is_dir():
+        inside = next(iter(sorted(path.glob("*.spinn" if called == "model" else "*.npz"))), None)
+        hint = "" if inside is None else f", such as {inside}"
+        raise UserError(f"{path}: is a folder; name a {called} file{hint}.")
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(info.file_size for info in archive.infolist()) > _SMALL + _DENSEST * (

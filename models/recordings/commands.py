@@ -28,17 +28,26 @@ def thrusters_of(dataset: xr.Dataset, vehicle: Any, command: str) -> Any:
 def forces_of(dataset: xr.Dataset, name: str, thrusters: Any) -> Float[Array, "n J K N"]:
     """Forces (N) of a command in forces or PWM; of none beyond a trajectory's end."""
     values, mask = dataset[name].to_numpy(), dataset["mask"].to_numpy()
-    count = thrusters.allocation.shape[1]
-    if values.shape[-1] != count:
-        raise UserError(
-            f"{name}: the recording has {values.shape[-1]} thrusters, the vehicle {count}; "
-            "choose the vehicle it was recorded with"
-        )
+    check_count(dataset, name, thrusters.allocation.shape[1])
     rest = 1500.0 if name == "pwm" else 0.0
     command = jnp.asarray(np.moveaxis(np.where(mask[..., None], values, rest), -1, 0))
     if name == "thruster_force":
         return command
     return thrusters.force(command, jnp.asarray(voltage_of(dataset, thrusters)))
+
+
+def check_count(dataset: xr.Dataset, name: str, count: int, vehicle: str = "the vehicle") -> None:
+    """Refuse commands of another number of thrusters than the vehicle's `count`.
+
+    Raises:
+        UserError: the sentence says both numbers.
+    """
+    found = dataset[name].shape[-1]
+    if name != "F_Bo_B" and found != count:
+        raise UserError(
+            f"{name}: the recording has {found} thrusters, {vehicle} {count}; choose the vehicle "
+            "it was recorded with (--vehicle)"
+        )
 
 
 def voltage_of(dataset: xr.Dataset, thrusters: Any) -> Float[np.ndarray, "J K N"]:

@@ -19,6 +19,7 @@ from ..config.errors import UserError
 from ..config.typed_yaml import dump, load
 from ..frames import pose_to_enu, twist_frd_to_flu
 from ..se3 import TWIST, WRENCH, XYZ
+from ..vehicles.places import named_in
 from .build import Trajectory
 from .checks.finding import Finding, with_findings
 from .checks.flickers import flicker_finding, mended
@@ -41,7 +42,7 @@ class CsvFolder:
 
     Attributes:
         frames: of all files: `ENU/FLU` or `NED/FRD` (world/body).
-        vehicle: name of a preset or path of a vehicle file.
+        vehicle: name of a preset, or path of a vehicle file from this folder.
         files: scenario of each CSV file; by default every `*.csv` in the folder, named as the file.
         rate: rate of the recording (Hz); by default that of the files.
         ignore: columns to leave out.
@@ -105,7 +106,7 @@ def read_csv(
         recording = Recording.from_trajectories(
             trajectories,
             dt,
-            vehicle=_vehicle(folder, meta.vehicle),
+            vehicle=named_in(meta.vehicle, folder),
             source=meta.source or folder.name,
             notes=notes,
         )
@@ -115,12 +116,6 @@ def read_csv(
         raise
     except ValueError as error:
         raise UserError(f"{folder}: {error}") from error
-
-
-def _vehicle(folder: Path, named: str) -> str:
-    """A preset's name unchanged, a file's path from the folder of the recording."""
-    beside = folder / named
-    return str(beside) if Path(named).suffix and beside.is_file() else named
 
 
 def _unlisted(name: str) -> Finding:

@@ -106,6 +106,11 @@ def observed(
     return np.any(np.isfinite(values) & mask[..., None], axis=2)
 
 
+def is_recording(dataset: xr.Dataset) -> bool:
+    """Whether a dataset has this format, in any version."""
+    return str(dataset.attrs.get("format", "")).startswith(FORMAT.rsplit(" ", 1)[0])
+
+
 def check(dataset: xr.Dataset) -> None:
     """Refuse a dataset that is not a recording.
 

@@ -17,6 +17,7 @@ import xarray as xr
 from ..config.errors import UserError
 from ..files.netcdf import load_netcdf, save_netcdf
 from ..se3 import WRENCH
+from ..vehicles.places import named_in
 from .build import Trajectory, assemble, window
 from .commands import forces_of, thrusters_of, voltage_of
 from .outputs import common_outputs, with_outputs
@@ -30,6 +31,7 @@ from .schema import (
     UNEVEN,
     check,
     check_plausible,
+    is_recording,
     observed,
     present,
 )
@@ -111,7 +113,7 @@ class Recording:
 
     @property
     def vehicle(self) -> str:
-        """Name of the vehicle's preset, or empty."""
+        """Name of the vehicle's preset, or path of its file, or empty."""
         return str(self.dataset.attrs.get("vehicle", ""))
 
     @property
@@ -254,9 +256,8 @@ class Recording:
         names = [scenarios] if isinstance(scenarios, str) else list(scenarios)
         unknown = [name for name in names if name not in self.scenarios]
         if unknown or not names:
-            raise UserError(
-                f"scenario: no {unknown or 'name given'}; the recording has {list(self.scenarios)}"
-            )
+            told = f"scenario {', '.join(unknown)}: is not here" if unknown else "scenario: no name"
+            raise UserError(f"{told}; the recording has {', '.join(self.scenarios)}")
         rows = [self.scenarios.index(name) for name in names]
         kept = self.dataset.isel(scenario=rows)
         stop = kept["mask"].to_numpy().sum(axis=2)
@@ -373,7 +374,7 @@ class Recording:
         """
         path = Path(path)
         dataset = load_netcdf(path)
-        if not _is_recording(dataset):
+        if not is_recording(dataset):
             raise UserError(f"{path}: a NetCDF file, but no recording (see docs/recording.md)")
         if dataset.attrs["format"] != FORMAT:
             raise UserError(
@@ -384,17 +385,14 @@ class Recording:
             check_plausible(dataset)
         except ValueError as error:
             raise UserError(f"{path}: {error}") from error
+        if recording.vehicle:
+            dataset.attrs["vehicle"] = named_in(recording.vehicle, path.parent)
         return recording
 
     @staticmethod
     def is_one(path: Path) -> bool:
         """Whether a file carries the format mark of `save`, valid or not."""
         try:
-            return _is_recording(load_netcdf(path))
+            return is_recording(load_netcdf(path))
         except UserError:
             return False
-
-
-def _is_recording(dataset: xr.Dataset) -> bool:
-    """Whether a dataset has this format, in any version."""
-    return str(dataset.attrs.get("format", "")).startswith(FORMAT.rsplit(" ", 1)[0])

@@ -8,7 +8,12 @@ from .store import Recording
 
 def _range(values: np.ndarray) -> str:
     finite = values[np.isfinite(values)]
-    return f"{finite.min():.3g} … {finite.max():.3g}" if finite.size else "missing"
+    return f"{_short(finite.min())} … {_short(finite.max())}" if finite.size else "missing"
+
+
+def _short(value: float) -> str:
+    """Three digits, or all before the point: pulses are 1100 … 1900, not 1.1e+03."""
+    return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def summarize(recording: Recording) -> str:

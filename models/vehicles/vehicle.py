@@ -9,17 +9,26 @@ import os
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from typing import Annotated
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ..config.checks import Vector3, Vector6, check_numbers, require
-from ..config.errors import UserError
+from ..config.errors import FieldError, UserError
 from ..config.typed_yaml import load
 from ..rigid_body import FossenDynamics, spatial_inertia
 from ..thruster_curves import QuadraticCurve, T200Curve
 from ..thrusters import MOST, Thrusters
+from .plausibility import (
+    DENSITY,
+    LAG,
+    check_battery,
+    check_mount,
+    check_upright,
+    check_vehicle,
+)
 
 _FOLDER = Path(__file__).parent
 
@@ -39,13 +48,20 @@ class Quadratic:
     full_force: float
     dead_band: float = 25.0
 
+    def __post_init__(self):
+        check_numbers(self)
+        require(self.full_force > 0, self, "full_force", "give a positive force (N)")
+        require(0 <= self.dead_band < 400, self, "dead_band", "give 0 to below 400 µs")
+
     def build(self, dtype: jnp.dtype | type) -> QuadraticCurve:
         return QuadraticCurve(self.full_force, self.dead_band, dtype)
 
 
 @dataclass(frozen=True)
 class Mount:
-    """Position of a thruster (m from Bo) and its force in B per newton at PWM above 1500.
+    """Position of a thruster (m from Bo) and its force in B per newton of the curve above 1500.
+
+    The length of `direction` is 1, or its thrust over that of the curve.
 
     `motor` is ArduSub's MOT_n_DIRECTION: -1 where PWM above 1500 turns the propeller backwards.
     """
@@ -54,6 +70,10 @@ class Mount:
     direction: Vector3
     motor: float = 1.0
 
+    def __post_init__(self):
+        check_numbers(self)
+        check_mount(self)
+
 
 @dataclass(frozen=True)
 class Propulsion:
@@ -61,10 +81,14 @@ class Propulsion:
 
     mounts: tuple[Mount, ...]
     curve: T200 | Quadratic = field(default_factory=T200)
-    time_constant: float = 0.0
-    start_delay: float = 0.0
+    time_constant: Annotated[float, LAG] = 0.0
+    start_delay: Annotated[float, LAG] = 0.0
     voltage: float = 16.0
     resistance: float = 0.0
+
+    def __post_init__(self):
+        check_numbers(self)
+        check_battery(self)
 
 
 @dataclass(frozen=True)
@@ -92,13 +116,13 @@ class Vehicle:
     added_mass: Vector6
     linear_damping: Vector6
     quadratic_damping: Vector6
-    water_density: float
+    water_density: Annotated[float, DENSITY]
     propulsion: Propulsion
     sources: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self):
         check_numbers(self)
-        for name in ("mass", "weight", "buoyancy", "water_density"):
+        for name in ("mass", "weight", "buoyancy"):
             require(getattr(self, name) > 0, self, name, "give a positive number")
         for name in ("size", "inertia"):
             require(min(getattr(self, name)) > 0, self, name, "give three positive numbers")
@@ -111,12 +135,21 @@ class Vehicle:
             )
         a, b, c = sorted(self.inertia)
         require(a + b >= c, self, "inertia", "no body has one moment above the other two together")
-        if not 1 <= len(self.propulsion.mounts) <= MOST:
-            raise UserError(
-                f"Vehicle.propulsion.mounts has {len(self.propulsion.mounts)} thrusters: give 1 to "
-                f"{MOST}, in the autopilot's order."
-            )
-        self.thrusters()
+        mounts, path = len(self.propulsion.mounts), ("propulsion", "mounts")
+        if not 1 <= mounts <= MOST:
+            remedy = f"give 1 to {MOST}, in the autopilot's order"
+            raise FieldError("Vehicle", path, f"has {mounts} thrusters: {remedy}.")
+        check_vehicle(self)
+        try:
+            self.thrusters()
+        except ValueError as error:
+            raise FieldError("Vehicle", path, f"can't be used: {error}") from error
+        check_upright(self)
+
+    @property
+    def top_heavy(self) -> bool:
+        """Whether the centre of buoyancy is below the centre of mass: unstable in roll, pitch."""
+        return self.center_of_buoyancy[2] < self.center_of_mass[2]
 
     @property
     def unactuated(self) -> tuple[str, ...]:
@@ -127,6 +160,15 @@ class Vehicle:
         """A sentence on the axes that its thrusters can't actuate; empty if there is none."""
         axes = " and ".join(self.unactuated)
         return f"The thrusters of {self.name} can't actuate {axes}." if axes else ""
+
+    def instability(self) -> str:
+        """A sentence on the axes that its buoyancy does not restore; empty if there is none."""
+        if not self.top_heavy:
+            return ""
+        return (
+            f"{self.name} is unstable in roll and pitch: its centre of buoyancy is below its "
+            "centre of mass (z is up)."
+        )
 
     def dynamics(
         self, diffusion: Float[np.ndarray, "6"] | None = None, dtype: jnp.dtype | type = float

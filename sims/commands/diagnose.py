@@ -86,6 +86,7 @@ class Diagnose:
 
             from ...models.files.checkpoint import load_model
             from ...models.recordings.checks.finding import check_accepted
+            from ...models.vehicles.places import absolute, load_named
             from ...models.vehicles.vehicle import load_vehicle
             from ...training.diagnosis.pipeline import diagnose
             from ..diagnosis_folder import write_diagnosis
@@ -99,8 +100,8 @@ class Diagnose:
         if self.vehicle is not None:
             load_vehicle(self.vehicle)  # fails now, not after the data are read
         recording = self._read(self.data, self.vehicle or (named if self._is_log() else None))
-        stated = self._vehicle(recording.vehicle, named)
-        vehicle = load_vehicle(stated)
+        stated = absolute(self._vehicle(recording.vehicle, named))
+        vehicle = load_named(stated, str(self.data))
         recording = self._examined(recording, vehicle, self.data)
         print_findings(console(), recording)
         if self.diffusion is not None:

@@ -55,6 +55,7 @@ class Evaluate:
         with interrupts_held():
             from ...models.recordings.checks.examine import examine
             from ...models.recordings.checks.finding import check_accepted
+            from ...models.vehicles.places import load_named
             from ...models.vehicles.vehicle import load_vehicle
             from ...systems.logs.load import load_data
             from ..learning import Start, compare, prepared
@@ -63,9 +64,16 @@ class Evaluate:
         if self.out is not None and self.out.suffix not in (".csv", ".json", ".nc"):
             raise UserError(f"--out {self.out}: end the name in .csv, .json or .nc")
         check_accepted(self.accept)
+        if self.data.suffix == ".spinn" and self.model.suffix != ".spinn":
+            raise UserError(
+                f"{self.model}: the model, a .spinn file, comes first and the data second: "
+                f"spinndrift evaluate {self.data} {self.model}"
+            )
         start, metadata = Start.read(self.model)
-        name = self.vehicle or metadata.get("vehicle") or "bluerov2_heavy"
-        vehicle = load_vehicle(name)
+        if self.vehicle is not None:
+            vehicle = load_vehicle(self.vehicle)
+        else:
+            vehicle = load_named(metadata.get("vehicle") or "bluerov2_heavy", str(self.model))
         with progress_bar(f"reading {self.data.name}") as update:
             recording = load_data(
                 self.data, vehicle=self.vehicle, accept=self.accept, progress=update

@@ -12,7 +12,6 @@ from tyro.conf import Positional, arg
 from ...models.config.errors import UserError
 from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar
-from .import_log import known_vehicle
 
 if TYPE_CHECKING:
     from ...models.recordings.store import Recording
@@ -70,7 +69,10 @@ class Export:
 
         recording, scene, said = self._read()
         if self.scenario:
-            recording = recording.select(self.scenario)
+            try:
+                recording = recording.select(self.scenario)
+            except UserError as error:
+                raise UserError(f"{self.data}: --{error}") from error
         with progress_bar(f"writing {self.out.name}") as update, mcap_file(self.out) as into:
             duration = write_recording(into, recording, scene, said, update)
         shown = console()
@@ -84,12 +86,10 @@ class Export:
         with interrupts_held():
             from ...models.recordings.store import Recording
             from ...systems.logs.load import load_data
-            from ..reports.figures_path import Scene
 
         if not (self.data / "log.nc").is_file():
             recording = load_data(self.data)
-            vehicle = known_vehicle(recording.vehicle)
-            return recording, None if vehicle is None else Scene(vehicle.size), []
+            return recording, _hull(recording.vehicle), []
         return Recording.load(self.data / "log.nc"), *self._told()
 
     def _told(self) -> "tuple[Scene | None, list[str]]":
@@ -112,3 +112,15 @@ class Export:
                 ) from error
             said = outcome_of(found) if isinstance(found, dict) else []
         return around, said
+
+
+def _hull(named: str) -> "Scene | None":
+    """The hull of a recording's vehicle; None if it names none, or one that is not here."""
+    with interrupts_held():
+        from ...models.vehicles.vehicle import load_vehicle
+        from ..reports.figures_path import Scene
+
+    try:
+        return Scene(load_vehicle(named).size) if named else None
+    except UserError:
+        return None

@@ -56,12 +56,16 @@ class Generate:
         with interrupts_held():
             from ...models.disturbances import preset
             from ...models.files.checkpoint import load_model
+            from ...models.recordings.store import Recording
             from ...models.recordings.summary import summarize
+            from ...models.vehicles.places import absolute
             from ...models.vehicles.vehicle import load_vehicle
             from ...training.data.generate import generate
 
         if self.out.suffix != ".nc":
             raise UserError(f"--out {self.out}: a Recording is a NetCDF file; end the name in .nc")
+        if not self.config.maneuvers:
+            raise UserError("--maneuvers: give at least one; without the option all are simulated")
         vehicle = load_vehicle(self.vehicle)
         disturbance = preset(self.disturbances)
         dynamics = None if self.model is None else load_model(self.model, dtype=float)[0]
@@ -69,6 +73,7 @@ class Generate:
             recording = generate(
                 GenerateConfig(**vars(self.config)), vehicle, (disturbance,), dynamics
             )
+        recording = Recording(recording.dataset.assign_attrs(vehicle=absolute(self.vehicle)))
         recording.save(self.out)
         shown = console()
         shown.print(summarize(recording))

@@ -3,7 +3,7 @@
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 from tyro.conf import FlagCreatePairsOff, Positional
 
@@ -11,9 +11,6 @@ from ...models.config.checks import WATER_DENSITY, Within
 from ...models.config.errors import UserError
 from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar
-
-if TYPE_CHECKING:
-    from ...models.vehicles.vehicle import Vehicle
 
 
 @dataclass(frozen=True)
@@ -77,6 +74,8 @@ class Import:
             from ...models.recordings.checks.examine import examine
             from ...models.recordings.checks.finding import check_accepted
             from ...models.recordings.summary import summarize
+            from ...models.vehicles.places import load_named
+            from ...models.vehicles.vehicle import load_vehicle
             from ...systems.logs.load import LogOptions, load_data
             from ..acceptance import acceptance
             from ..reports.findings import print_findings
@@ -92,6 +91,8 @@ class Import:
             raise UserError(
                 f"--rate {self.rate:g}: the rate is that of --align {self.align}; leave --rate away"
             )
+        if self.vehicle is not None:
+            load_vehicle(self.vehicle)  # fails now, not after the data are read
         options = LogOptions(
             self.minimum,
             self.gap,
@@ -110,12 +111,15 @@ class Import:
                 accept=self.accept,
                 progress=update,
             )
-        vehicle = known_vehicle(recording.vehicle)
+        named = recording.vehicle
+        vehicle = load_named(named, str(self.log)) if named else None
         recording = examine(recording, vehicle, str(self.log), self.accept)
         recording.save(out)
         shown = console()
         shown.print(summarize(recording), markup=False)
         print_findings(shown, recording)
+        if vehicle is not None and (told := vehicle.instability()):
+            shown.print(told)
         shown.print("what the other commands can use of it:")
         for line in acceptance(recording):
             shown.print(f"  {line}", markup=False, soft_wrap=True)
@@ -153,17 +157,6 @@ class Import:
 
     def _out(self) -> Path:
         return self.out if self.out is not None else Path(f"{stem(self.log)}.nc")
-
-
-def known_vehicle(name: str) -> "Vehicle | None":
-    """The vehicle of a recording; None if it names none, or one that is not here."""
-    with interrupts_held():
-        from ...models.vehicles.vehicle import load_vehicle
-
-    try:
-        return load_vehicle(name) if name else None
-    except UserError:
-        return None
 
 
 def stem(path: Path) -> str:

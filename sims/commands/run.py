@@ -80,8 +80,11 @@ class Run:
         scenario = scenario.with_changes(self.seed, self.duration, self.model)
         if self.arm or self.dry_run:
             scenario.link("--arm" if self.arm else "--dry-run")
-        if told := scenario.station.load_vehicle().limitation():
+        vehicle = scenario.station.load_vehicle()
+        if told := vehicle.limitation():
             console().print(f"{told} What the controller asks for there has no effect.")
+        if told := vehicle.instability():
+            console().print(told)
         with (
             new_folder(self.out, scenario) as out,
             live_page(self.live, scenario, self._say) as live,

@@ -69,6 +69,7 @@ class Train:
             from ...models.config.typed_yaml import load
             from ...models.recordings.checks.examine import examine
             from ...models.recordings.checks.finding import check_accepted
+            from ...models.vehicles.places import load_named
             from ...models.vehicles.vehicle import load_vehicle
             from ...systems.logs.load import load_data
             from ...training.config import TrainingConfig
@@ -100,7 +101,8 @@ class Train:
             recording = load_data(
                 self.data, vehicle=self.vehicle, accept=self.accept, progress=update
             )
-        vehicle = load_vehicle(recording.vehicle or metadata.get("vehicle") or "bluerov2_heavy")
+        stated = recording.vehicle or metadata.get("vehicle") or "bluerov2_heavy"
+        vehicle = load_named(stated, str(self.data if recording.vehicle else self.model))
         recording = examine(recording, vehicle, str(self.data), self.accept)
         print_findings(console(), recording)
         with progress_bar("training") as update:

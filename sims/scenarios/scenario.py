@@ -11,6 +11,7 @@ from ...models.config import typed_yaml
 from ...models.config.checks import SECONDS, check_numbers, require
 from ...models.config.errors import UserError
 from ...models.config.yaml_text import parse
+from ...models.vehicles.places import named_in
 from ...systems.controllers.kinds import ControllerKind, MppiImpedance
 from ...systems.mavlink.config import Mavlink
 from ...systems.own import OwnSystem
@@ -182,8 +183,11 @@ def load_scenario(name_or_path: str | Path, text: str = "") -> Scenario:
     `text` is YAML that overrides the file: mappings are merged key by key, other values replace the
     file's, and so does a value with another `!Tag`.
 
+    A vehicle's file is found from the scenario's folder, else from the working folder.
+
     Raises:
-        UserError: there is no such scenario, or it is not valid, with or without `text`.
+        UserError: there is no such scenario, it is not valid, with or without `text`, or its
+            vehicle can't be read.
 
     Example:
         >>> load_scenario("station_keeping_calm", text="station: {seed: 7}").station.seed
@@ -197,8 +201,33 @@ def load_scenario(name_or_path: str | Path, text: str = "") -> Scenario:
                 f"{', '.join(scenario_names())}, or the path of a .yaml file"
             )
         path = _FOLDER / f"{name_or_path}.yaml"
-    scenario = typed_yaml.load(Scenario, path)
-    return overridden(scenario, text) if text.strip() else scenario
+    stated = _located(typed_yaml.load(Scenario, path), path.parent)
+    scenario = overridden(stated, text) if text.strip() else stated
+    try:
+        vehicle = scenario.station.load_vehicle()
+    except UserError as error:
+        same = scenario.station.vehicle == stated.station.vehicle
+        raise UserError(f"{name_or_path if same else _TEXT}: {error}") from error
+    for i, effect in enumerate(scenario.station.effects):
+        try:
+            effect.build().for_thrusters(len(vehicle.propulsion.mounts))
+        except UserError as error:
+            same = scenario.station.effects == stated.station.effects
+            where = f"{name_or_path if same else _TEXT}: station.effects[{i}]"
+            raise UserError(f"{where}: {error}") from error
+    return scenario
+
+
+def _located(scenario: Scenario, folder: Path) -> Scenario:
+    """The scenario with vehicles' files that are found from its folder, or else from here."""
+    station = scenario.station
+    station = replace(station, vehicle=named_in(station.vehicle, folder))
+    scenario = replace(scenario, station=station)
+    controller = scenario.controller
+    if isinstance(controller, MppiImpedance) and controller.vehicle:
+        controller = replace(controller, vehicle=named_in(controller.vehicle, folder))
+        scenario = replace(scenario, controller=controller)
+    return scenario
 
 
 def overridden(base: Scenario | str, text: str) -> Scenario:

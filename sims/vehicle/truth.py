@@ -48,6 +48,6 @@ class TruthLog:
         Recording.from_trajectories(
             [Trajectory(name, X, V, {"pwm": pwm}, sensors)],
             self.dt,
-            vehicle=self._physics.vehicle.name,
+            vehicle=self._physics.config.vehicle,
             source=source,
         ).save(path)

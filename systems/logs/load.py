@@ -13,6 +13,7 @@ from ...models.recordings.csv import METADATA, read_csv
 from ...models.recordings.outputs import with_outputs
 from ...models.recordings.schema import check_plausible
 from ...models.recordings.store import Recording
+from ...models.vehicles.places import absolute
 from ...models.vehicles.vehicle import load_vehicle
 from .align import aligned, reference
 from .bags.bag import bag_kind
@@ -91,6 +92,7 @@ def import_log(  # long: a third of it says what it takes and refuses
     _check_options(RATES[-1] if rate is None else rate, options)
     if vehicle is not None:
         load_vehicle(vehicle)
+        vehicle = absolute(vehicle)
     other = None if options.align is None else reference(options.align)
     damage, signals = _signals(path, vehicle, options, progress)
     signals = sound(signals)
@@ -116,8 +118,8 @@ def import_log(  # long: a third of it says what it takes and refuses
     if not trajectories:
         raise UserError(
             f"{path}: no stretch of {options.minimum:g} s with attitude and thruster outputs is "
-            f"left ({' '.join(dropped) or 'nothing overlaps'}); allow shorter ones (minimum) or "
-            "longer gaps (gap)"
+            f"left ({' '.join(dropped) or 'nothing overlaps'}); allow shorter ones "
+            "(--minimum) or longer gaps (--gap)"
         )
     progress(0.95)
     report = tell(signals, path.name, trajectories, lines, [*damage, *dropped], 1.0 / rate)
@@ -217,11 +219,12 @@ def load_data(  # long: half of it says what it takes and refuses
         return logged
     for given in fields(options):
         if getattr(options, given.name) != given.default:
-            raise UserError(f"{path}: {given.name} is for logs of a vehicle; leave it out here")
+            option = f"--{given.name.replace('_', '-')}"
+            raise UserError(f"{path}: {option} is for logs of a vehicle; leave it out here")
     progress(1.0)
-    if not vehicle or vehicle == recording.vehicle:
+    if not vehicle:
         return recording
-    return Recording(recording.dataset.assign_attrs(vehicle=vehicle))
+    return Recording(recording.dataset.assign_attrs(vehicle=absolute(vehicle)))
 
 
 def _signals(

@@ -126,7 +126,7 @@ def _motion(signals: Signals) -> list[str]:
             told.append(
                 f"Estimated depth is {slope:.3f} × depth by pressure {offset:+.2f} m. The "
                 "autopilot takes 9800 Pa/m unless BARO_SPEC_GRAV says otherwise: in sea water "
-                "depths are then 2.5 % too large (give the water's density to correct it)."
+                "depths are then 2.5 % too large (--water-density corrects them)."
             )
     return told
 
@@ -165,13 +165,13 @@ def _consistency(kept: Sequence[Trajectory], dt: float) -> tuple[list[str], list
     found = [agreement(dt * np.arange(len(k)), k.X_WB.T, k.V_WB_B.T) for k in long]
     sizes = np.array([len(k) for k in long])
     good, bad = [], []
-    for part, what in ((0, "Body velocity"), (1, "Body rates")):
+    for part, what in ((0, "the body velocity"), (1, "the body rates")):
         explained = np.array([f[part].explained for f in found])
         known = np.isfinite(explained)
         if not known.any():
             continue
         mean = max(float(np.average(explained[known], weights=sizes[known])), 0.0)
-        sentence = f"{what} integrated explains {100 * mean:.1f} % of the change of pose"
+        sentence = f"The integral of {what} explains {100 * mean:.1f} % of the change of pose"
         if mean > _CONSISTENT:
             good.append(f"{sentence}.")
         else:

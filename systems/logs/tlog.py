@@ -138,8 +138,8 @@ def _choose(
     mine = [key for key in autopilots if system is None or key[0] == system]
     if not mine:
         raise UserError(
-            f"system {system}: not an autopilot of this log; "
-            f"there are {sorted({s for s, _ in autopilots})}"
+            f"--system {system}: not an autopilot of this log; give one of "
+            f"{', '.join(map(str, sorted({s for s, _ in autopilots})))}"
         )
     submarines = [key for key in mine if autopilots[key][0] == _SUBMARINE]
     chosen = max(submarines or mine, key=lambda key: spoken[key])

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...models.config.checks import Vector6, check_numbers, require
+from ...models.config.errors import UserError
 from ...models.disturbances import Combined, Kind, OrnsteinUhlenbeckWrench, preset
 from ...models.dynamics import Dynamics
 from ...models.effects.effect_config import EffectConfig, check_distinct
@@ -155,7 +156,10 @@ class StationConfig:
         Raises:
             UserError: there is no such preset or file, or it is not a vehicle.
         """
-        return load_vehicle(self.vehicle)
+        try:
+            return load_vehicle(self.vehicle)
+        except UserError as error:
+            raise UserError(f"station.vehicle: {error}") from error
 
     def dynamics(self) -> Dynamics:
         """The dynamics to simulate, in double precision.

@@ -7,6 +7,7 @@ import numpy as np
 from ...config.errors import UserError
 from ...vehicles.vehicle import Vehicle
 from ..build import Trajectory
+from ..commands import check_count
 from ..pieces import good_pieces
 from ..schema import UNEVEN
 from ..store import Recording
@@ -31,9 +32,11 @@ def examine(
         accept: words of severe findings that are accepted.
 
     Raises:
-        UserError: for severe findings that are not accepted, or if nothing is left.
+        UserError: for severe findings that are not accepted, if nothing is left, or if the
+            commands are those of another number of thrusters.
     """
     check_accepted(accept)
+    _check_thrusters(recording, vehicle, source)
     enforce(source, _in_other_lengths(recording, vehicle), accept)
     recording, mended_ = _without_flickers(recording)
     recording, cut = _without_unmeasured(recording, source)
@@ -42,6 +45,17 @@ def examine(
     found += command_findings(recording, vehicle)
     enforce(source, found, accept)
     return type(recording)(with_findings(recording.dataset, found))
+
+
+def _check_thrusters(recording: Recording, vehicle: Vehicle | None, source: str) -> None:
+    """Refuse commands that the vehicle's thrusters can't turn into a wrench."""
+    if vehicle is None or "F_Bo_B" in recording.commands:
+        return
+    count = len(vehicle.propulsion.mounts)
+    try:
+        check_count(recording.dataset, recording.commands[0], count, vehicle.name)
+    except UserError as error:
+        raise UserError(f"{source}: {error}") from error
 
 
 def _in_other_lengths(recording: Recording, vehicle: Vehicle | None) -> list[Finding]:

@@ -144,7 +144,8 @@ def test_forecasts_alone_have_the_errors_of_a_whole_judgement():
     theta = np.repeat(problem.believed[:, None], len(problem.data.fold), axis=1)
     given = problem, Contender(theta), 1.0
     whole = judge(*given, 0, [], estimated=True)
-    assert np.isfinite(whole.square).all() and whole.square.any()
+    assert np.isfinite(whole.square).all()
+    assert whole.square.any()
     np.testing.assert_allclose(
         forecast_square(*given, [], estimated=True), whole.square, rtol=1e-4, atol=1e-12
     )

@@ -74,9 +74,8 @@ def _with_port(given: list[str]) -> list[str]:
     """The arguments with a port after each `--live` that has none."""
     found = []
     for word, following in zip(given, [*given[1:], ""], strict=True):
-        found.append(word)
-        if word == "--live" and not following.rpartition(":")[2].isdecimal():
-            found.append(LIVE_PORT)
+        bare = word == "--live" and not following.rpartition(":")[2].isdecimal()
+        found.append(f"--live={LIVE_PORT}" if bare else word)
     return found
 
 

@@ -1,5 +1,6 @@
 """Tasks run sequentially in this process, or distributed by Dask over processes and machines."""
 
+import asyncio
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from .progress import Update
 
 T = TypeVar("T")
 _ATTEMPTS = 3
+_PATIENCE = 5.0  # s for a scheduler to answer
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,8 @@ def _client(address: str | None, workers: int) -> Iterator[Any]:
     Client, LocalCluster = distributed.Client, distributed.LocalCluster
     if address is not None:
         try:
-            client = Client(address, timeout=5, set_as_default=False)
+            asyncio.run(_greet(address))  # a Client that fails would close itself for 10 s more
+            client = Client(address, timeout=_PATIENCE, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             raise UserError(
                 f"--cluster {address}: no scheduler answers there; start one with "
@@ -134,6 +137,21 @@ def _client(address: str | None, workers: int) -> Iterator[Any]:
         Client(cluster, set_as_default=False) as client,
     ):
         yield client
+
+
+async def _greet(address: str) -> None:
+    """Connect to a process of Dask and leave it again.
+
+    Raises:
+        OSError: none answers there.
+        ValueError: the address has another form.
+    """
+    from distributed import Security
+    from distributed.comm.core import connect
+
+    given = Security().get_connection_args("client")  # as a Client takes them
+    comm = await asyncio.wait_for(connect(address, timeout=_PATIENCE, **given), _PATIENCE)
+    await comm.close()
 
 
 def _distributed() -> ModuleType:

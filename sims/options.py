@@ -46,6 +46,10 @@ def misread(given: Sequence[str], told: str) -> str:
     text = " ".join(lines).replace("{None}|", "")
     command = given[0] if given and not given[0].startswith("-") else "COMMAND"
     see = f"see spinndrift {command} --help"
+    unknown = re.search(r"Unrecognized options?: *(\S+)", text)
+    bare = next((i for i, word in enumerate(given) if word.startswith("--live=")), None)
+    if unknown is not None and bare is not None and unknown[1] in given[bare + 1 : bare + 2]:
+        return f"--live {unknown[1]}: give PORT or HOST:PORT; {see}"
     wrong = re.search(r"Error parsing (?:argument )?(--[\w-]+)", text)
     if wrong is not None:
         option = wrong[1]

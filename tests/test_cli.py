@@ -207,6 +207,41 @@ def test_a_disk_that_is_full_in_the_end_is_told_and_the_old_file_stays(generated
     assert called("generate", "--out", generated, *GENERATED) is None  # it is one of ours
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("run station_keeping_calm --arm --dry-run", "--arm and --dry-run exclude each other"),
+        (
+            "train missing.nc --resume --out typo",
+            "--resume: typo has no checkpoint; leave --resume out or name the run's folder",
+        ),
+        ("check logs", "spinndrift: check logs: name one or more folders"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_before_any_work(
+    arguments, words, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert called(*arguments.split()) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert len(told.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_windows_longer_than_the_data_are_refused_before_the_checks(
+    generated, tmp_path, capsys, monkeypatch
+):
+    vehicle = load_vehicle("bluerov2_heavy")
+    lag = kind("thruster_lag").of(time_constant=0.1)
+    model = tmp_path / "model.spinn"
+    save_model(model, Extended.create(vehicle.dynamics(), (lag,), vehicle.thrusters()))
+    monkeypatch.setattr("spinndrift.models.recordings.checks.examine.examine", None)
+    assert called("evaluate", model, generated, "--length", "500") == 2
+    told = capsys.readouterr().err
+    assert "longest trajectory lasts 2 s, a window needs 500 s" in told
+
+
 def test_pieces_too_short_to_train_on_are_told_with_the_remedy(generated, tmp_path, capsys):
     out = tmp_path / "run"
     assert called("train", generated, "--out", out) == 2

@@ -17,8 +17,7 @@ from spinndrift.models.recordings.store import Recording
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.run.collection import COLLECTION, Collected, collect, maneuver_scenario
 from spinndrift.sims.run.experiment import chosen_maneuvers
-from spinndrift.sims.run.flight_log import without_horizontal
-from spinndrift.sims.run.log import RunLog
+from spinndrift.sims.run.log import RunLog, without_horizontal
 from spinndrift.sims.scenarios.maneuvers import Maneuvers
 from spinndrift.sims.scenarios.scenario import Scenario, load_scenario
 from spinndrift.systems.controllers.maneuvers import Phase, Steadiness

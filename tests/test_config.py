@@ -139,6 +139,7 @@ def test_drake_reads_the_same_text():
         ("name: a\nflag: no", "2: flag: found `no` (text); write true or false"),
         ("name: a\nflag: 1", "2: flag: found `1` (a number); write true or false"),
         ("name: a\nmaybe: true", "2: maybe: found `true` (a boolean); write a number"),
+        ("name: a\nmaybe: x", "maybe: found `x` (text); write a number, or null for none"),
         ("name: a\nmaybe: 1_0", "2: maybe: found `1_0` (text); write a number"),
         ("name: a\nmaybe: .nan", "2: maybe: found `nan` (a number); write a finite number"),
         (

@@ -231,6 +231,8 @@ def test_outputs_are_checked_before_anything_is_read(tmp_path, capsys, monkeypat
     monkeypatch.chdir(tmp_path)
     _recording((0.0,)).save("a.nc")
     assert "ending in .mcap" in _fails(capsys, "a.nc", "a.bag")
+    told = _fails(capsys, "a.nc", "a.mcap", "--layout", "l.txt")
+    assert "--layout l.txt: give a name ending in .json" in told
     (tmp_path / "own.mcap").write_bytes(b"\x89MCAP0\r\nof another program")
     assert "is no MCAP file of spinndrift" in _fails(capsys, "a.nc", "own.mcap")
     assert (tmp_path / "own.mcap").read_bytes().endswith(b"another program")

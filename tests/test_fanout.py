@@ -3,13 +3,15 @@
 import os
 import pickle
 import signal
+import socket
 import threading
 import time
 
 import pytest
 
 from spinndrift.models.config.errors import UserError
-from spinndrift.sims.fanout import run_on_cluster
+from spinndrift.sims import fanout
+from spinndrift.sims.fanout import check_workers, run_on_cluster
 from spinndrift.sims.study.config import scaled
 from spinndrift.sims.study.run import StudyWork
 
@@ -93,6 +95,16 @@ def test_bad_input_on_a_worker_ends_the_study(cluster):
         run_on_cluster(
             work, ["a"], lambda fraction, remark="", /: None, address=cluster.scheduler_address
         )
+
+
+def test_an_address_without_a_scheduler_is_one_sentence(monkeypatch):
+    """No client is left behind, whose own end would take longer and print an error of its own."""
+    monkeypatch.setattr(fanout, "_PATIENCE", 0.5)
+    monkeypatch.setattr("distributed.Client", None)
+    with socket.create_server(("127.0.0.1", 0)) as server:  # listens, and is no scheduler
+        for address in (f"tcp://127.0.0.1:{server.getsockname()[1]}", "nope", "tcp://a:b:c"):
+            with pytest.raises(UserError, match=f"--cluster {address}: no scheduler answers there"):
+                check_workers(address, 0)
 
 
 def test_what_workers_are_sent_survives_the_way():

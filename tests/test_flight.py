@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -310,6 +311,16 @@ def test_a_vehicle_with_another_frame_is_refused(port: int):
     text = f'vehicle_link: !Mavlink {{connection: "tcp:127.0.0.1:{port}"}}'
     with pytest.raises(UserError, match="has 8 thrusters and the scenario's vehicle 6"):
         fly(load_scenario("station_keeping_calm", f"station: {{vehicle: bluerov2}}\n{text}"))
+
+
+@pytest.mark.parametrize("collecting", [False, True])
+def test_an_unarmed_command_offers_what_it_has(collecting: bool, monkeypatch: pytest.MonkeyPatch):
+    for name in ("Driver", "Cockpit", "preflight"):
+        monkeypatch.setattr(flight, name, MagicMock())
+    monkeypatch.setattr(flight, "as_granted", lambda scenario, *_: scenario)
+    with pytest.raises(UserError, match="nothing was armed: add --arm to fly") as told:
+        fly(scenario(1, 1.0), keep=MagicMock() if collecting else None)
+    assert ("--dry-run" in str(told.value)) is not collecting
 
 
 def test_a_scenario_without_a_vehicle_says_what_to_add():

@@ -87,6 +87,22 @@ def test_no_port_is_told(where: str):
         LivePage(where)
 
 
+@pytest.mark.parametrize("host", ["192.0.2.1", "a..b"])
+def test_a_host_that_is_not_this_computer_is_told(host: str):
+    words = f"--live {host}:7890: {host} is no address of this computer; give 7890, or 0.0.0.0"
+    with pytest.raises(UserError, match=re.escape(words)):
+        LivePage(f"{host}:7890")
+
+
+def test_a_host_without_a_port_is_told_the_form():
+    for words in ("run station_keeping_calm --live localhost", "run a.yaml --live b --quiet"):
+        word = words.split()[3]
+        with pytest.raises(UserError, match=f"^--live {word}: give PORT or HOST:PORT; see"):
+            cli._parsed(cli._with_port(words.split()))
+    with pytest.raises(UserError, match="Unrecognized options: b"):
+        cli._parsed(cli._with_port(["run", "a.yaml", "b", "--live"]))
+
+
 def test_a_taken_port_is_told():
     with LivePage("0") as page:
         port = page.address.rstrip("/").rpartition(":")[2]

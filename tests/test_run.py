@@ -186,7 +186,7 @@ def test_collision_ends_the_run():
     [
         (
             "station: {obstacles: [{x: 0.2, y: 0.0, name: post}]}",
-            r"station.start: .* 0\.1\d m inside post, a certain collision",
+            r"station.start: .* 0\.1\d m inside the pylon `post`, a certain collision",
         ),
         (
             "{success: !ReachGoal {goal: [3, 0, -1.5]}, station: {obstacles: [{x: 3.1, y: 0.0}]}}",

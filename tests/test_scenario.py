@@ -23,6 +23,7 @@ SMALL = """
 planner: {horizon: 10, sequences: 16, realisations: 1, knots: [2], effective_samples: 4,
     shown_paths: 4}
 """
+_SELDOM = ("tracking_calm", "keeping_harbour", "hold_depth_vehicle")
 BASE = """
 name: base
 duration: 5
@@ -36,7 +37,7 @@ success: !FollowPath {position_rms: 0.2}
 def test_what_is_shipped():
     kinds = ("pylon_crossing", "station_keeping", "trajectory_tracking")
     simulated = {f"{k}_{water}" for k in kinds for water in ("calm", "harbour")}
-    assert set(scenario_names()) == simulated | {"pylon_crossing_vehicle"}
+    assert set(scenario_names()) == simulated | {"pylon_crossing_vehicle", "hold_depth_vehicle"}
 
 
 @pytest.mark.parametrize("name", scenario_names())
@@ -82,7 +83,8 @@ def test_pylon_crossing_is_the_papers_task():
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(n, marks=[pytest.mark.slow] * n.endswith(("tracking_calm", "keeping_harbour")))
+        # test_without_position flies hold_depth_vehicle
+        pytest.param(n, marks=[pytest.mark.slow] * n.endswith(_SELDOM))
         for n in scenario_names()
     ],
 )
@@ -183,7 +185,7 @@ def test_faults_are_told(text, message):
 
 
 def test_unknown_scenarios_are_told(tmp_path):
-    with pytest.raises(UserError, match="take one of pylon_crossing_calm"):
+    with pytest.raises(UserError, match="take one of hold_depth_vehicle, pylon_crossing_calm"):
         load_scenario("storm")
     with pytest.raises(UserError, match="no such file"):
         load_scenario(tmp_path / "mine.yaml")

@@ -2,6 +2,7 @@
 
 import os
 import pty
+import re
 import socket
 import threading
 import time
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from spinndrift.models.config.errors import UserError
+from spinndrift.sims.scenarios.scenario import load_scenario
 from spinndrift.systems.mavlink.dialect import Parser, mavlink
 from spinndrift.systems.mavlink.transport import Connection, Lost, Transport
 
@@ -138,6 +140,26 @@ def test_where_no_one_listens_is_one_sentence():
         Connection.parse(f"tcp:127.0.0.1:{port}").open()
     with pytest.raises(UserError, match=r"serial:/dev/no_such:57600: .*check the device"):
         Connection.parse("serial:/dev/no_such:57600").open()
+
+
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+@pytest.mark.parametrize("host", ["192.0.2.1", "a..b"])  # of documentation; no name
+def test_where_this_computer_can_t_listen_is_told_what_to_give(kind: str, host: str):
+    words = f"{host} is no address of this computer; give {kind}:0.0.0.0:14550"
+    with pytest.raises(UserError, match=re.escape(words)):
+        Connection.parse(f"{kind}:{host}:14550").open()
+
+
+def test_the_field_of_a_connection_is_named_once():
+    for text, field in (
+        ("connection: 10.0.0.1", "vehicle_link: Mavlink.connection: `10.0.0.1` is no"),
+        (
+            'connection: "udpin:0.0.0.0:14550", dvl: !WaterLinkedDvl {connection: x}',
+            "vehicle_link.dvl: WaterLinkedDvl.connection: `x` is no",
+        ),
+    ):
+        with pytest.raises(UserError, match=re.escape(f"--scenario-text: {field} connection")):
+            load_scenario("station_keeping_calm", f"vehicle_link: !Mavlink {{{text}}}")
 
 
 def test_close_from_another_thread_ends_a_read():

@@ -1,5 +1,9 @@
 """The server over sockets on loopback: real clients find a vehicle and command it."""
 
+import os
+import pty
+import select
+import socket
 import subprocess
 import sys
 import time
@@ -10,16 +14,52 @@ from served_vehicle import LIMIT, Served
 
 from spinndrift.models.recordings.store import Recording
 from spinndrift.systems.mavlink.dialect import Message, Parser, mavlink
+from spinndrift.systems.mavlink.link import Link
 from spinndrift.systems.mavlink.transport import Connection, Transport
 
 pytestmark = pytest.mark.whole
 
 
 @pytest.fixture(scope="module")
-def served() -> Iterator[Served]:
-    served = Served("tcpin:127.0.0.1:0", "udpin:127.0.0.1:0", "tcpin:127.0.0.1:0")
+def router() -> Iterator[Link]:
+    """A link that waits for its vehicle."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with Link(Connection.parse(f"tcpin:127.0.0.1:{port}")) as link:
+        yield link
+
+
+@pytest.fixture(scope="module")
+def line() -> Iterator[tuple[int, str]]:
+    """A serial line: our end, and the name of the other."""
+    ours, theirs = pty.openpty()
+    yield ours, os.ttyname(theirs)
+    os.close(ours)
+    os.close(theirs)
+
+
+@pytest.fixture(scope="module")
+def served(router: Link, line: tuple[int, str]) -> Iterator[Served]:
+    listening = ("tcpin:127.0.0.1:0", "udpin:127.0.0.1:0", "tcpin:127.0.0.1:0")
+    router_port = router.connection.number
+    served = Served(*listening, f"tcp:127.0.0.1:{router_port}", f"serial:{line[1]}:115200")
     yield served
     served.close()
+
+
+def test_it_connects_to_a_router_that_listens(served: Served, router: Link):
+    del served
+    assert router.find_vehicle(LIMIT) == (1, 1)
+
+
+def test_it_serves_a_serial_line(served: Served, line: tuple[int, str]):
+    del served
+    parser, heard, end = Parser(255, 190), set[str](), time.monotonic() + LIMIT
+    while "HEARTBEAT" not in heard and time.monotonic() < end:
+        if select.select([line[0]], [], [], 0.1)[0]:
+            heard |= {m.get_type() for m in parser.messages(os.read(line[0], 4096))}
+    assert "HEARTBEAT" in heard
 
 
 class Client:

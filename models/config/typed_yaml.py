@@ -41,7 +41,7 @@ from cattrs.gen import make_dict_structure_fn
 
 from .checks import LARGEST
 from .errors import UserError
-from .yaml_messages import fault, faults, fields, is_array, is_union, needed, wanted
+from .yaml_messages import Fault, fault, faults, fields, is_array, is_union, needed, wanted
 from .yaml_text import Tagged, emit, line_of, parse
 
 T = TypeVar("T")
@@ -273,7 +273,10 @@ def _union(cls: Any, converter: Converter) -> Any:
         if value is None and optional:
             return None
         if len(members) == 1:
-            return converter.structure(value, members[0])
+            try:
+                return converter.structure(value, members[0])
+            except Fault as error:  # of the value itself; those of its parts come in groups
+                raise Fault(f"{error}, or null for none" if optional else str(error)) from error
         if isinstance(value, Tagged):
             if value.tag not in classes:
                 raise fault(value, remedy)

@@ -44,9 +44,13 @@ def short(text: str) -> str:
     return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}…"
 
 
-def fault(value: Any, remedy: str) -> ValueError:
+class Fault(ValueError):
+    """A value that its field can't take."""
+
+
+def fault(value: Any, remedy: str) -> Fault:
     """The error of a value that its field can't take."""
-    return ValueError(f"found {_show(value)}; write {remedy}")
+    return Fault(f"found {_show(value)}; write {remedy}")
 
 
 def faults(error: BaseException, path: FieldPath, cls: Any) -> list[tuple[FieldPath, str]]:

@@ -30,6 +30,8 @@ class CheckLogs:
         with interrupts_held():
             from ..reports.marked_page import held_page
 
+        if not self.folders:
+            raise UserError("check logs: name one or more folders")
         if self.docs is None:
             yield
             return

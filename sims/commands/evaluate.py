@@ -58,6 +58,7 @@ class Evaluate:
             from ...models.vehicles.places import load_named
             from ...models.vehicles.vehicle import load_vehicle
             from ...systems.logs.load import load_data
+            from ...training.data.windows import window_places
             from ..learning import Start, compare, prepared
             from ..reports.findings import print_findings
 
@@ -78,6 +79,7 @@ class Evaluate:
             recording = load_data(
                 self.data, vehicle=self.vehicle, accept=self.accept, progress=update
             )
+        window_places(recording, self.length, self.length)  # refuses what is too short now
         recording = examine(recording, vehicle, str(self.data), self.accept)
         with progress_bar("evaluating"):
             models, windows = prepared(recording, vehicle, start, self.length)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ...models.recordings.store import Recording
     from ..reports.figures_path import Scene
 
-_SUFFIX = ".mcap"
+_SUFFIX, _LAYOUT = ".mcap", ".json"
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,8 @@ class Export:
 
         if self.out.suffix != _SUFFIX:
             raise UserError(f"{self.out}: give a name ending in {_SUFFIX}")
+        if self.layout is not None and self.layout.suffix != _LAYOUT:
+            raise UserError(f"--layout {self.layout}: give a name ending in {_LAYOUT}")
         checked_package(self.out)
         with ExitStack() as stack:
             stack.enter_context(output_file(self.out, is_ours, "MCAP file of spinndrift", ""))

@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from ...models.config.checks import SECONDS, SEED
+from ...models.config.errors import UserError
 from ...models.files.interrupts import interrupts_held
 from ..progress import console, progress_bar, tell_code
 
@@ -17,8 +18,8 @@ class Run:
     """Simulate a scenario: plant, water, sensors, filter, planner and controller in closed loop.
 
     SCENARIO is the path of a YAML file, or the name of a shipped scenario: station_keeping,
-    trajectory_tracking or pylon_crossing, each with the ending _calm or _harbour, or
-    pylon_crossing_vehicle.
+    trajectory_tracking or pylon_crossing, each with the ending _calm or _harbour, or for a vehicle
+    pylon_crossing_vehicle and hold_depth_vehicle, which needs no DVL.
 
     Writes a folder: report.html (read this first), meshcat.html (3-D replay), log.nc (a Recording
     of the run), metrics.json, and scenario.yaml with every default written out, which can be
@@ -44,7 +45,8 @@ class Run:
     seed: Annotated[int | None, SEED] = None
     """Seed of everything random; by default that of the scenario."""
     out: Path | None = None
-    """Folder to write, which must not exist yet; by default runs/<name>-<seed>."""
+    """Folder to write, which must be new, empty or that of a run that was interrupted; by default
+    runs/<name>-<seed>."""
     scenario_text: str = ""
     """YAML that overrides the scenario, such as 'station: {disturbance_set: calm}'."""
     model: Path | None = None
@@ -73,8 +75,14 @@ class Run:
             from ..run.folder import new_folder, write_files
             from ..run.live import live_page
             from ..run.loop import simulate
+            from ..run.way import position_note
             from ..scenarios.scenario import load_scenario
 
+        if self.arm and self.dry_run:
+            raise UserError(
+                "--arm and --dry-run exclude each other: --arm flies, --dry-run computes and logs "
+                "without commands; leave one out"
+            )
         scenario = load_scenario(self.scenario, self.scenario_text)
         tell_code(self.scenario, scenario.code)
         scenario = scenario.with_changes(self.seed, self.duration, self.model)
@@ -85,6 +93,8 @@ class Run:
             console().print(f"{told} What the controller asks for there has no effect.")
         if told := vehicle.instability():
             console().print(told)
+        if scenario.vehicle_link is None and (note := position_note(scenario)):
+            self._say(note)
         with (
             new_folder(self.out, scenario) as out,
             live_page(self.live, scenario, self._say) as live,
@@ -131,10 +141,11 @@ class Run:
     def _summary(self, values: dict, out: Path) -> None:
         shown, path, timing = console(), values["path"], values["timing"]
         shown.print(values["outcome"]["words"])
+        tracked = "depth error" if values["tracking"].get("depth_only") else "tracking error"
         told = [] if path["length_m"] is None else [f"path {path['length_m']:.1f} m"]
         for name, block, key in (
             ("minimum clearance", path, "min_clearance_m"),
-            ("tracking error", values["tracking"], "position_rms_m"),
+            (tracked, values["tracking"], "position_rms_m"),
             ("estimation error", values["estimate"], "position_rms_m"),
         ):
             if block.get(key) is not None:

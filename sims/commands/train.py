@@ -89,11 +89,7 @@ class Train:
             config = usual if self.config is None else load(TrainingConfig, self.config, usual)
         changes = {"steps": self.steps, "seed": self.seed}
         config = replace(config, **{k: v for k, v in changes.items() if v is not None})
-        if (self.out / "checkpoint.npz").exists() and not self.resume:
-            raise UserError(
-                f"--out {self.out}: holds a training run; continue it with --resume or name "
-                "another folder"
-            )
+        self._check_resumed()
         if self.vehicle is not None:
             load_vehicle(self.vehicle)  # fails now, not after the data are read
         start, metadata = (None, {}) if self.model is None else Start.read(self.model)
@@ -122,3 +118,17 @@ class Train:
         shown = console()
         shown.print(learned.evaluation.summary())
         shown.print(f"wrote {self.out / 'model.spinn'} and {self.out / 'report.html'}")
+
+    def _check_resumed(self) -> None:
+        """Refuse to begin where a training run is, and to continue where none is."""
+        there = (self.out / "checkpoint.npz").exists()
+        if there and not self.resume:
+            raise UserError(
+                f"--out {self.out}: holds a training run; continue it with --resume or name "
+                "another folder"
+            )
+        if self.resume and not there:
+            raise UserError(
+                f"--resume: {self.out} has no checkpoint; leave --resume out or name the run's "
+                "folder"
+            )

@@ -54,8 +54,10 @@ class Vehicle:
     """What is served: a vehicle to ground stations, or the physics of a real ArduSub."""
     connection: tuple[str, ...] = ()
     """Where to serve: udpout:HOST:PORT sends to a ground station that listens, udpin:HOST:PORT
-    answers whoever sends, tcpin:HOST:PORT takes one client at a time; port 0 takes a free one. By
-    default udpout:127.0.0.1:14550 and tcpin:127.0.0.1:5760, for an ArduSub udpin:127.0.0.1:9002."""
+    answers whoever sends, tcpin:HOST:PORT takes one client at a time, tcp:HOST:PORT connects to a
+    router that listens, serial:DEVICE:BAUD takes a serial line; port 0 of udpin and tcpin takes a
+    free one. By default udpout:127.0.0.1:14550 and tcpin:127.0.0.1:5760, for an ArduSub
+    udpin:127.0.0.1:9002."""
     seed: Annotated[int | None, SEED] = None
     """Seed of everything random; by default that of the scenario."""
     scenario_text: str = ""
@@ -65,7 +67,8 @@ class Vehicle:
     duration: Annotated[float | None, SECONDS] = None
     """Simulated time after which to end (s); by default never."""
     out: Path | None = None
-    """Folder to write, which must not exist yet; nothing is written by default."""
+    """Folder to write, which must be new, empty or that of a call that was interrupted; nothing is
+    written by default."""
     quiet: Annotated[bool, FlagCreatePairsOff, arg(help="Print nothing.")] = False
 
     def run(self) -> None:

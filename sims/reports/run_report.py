@@ -211,7 +211,8 @@ def _tiles(values: dict[str, Any]) -> list[tuple[str, str, str]]:
     fastest = path["max_speed_m_s"]
     add("Path", path["length_m"], "m", 1, "" if fastest is None else f"up to {fastest:.2f} m/s")
     add("Minimum clearance", path.get("min_clearance_m"), "m", 2, "hull to pylon")
-    add("Tracking error", tracking.get("position_rms_m"), "m", 2, "RMS")
+    tracked = "Depth error" if tracking.get("depth_only") else "Tracking error"
+    add(tracked, tracking.get("position_rms_m"), "m", 2, "RMS")
     add("Estimation error", values["estimate"].get("position_rms_m"), "m", 2, "RMS")
     return tiles
 

@@ -23,6 +23,7 @@ from .flight import fly
 from .folder import RUN, telemetry_log, write_files
 from .live import LivePage
 from .loop import Engine, Progress, simulate
+from .way import position_note
 
 COLLECTION = FolderKind("collection", ("scenario.yaml", "recording.nc"))
 """What `spinndrift collect` writes, besides a folder `dive-N` of each dive (a run's)."""
@@ -205,6 +206,8 @@ def collect(
             with telemetry_log(dive) as record:
                 run = fly(left, arm=arm, record=record, keep=collection.keep, **told)
         else:
+            if note := position_note(left):
+                say(note)
             seeded = left.with_changes(seed=(left.seed + number - 1) % 2**32)
             run = simulate(seeded, progress, engine, collection.keep, live)
         if live is not None:

@@ -60,8 +60,8 @@ def fly(
     again, arm, fly. With `dry_run` nothing is armed, changed or commanded; all is computed and
     logged. The run's scenario has the rates that the vehicle granted; its log has the estimate in
     place of the truth. `record` is a telemetry log (.tlog) to write. `say` gets sentences on what
-    is done. `keep` takes in each trajectory that the controller `!Maneuvers` finishes,
-    `live` what is seen.
+    is done. `keep` takes in each trajectory that the controller `!Maneuvers` finishes (of
+    `spinndrift collect`, which has no --dry-run), `live` what is seen.
 
     Raises:
         UserError: the scenario has no `vehicle_link` or no safe plan, a check of the pre-flight
@@ -83,10 +83,8 @@ def fly(
         say("running the loop without commands")
         cockpit.shadow()
         if not (arm or dry_run):
-            raise UserError(
-                "all checks are passed, and nothing was armed: add --arm to fly, or --dry-run to "
-                "compute and log without commands"
-            )
+            dry = ", or --dry-run to compute and log without commands" if keep is None else ""
+            raise UserError(f"all checks are passed, and nothing was armed: add --arm to fly{dry}")
         say("dry run: nothing is armed" if dry_run else "arming")
         cockpit.compile_monitor()
         checks = preflight(driver, scenario)

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from ...systems.closed_loop import Signal
 from ...systems.growing_rows import GrowingRows
@@ -17,7 +16,7 @@ from ...systems.mavlink import telemetry
 from ...systems.mavlink.driver import Acted, Driver
 from ...systems.mavlink.safety import AGED
 from ..scenarios.scenario import Scenario
-from .log import RunLog
+from .log import RunLog, without_horizontal
 from .signals import PlanTap, consistency, mean_over
 
 ORDERS = ("fly", "neutral", "hold_depth", "disarm", "yield")
@@ -174,20 +173,6 @@ class Journal:
         """What was noted from one call on, by name."""
         parts = np.split(self._rows.since(first), np.cumsum(self._sizes)[:-1], axis=1)
         return dict(zip(_NOTED, parts, strict=True))
-
-
-def without_horizontal(X: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States without what a vehicle without a horizontal aid can't know, and its climb (m/s).
-
-    As in an imported log: w is the part of the climb along the body's axis.
-    """
-    X, V = X.copy(), V.copy()
-    R = Rotation.from_quat(X[:, :4], scalar_first=True)
-    climb = R.apply(V[:, :3])[:, 2]
-    X[:, 4:6] = np.nan
-    V[:, :2] = np.nan
-    V[:, 2] = climb * R.as_matrix()[:, 2, 2]
-    return X, V, climb
 
 
 def _ages(entry: Entry) -> Float[np.ndarray, " a"]:

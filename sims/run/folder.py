@@ -123,7 +123,7 @@ def report_page(run: Run, values: dict[str, Any], replay: str = "") -> Page:
         values,
         scene(run.scenario),
         title=f"{title}, seed {run.scenario.seed}",
-        description=run.scenario.description,
+        description=f"{run.scenario.description} {run.note}".strip(),
         scenario_text=typed_yaml.dump(run.scenario),
         limits=np.asarray(limits),
         limitation=vehicle.limitation(),

@@ -19,10 +19,12 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram
 
 from ...models.config.errors import UserError
+from ...systems.mavlink.refusals import no_local
 from ...systems.mavlink.safety import AGED, SafetyConfig
 from ..scenarios.criteria import Outcome
 from ..scenarios.scenario import Scenario
-from .flight_log import ORDERS, Entry, Journal, without_horizontal
+from .flight_log import ORDERS, Entry, Journal
+from .log import without_horizontal
 from .signals import PlanTap
 
 _PAGE = Path(__file__).with_name("live.html")
@@ -43,7 +45,7 @@ class LivePage:
         """Listen at a PORT of this computer, or at HOST:PORT; port 0 takes a free one.
 
         Raises:
-            UserError: that is no port, or it is taken.
+            UserError: that is no port, or it is taken, or the host is not this computer.
         """
         host, _, port = where.rpartition(":")
         if not port.isdecimal() or int(port) > 65535:
@@ -63,9 +65,14 @@ class LivePage:
 
         try:
             self._server = ThreadingHTTPServer((host or "127.0.0.1", int(port)), Handler)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:
+            if no_local(error):
+                raise UserError(
+                    f"--live {where}: {host} is no address of this computer; give {port}, or "
+                    f"0.0.0.0:{port} to show the page to other computers"
+                ) from error
             raise UserError(
-                f"--live {where}: can't listen there ({error.strerror}); give another port, or 0 "
+                f"--live {where}: can't listen there ({error}); give another port, or 0 "
                 "for a free one"
             ) from error
         self._server.daemon_threads = True

@@ -15,8 +15,9 @@ Besides the variables of every recording (`docs/recording.md`) a run's log holds
 
 and for every plan (dim `plan`): `plan_time` (s), `plan_X_WB`, and with a sampling planner also
 `sample_p_WB`, `sample_weight` and `planner_figures`. Attributes: `allowed_risk` of the planner's
-chance constraint, `least_risk`, that of the widest path to the goal, and `fused`, the names of the
-n fused sensors if they are not `FUSED`.
+chance constraint, `least_risk`, that of the widest path to the goal, `fused`, the names of the n
+fused sensors if they are not `FUSED`, and `depth_only` of a simulated vehicle that held its depth
+without a position.
 """
 
 import os
@@ -26,6 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from ...models.recordings.build import Trajectory
 from ...models.recordings.store import Recording
@@ -90,12 +92,14 @@ class RunLog:
         least_risk: float | None = None,
         fused: tuple[str, ...] = FUSED,
         start: float = 0.0,
+        depth_only: bool = False,
     ) -> "RunLog":
         """Build from arrays with time first; `variables` holds at least X_WB, V_WB_B, F_Bo_B.
 
         `least_risk` is the probability of a collision on the widest path to the goal; `fused` are
         the names of the sensors that the filter fuses; `start` is the time of the first sample on
-        the vehicle's clock (s), NaN if unknown.
+        the vehicle's clock (s), NaN if unknown. `depth_only` says that the controller held depth
+        and attitude without a position, so that the depth alone is judged.
         """
         rest = dict(variables)
         X, V = rest.pop("X_WB"), rest.pop("V_WB_B")
@@ -115,6 +119,8 @@ class RunLog:
                 dataset.attrs["allowed_risk"] = float(plans.allowed)
         if least_risk is not None:
             dataset.attrs["least_risk"] = float(least_risk)
+        if depth_only:
+            dataset.attrs["depth_only"] = 1
         if fused != FUSED:
             dataset.attrs["fused"] = ",".join(fused)
         return cls(Recording(dataset))
@@ -140,6 +146,11 @@ class RunLog:
     def placed(self) -> bool:
         """Whether x and y of the vehicle are known at any time."""
         return bool(np.isfinite(self["X_WB"][:, 4:6]).all(axis=1).any())
+
+    @property
+    def depth_only(self) -> bool:
+        """Whether the depth alone is judged, as the vehicle did not know its x and y."""
+        return bool(self.recording.dataset.attrs.get("depth_only", 0)) or not self.placed
 
     @property
     def least_risk(self) -> float | None:
@@ -184,6 +195,20 @@ class RunLog:
             UserError: the file is missing or not a recording.
         """
         return cls(Recording.load(path))
+
+
+def without_horizontal(X: np.ndarray, V: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States without what a vehicle without a horizontal aid can't know, and its climb (m/s).
+
+    As in an imported log: w is the part of the climb along the body's axis.
+    """
+    X, V = X.copy(), V.copy()
+    R = Rotation.from_quat(X[:, :4], scalar_first=True)
+    climb = R.apply(V[:, :3])[:, 2]
+    X[:, 4:6] = np.nan
+    V[:, :2] = np.nan
+    V[:, 2] = climb * R.as_matrix()[:, 2, 2]
+    return X, V, climb
 
 
 def _plan_variables(plans: Plans) -> dict[str, xr.DataArray]:

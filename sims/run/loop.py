@@ -26,7 +26,7 @@ from .live import LivePage, simulation_view
 from .log import RunLog
 from .signals import PlanTap, collect, log_commands, log_periods, plan_source
 from .trajectories import Keep, ManeuverTap
-from .way import check_free, find_passage, holding, no_safe_plan
+from .way import check_free, depth_only, find_passage, holding, no_safe_plan, position_note
 
 Progress = Callable[[float, str], None]
 Engine = Literal["auto", "drake", "compiled"]
@@ -81,6 +81,8 @@ class Run(NamedTuple):
     """Further metrics by group, of a flight on a vehicle."""
     checks: tuple[tuple[str, bool, str], ...] = ()
     """Name, result and words of each check of its pre-flight."""
+    note: str = ""
+    """What a reader of its report should know (`way.position_note`)."""
 
 
 def simulate(
@@ -224,8 +226,10 @@ def _one(
         )
     if passage is not None and not passage.safe and outcome.reason in ("duration", "no progress"):
         outcome = Outcome("no safe plan", outcome.time, no_safe_plan(scenario, passage))
-    log = collect(scenario, logged(diagram, context), tap, outcome.time, passage)
-    return Run(scenario, log, outcome, timing)
+    log = collect(
+        scenario, logged(diagram, context), tap, outcome.time, passage, depth_only(scenario)
+    )
+    return Run(scenario, log, outcome, timing, note=position_note(scenario))
 
 
 def _simulator(

@@ -21,7 +21,7 @@ from .estimate import (
     local,
     nees,
 )
-from .log import RunLog
+from .log import RunLog, without_horizontal
 
 SETTLED = 2.0  # s: initial transient that is not counted as tracking error
 _SATURATED = 5.0  # µs from the end of the range
@@ -63,9 +63,8 @@ def verdict(outcome: Outcome, success: Success, values: dict[str, Any]) -> tuple
     rms = values["tracking"]["position_rms_m"]
     if rms is None or math.isnan(rms):
         return False, "The run was too short to measure the tracking error."
-    if values["path"]["length_m"] is None or math.isnan(values["path"]["length_m"]):
-        words = f"The depth was held within {rms:.2f} m RMS; the place is not known."
-        return rms <= success.position_rms, words
+    if values["tracking"]["depth_only"]:
+        return rms <= success.position_rms, _depth_words(rms, success, values["tracking"])
     if rms <= success.position_rms:
         return (
             True,
@@ -74,6 +73,16 @@ def verdict(outcome: Outcome, success: Success, values: dict[str, Any]) -> tuple
     return False, (
         f"The tracking error was {rms:.2f} m RMS; {success.position_rms:g} m are allowed."
     )
+
+
+def _depth_words(rms: float, success: FollowPath, tracking: dict[str, Any]) -> str:
+    words = f"The depth was held within {rms:.2f} m RMS"
+    if rms > success.position_rms:
+        words = f"The depth error was {rms:.2f} m RMS; {success.position_rms:g} m are allowed"
+    drift = tracking["drift_m"]
+    if math.isnan(drift):
+        return f"{words}; the place is not known."
+    return f"{words}; the vehicle did not know its place, and drifted by up to {drift:.2f} m."
 
 
 def clearance(
@@ -86,17 +95,21 @@ def clearance(
     return np.asarray(hull.clearance(jnp.asarray(log["X_WB"].T), cylinders))
 
 
-def tracking_error(log: RunLog) -> tuple[np.ndarray, np.ndarray] | None:
+def tracking_error(log: RunLog, depth_only: bool = False) -> tuple[np.ndarray, np.ndarray] | None:
     """Plan minus truth over time: log(X_WB⁻¹ X_plan) (N, 6), twist (N, 6); NaN without a plan.
 
-    A place that is not known (NaN) has no error, and neither has a velocity.
+    A place that is not known (NaN) has no error, and neither has a velocity; with `depth_only` they
+    are taken as unknown.
     """
     if "X_WB_plan" not in log or not np.any(log["plan_valid"] > 0.5):
         return None
     valid = (log["plan_valid"] > 0.5)[:, None]
+    known = log["X_WB"], log["V_WB_B"]
+    if depth_only:
+        known = without_horizontal(*known)[:2]
     X, V = (
-        np.where(np.isnan(known := log[name]) & valid, log[f"{name}_plan"], known)
-        for name in ("X_WB", "V_WB_B")
+        np.where(np.isnan(state) & valid, log[f"{name}_plan"], state)
+        for name, state in zip(("X_WB", "V_WB_B"), known, strict=True)
     )
     pose = local(X, np.where(valid, log["X_WB_plan"], X))
     twist = log["V_WB_B_plan"] - V
@@ -136,9 +149,15 @@ def _tracking(log: RunLog, success: Success) -> dict[str, Any]:
     error = tracking_error(log)
     if error is None:
         return {"position_rms_m": None}
+    found: dict[str, Any] = {"depth_only": log.depth_only}
+    if log.depth_only:
+        aside = np.linalg.norm((log["X_WB_plan"] - log["X_WB"])[:, 4:6], axis=1)
+        aside = aside[np.isfinite(aside) & (log["plan_valid"] > 0.5)]
+        found["drift_m"] = float(aside.max()) if aside.size else math.nan
+        error = tracking_error(log, depth_only=log.placed) or error
     settle = success.settle if isinstance(success, FollowPath) else SETTLED
     pose, twist = (part[log.time >= settle] for part in error)
-    return {
+    return found | {
         "position_rms_m": _rms(pose[:, :3]),
         "position_max_m": _largest(pose[:, :3]),
         "attitude_rms_deg": math.degrees(_rms(pose[:, 3:])),

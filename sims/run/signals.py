@@ -165,8 +165,9 @@ def collect(
     tap: PlanTap,
     end: float,
     passage: Passage | None = None,
+    depth_only: bool = False,
 ) -> RunLog:
-    """One log of all signals from 0 to `end` (s)."""
+    """One log of all signals from 0 to `end` (s), with the attribute `depth_only` (`RunLog`)."""
     dt = 1 / scenario.log.rate
     n = min(round(end / dt) + 1, len(signals["X_WB_cheat"].time))
     finite = np.all(np.isfinite(signals["X_WB_cheat"].value[:n]), axis=1)
@@ -198,6 +199,7 @@ def collect(
         notes=_NOTES,
         least_risk=None if passage is None else passage.risk,
         fused=fused,
+        depth_only=depth_only,
     )
 
 

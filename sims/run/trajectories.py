@@ -12,7 +12,8 @@ from ...systems.controllers.maneuvers import Phase
 from ..scenarios.criteria import Outcome
 from ..scenarios.maneuvers import Maneuvers
 from ..scenarios.scenario import Scenario
-from .flight_log import Journal, without_horizontal
+from .flight_log import Journal
+from .log import without_horizontal
 from .signals import mean_over
 
 Keep = Callable[[int, Trajectory], None]

@@ -10,7 +10,7 @@ from ...systems.planning.obstacles import Pylon
 from ...systems.planning.passage import Passage, upright_gap, widest_way
 from ...systems.planning.paths import PoseConfig
 from ...systems.planning.tasks import StationKeeping
-from ..scenarios.criteria import ReachGoal, clearance
+from ..scenarios.criteria import ReachGoal, clearance, named
 from ..scenarios.scenario import Scenario
 
 
@@ -57,6 +57,30 @@ def check_positioned(scenario: Scenario) -> None:
             f"station.obstacles: to keep clear of them {lacking}; {remedy} fly in free water: "
             "station: {obstacles: []}"
         )
+
+
+def position_note(scenario: Scenario) -> str:
+    """What a simulation without a sensor of horizontal motion says of it; empty with one.
+
+    Simulated, such a scenario runs in any case; on a vehicle `check_positioned` refuses some.
+    """
+    scenario = replace(scenario, vehicle_link=None)  # whose autopilot is not simulated
+    if scenario.positioned:
+        return ""
+    try:
+        check_positioned(scenario)
+    except UserError as error:
+        return f"This simulation goes on, but a vehicle would refuse the scenario: {error}"
+    return (
+        "There is no sensor of horizontal motion: the vehicle does not know where it is, and "
+        "drifts. Of its position the depth alone is judged."
+    )
+
+
+def depth_only(scenario: Scenario) -> bool:
+    """Whether a simulated vehicle holds its depth without a position, and is judged by it."""
+    held = scenario.controller.without_position(scenario.station) is not None
+    return held and not scenario.station.sensing.horizontal
 
 
 def find_passage(scenario: Scenario) -> Passage | None:
@@ -109,10 +133,9 @@ def _check(field: str, pose: PoseConfig, scenario: Scenario) -> None:
 
 
 def _taken(field: str, pylon: Pylon, gap: float) -> str:
-    name = pylon.name or f"the pylon at ({pylon.x:g}, {pylon.y:g})"
     return (
-        f"{field}: the hull would be {-gap:.2f} m inside {name}, a certain collision; move it or "
-        "the pylon"
+        f"{field}: the hull would be {-gap:.2f} m inside {named(pylon)}, a certain collision; "
+        "move it or the pylon"
     )
 
 

@@ -138,8 +138,8 @@ class Monitor:
         self._before = t
         for pylon in self.obstacles:
             if clearance(self._vehicle, X_WB, pylon) <= 0:
-                name = pylon.name or f"the pylon at ({pylon.x:g}, {pylon.y:g})"
-                return Outcome("collision", t, f"The vehicle hit {name} after {t:.1f} s.")
+                words = f"The vehicle hit {named(pylon)} after {t:.1f} s."
+                return Outcome("collision", t, words)
         rate = float(np.linalg.norm(V_WB_B[3:]))
         if rate <= self.safety.spin_rate:
             self._spinning_since = None
@@ -176,6 +176,11 @@ class Monitor:
             words = f"The vehicle made no progress for {rule.progress_time:g} s, at {t:.1f} s."
             return Outcome("no progress", t, words)
         return None
+
+
+def named(pylon: Pylon) -> str:
+    """A pylon in a sentence."""
+    return f"the pylon `{pylon.name}`" if pylon.name else f"the pylon at ({pylon.x:g}, {pylon.y:g})"
 
 
 def clearance(vehicle: Vehicle, X_WB: Float[np.ndarray, "7"], pylon: Pylon) -> float:

@@ -20,7 +20,7 @@ class WaterLinkedDvl:
 
     def __post_init__(self) -> None:
         """Check the connection."""
-        Connection.parse(self.connection, "vehicle_link.dvl.connection")
+        Connection.parse(self.connection, f"{type(self).__name__}.connection")
 
     def open(self) -> DvlStream:
         """Connect.
@@ -45,7 +45,7 @@ class NucleusDvl:
 
     def __post_init__(self) -> None:
         """Check the connection."""
-        Connection.parse(self.connection, "vehicle_link.dvl.connection")
+        Connection.parse(self.connection, f"{type(self).__name__}.connection")
 
     def open(self) -> DvlStream:
         """Connect and start its measurement.

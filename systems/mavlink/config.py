@@ -25,7 +25,8 @@ class Mavlink:
     `world` is `north`: then x points east and y north, about that place. Depth is absolute.
 
     Attributes:
-        connection: tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD.
+        connection: tcp:HOST:PORT, tcpin:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or
+            serial:DEVICE:BAUD (`systems.mavlink.transport`).
         actuation: how wrenches are commanded.
         estimate: `own` filter on the vehicle's sensors, or the `autopilot`'s estimate.
         world: what W's axes follow.
@@ -47,6 +48,6 @@ class Mavlink:
     def __post_init__(self) -> None:
         """Check the connection and the numbers."""
         check_numbers(self)
-        Connection.parse(self.connection, "vehicle_link.connection")
+        Connection.parse(self.connection, "Mavlink.connection")
         require(20 <= self.imu_rate <= 400, self, "imu_rate", "give a rate from 20 to 400 Hz")
         require(1 <= self.system <= 255, self, "system", "give a system id from 1 to 255")

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from ...models.config.errors import UserError
+from .refusals import LISTENING, refusal
 
 FORMS = "tcp:HOST:PORT, tcpin:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD"
 
@@ -49,7 +50,7 @@ class Connection:
         known = kind in _KINDS and bool(address) and number.isascii() and number.isdigit()
         if not known or not (kind == "serial" or int(number) < 65536):
             raise UserError(f"{field}: `{text}` is no connection; give {FORMS}")
-        lowest = 0 if kind in ("tcpin", "udpin") else 1
+        lowest = 0 if kind in LISTENING else 1
         if int(number) < lowest:
             raise UserError(f"{field}: `{text}` needs a port, or a baud rate, above 0")
         return cls(kind, address, int(number))
@@ -85,17 +86,8 @@ class Connection:
         try:
             yield
         except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-            raise UserError(f"connection {self}: {reason}; {_REMEDIES[self.kind]}") from error
-
-
-_REMEDIES = {
-    "tcp": "check that the vehicle or its router listens there, and the address",
-    "tcpin": "another program may use the port; close it or name another port",
-    "udpin": "another program may use the port; close it or name another port",
-    "udpout": "check the address",
-    "serial": "check the device's name, that it is plugged in and that you may open it",
-}
+            words = refusal(self.kind, self.address, self.number, error)
+            raise UserError(f"connection {self}: {words}") from error
 
 
 class Lost(OSError):

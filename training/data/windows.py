@@ -307,7 +307,7 @@ def window_places(
     if lengths.max() < steps + 1:
         raise UserError(
             f"recording: its longest trajectory lasts {(lengths.max() - 1) * recording.dt:g} s, "
-            f"a window needs {steps * recording.dt:g} s; record longer or give a shorter length_s"
+            f"a window needs {steps * recording.dt:g} s; record longer or give a shorter length"
         )
     return steps, [
         (j, k, n)

@@ -146,7 +146,8 @@ def forecast_square(
     data, kept = problem.data, _spread(problem.data.fold, _PIECES)
     if data.latent or data.spread is not None:
         problem = _with_velocities(problem, scores(problem, contender, estimated).latent)
-    none = tuple(np.zeros((rows, len(kept))) for rows in (12, 6, 6))
+    record, diffusion, slip = (np.zeros((rows, len(kept))) for rows in (12, 6, 6))
+    none = record, diffusion, slip
     kinds = _kinds(problem, contender, in_use)
     return _square(simulate(problem, contender, none, kept, horizon, 0, kinds, 0), data, horizon)
 

@@ -98,13 +98,12 @@ def _check_forces(vehicle: Any) -> None:
 
 def _check_lengths(vehicle: Any) -> None:
     volume = vehicle.buoyancy / (vehicle.water_density * GRAVITY)
-    share = volume / float(np.prod(vehicle.size))
-    least, most = _VOLUME
+    box, (least, most) = float(np.prod(vehicle.size)), _VOLUME
     require(
-        least <= share <= most,
+        least * box <= volume <= most * box,
         vehicle,
         "size",
-        f"its box holds {1 / share:.2g} times the {volume:.3g} m³ that the buoyancy displaces; "
+        f"a box of {box:.3g} m³ is not that of a vehicle whose buoyancy displaces {volume:.3g} m³; "
         "give length, width and height in m",
     )
     diagonal = float(np.linalg.norm(vehicle.size))
@@ -117,8 +116,8 @@ def _check_lengths(vehicle: Any) -> None:
         if away > _REACH * diagonal:
             _refuse(
                 path,
-                f"is {position!r}: that is {away / diagonal:.3g} times the diagonal of `size` from "
-                "Bo; give metres",
+                f"is {position!r}: that is {away:.3g} m from Bo, and the diagonal of `size` is "
+                f"{diagonal:.3g} m; give metres",
             )
     apart = np.subtract(vehicle.center_of_buoyancy, vehicle.center_of_mass)
     require(

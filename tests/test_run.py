@@ -194,7 +194,7 @@ def test_collision_ends_the_run():
         ),
         (
             "{station: {obstacles: [{x: 4.5, y: -2.3, name: post}]}}",
-            r"controller.task.goal: .* inside post",
+            r"controller.task.goal: .* inside the pylon `post`",
         ),
     ],
 )

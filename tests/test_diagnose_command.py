@@ -90,7 +90,7 @@ def test_a_vehicle_that_nobody_states_is_told(tmp_path, diagnosing, capsys, stat
     data, out = recorded(tmp_path / "still.nc", stated), tmp_path / "out"
     more = ("--vehicle", "bluerov2_heavy") if given else ()
     assert called("diagnose", data, "--out", out, *more) is None
-    told = "still.nc states no vehicle, so bluerov2_heavy is assumed" in capsys.readouterr().err
+    told = "still.nc names no vehicle, so bluerov2_heavy is assumed" in capsys.readouterr().err
     assert told == said
     assert files(out) == FILES
 

@@ -185,7 +185,7 @@ def test_the_largest_are_named_with_their_time():
     assert "0.4 rad, in a, b, c and 1 more runs" in told
     assert in_words([], ["a"]) == []
     (cut,) = in_words([], ["a"], ["Cut at 1 × attitude reset of the estimator.", "else"])
-    assert cut.endswith("attitude reset of the estimator.")
+    assert cut.endswith("attitude reset of the estimator")
     (alone,) = off_causes(off[:1], ["a"])
     assert alone.when is not None
     assert alone.when.text == "from 1.0 s to its end"

@@ -1,5 +1,7 @@
 """Logs with one stream wrong: its unit or sign, readings that stand still, a clock that jumps."""
 
+import struct
+
 import log_writers
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from spinndrift.models.recordings.outputs import outputs_of
 from spinndrift.models.recordings.resample import rotations
 from spinndrift.systems.logs.clock import epochs
 from spinndrift.systems.logs.load import import_log
+from spinndrift.systems.logs.packets import repeated, scan
 from spinndrift.systems.mavlink import codec
 
 DURATION = 20.0
@@ -377,3 +380,27 @@ def test_a_dataflash_clock_that_steps_back_makes_two_parts(tmp_path):
     recording, _, report = imported(tmp_path, log, "dive.BIN")
     assert recording.scenarios == ("01_MANUAL", "02_MANUAL")
     assert "clock stepped back 1 time" in str(report)
+
+
+@pytest.mark.parametrize("rate", [20, 300])
+def test_equal_packets_whose_numbers_came_round_are_no_copies(rate):
+    """At 300 packets a second the numbers recur within the two seconds that a copy may be late."""
+    one = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+    data = b""
+    for k in range(700):
+        stamp = struct.pack(">Q", round(1e15 + 1e6 * k / rate))
+        one.seq = k % 256
+        data += stamp + dialect.MAVLink_heartbeat_message(12, 3, 0, 0, 4, 3).pack(one)
+    packets = scan(data)
+    every = np.ones(packets.record.size, bool)
+    assert packets.record.size == 700
+    assert not repeated(data, packets, every).any()
+    copied = repeated(data + data[-20 * 29 :], scan(data + data[-20 * 29 :]), np.ones(720, bool))
+    assert np.flatnonzero(copied).tolist() == [*range(700, 720)]
+
+
+@pytest.mark.parametrize(("jump", "said"), [(103.0, False), (112.0, True)])
+def test_a_reset_of_the_estimator_before_arming_is_none_of_the_data(tmp_path, jump, said):
+    log = dive(duration=DURATION, state=lambda t: (t > 106.0, 19), jump=jump)
+    _, _, report = imported(tmp_path, log)
+    assert ("position reset of the estimator" in str(report)) == said

@@ -195,8 +195,9 @@ class Diagnose:
         stated = self.vehicle or ("" if self._is_log() else recorded) or named
         if not stated:
             stated = recorded or _USUAL  # that of a log's frame
-            told = f"{self.data.name} states no vehicle, so {stated} is assumed; name another with "
-            console().print(told + "--vehicle", soft_wrap=True)
+            by = ", by its frame or number of outputs," if recorded and self._is_log() else ""
+            told = f"{self.data.name} names no vehicle, so {stated}{by} is assumed; name another"
+            console().print(f"{told} with --vehicle", soft_wrap=True)
         return stated
 
     def _is_log(self) -> bool:

@@ -19,6 +19,8 @@ _MAGICS = (_V2, _V1)
 _MAGIC = re.compile(rb"[\xfd\xfe]")
 _SIGNATURE = 13
 _COPY_S = 2.0
+_CYCLE = 192
+"""Packets after which numbers may recur: 256, less those that are lost."""
 _CODES = {
     "b": "i1",
     "B": "u1",
@@ -144,16 +146,17 @@ def _resync(data: bytes, start: int, size: int) -> int:
 def repeated(data: bytes, packets: Packets, which: np.ndarray) -> np.ndarray:
     """Which of the chosen packets came before, byte for byte with number and checksum.
 
-    A vehicle's packets are numbered from 0 to 255, so such copies within two seconds are not new.
+    A vehicle numbers its packets from 0 to 255, so equal ones are copies if they are less than two
+    seconds and clearly less than 256 packets apart.
     """
     stamps = packets.stamps(data)
-    seen: dict[bytes, float] = {}
+    seen: dict[bytes, tuple[int, float]] = {}
     found = np.zeros(which.size, bool)
-    for i in np.flatnonzero(which).tolist():
-        packet = data[packets.record[i] + 8 : packets.end[i]]
-        before = seen.get(packet)
-        found[i] = before is not None and abs(stamps[i] - before) < _COPY_S
-        seen[packet] = float(stamps[i])
+    for count, i in enumerate(np.flatnonzero(which).tolist()):
+        packet, t = data[packets.record[i] + 8 : packets.end[i]], float(stamps[i])
+        before, earlier = seen.get(packet, (-_CYCLE, t))
+        found[i] = count - before < _CYCLE and abs(t - earlier) < _COPY_S
+        seen[packet] = count, t
     return found
 
 

@@ -55,6 +55,7 @@ def segments(signals: Signals, gap: float) -> tuple[list[Segment], list[str]]:
         told.append(f"{count} gap{'s' * (count > 1)} of up to {longest:.1f} s")
     cuts = [*signals.cuts, *jumps(signals)]
     spans = _intersect(spans, _between([t for t, _ in cuts]))
+    cuts = [(t, k) for t, k in cuts if any(s.start <= t <= s.stop for s in armed)]
     for kind in dict.fromkeys(kind for _, kind in cuts):
         times = np.sort([t for t, k in cuts if k == kind])
         count = 1 + int(np.count_nonzero(np.diff(times) > 1.0))

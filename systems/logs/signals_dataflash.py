@@ -68,6 +68,7 @@ WANTED = (
 _HORIZ_VEL, _HORIZ_POS, _CONST_POS = 1 << 1, 1 << 3 | 1 << 4, 1 << 7
 _ARMED_EVENT, _DISARMED_EVENT = 10, 11
 _AIDS = ("VISO", "VISP", "VISV")
+_FIX_3D = 3
 _BAROMETERS = {"BARO": 0, "BAR2": 1, "BAR3": 2}
 _LATEST_S = 1e9  # of a clock that counts from the boot
 
@@ -106,6 +107,7 @@ def signals_from_bin(
         rate_notes = (*rate_notes, *delay)
     aids = [name for name in _AIDS if name in tables]
     no_aid, stops = aid_spans(tables, aids, last)
+    aids += ["GPS"] if _has_fix(tables) else []
     spans = {"wiring": wired.spans, **_states(tables, first, last), **_aiding(tables, core)}
     voltage = _voltage(tables)
     batteries = [name for name in ("BAT",) if name in tables]
@@ -125,7 +127,7 @@ def signals_from_bin(
         spans={**spans, **no_aid},
         cuts=(*((t, "step back of the clock") for t in log.boots), *wired.cuts),
         has=(f"Horizontal aid: {', '.join(aids)}.",) if aids else (),
-        lacks=() if aids else ("No DVL, odometry or vision record in the log.",),
+        lacks=() if aids else ("No DVL, odometry or vision record and no GPS fix in the log.",),
         notes=(*log.notes, *strange, *wired.notes, *notes, *rate_notes, *depth.told),
         findings=tuple(findings),
         **wired.of_signals(),
@@ -274,6 +276,13 @@ def _aiding(tables: Mapping[str, Table], core: int) -> dict[str, Spans]:
     flags = whole(status["SS"])
     aided = (flags & _HORIZ_VEL > 0) & (flags & _HORIZ_POS > 0) & (flags & _CONST_POS == 0)
     return {"aiding": sampled_spans(status["t"], ["" if a else UNAIDED for a in aided])}
+
+
+def _has_fix(tables: Mapping[str, Table]) -> bool:
+    """Whether a GPS had a fix most of the time."""
+    table = tables.get("GPS")
+    fixes = np.zeros(0) if table is None or "Status" not in table else table["Status"]
+    return fixes.size > 0 and bool(np.median(fixes) >= _FIX_3D)
 
 
 def _states(tables: Mapping[str, Table], first: float, last: float) -> dict[str, Spans]:

@@ -302,7 +302,7 @@ def in_words(
     """A sentence where the heading is off, or `notes` of an import tell that the attitude jumps."""
     if not off:
         jumps = (note for note in notes if "attitude reset" in note)
-        return [f"the attitude jumps against the rates: {note}" for note in jumps]
+        return [f"the attitude jumps against the rates: {note.rstrip('.')}" for note in jumps]
     runs = [labels[n] for n in dict.fromkeys(one.first_run for one in off)]
     more = f" and {len(runs) - 3} more runs" if len(runs) > 3 else ""
     largest = max(off, key=lambda one: abs(one.offset))

@@ -199,8 +199,9 @@ def test_commands_go_on_where_the_record_cannot_be_written(flying):
         def write(self, data):
             raise OSError(28, "No space left on device")
 
-    link._record.close()
-    link._record = Full()
+    with link._sending:  # its thread writes too
+        link._record.close()
+        link._record = Full()
     count = len(vehicle.heard)
     assert link.send(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3))
     assert within(5.0, lambda: len(vehicle.heard) > count + 3)  # its own heartbeats go on, too

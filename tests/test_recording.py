@@ -142,7 +142,7 @@ def test_split_by_run_shares_nothing_and_loses_nothing():
     assert np.array_equal(long.split()[1].mask, long.split_by_time()[1].mask)
     with pytest.raises(UserError, match="single run"):
         recording(40).split_by_run(0.5)
-    with pytest.raises(UserError, match="'c'"):
+    with pytest.raises(UserError, match="scenario c: is not here"):
         made.select("c")
 
 

@@ -214,3 +214,19 @@ def test_damaged_packets_are_skipped_and_the_next_are_read():
     assert {m.get_type() for m in found} == {"HEARTBEAT"}
     assert len(found) >= 148  # a wrong length may take a neighbour along
     assert receiver.damaged > 0
+
+
+def test_a_serial_line_that_no_one_reads_holds_nothing_up():
+    """Its buffer is full after some kilobytes; packets are lost then, as on a radio."""
+    ours, theirs = pty.openpty()
+    transport = Connection.parse(f"serial:{os.ttyname(theirs)}:115200").open()
+    try:
+        began = time.monotonic()
+        for _ in range(40):
+            transport.write(bytes(1000))
+        assert time.monotonic() - began < 10.0
+        assert os.read(ours, 100) == bytes(100)
+    finally:
+        transport.close()
+        os.close(ours)
+        os.close(theirs)

@@ -20,6 +20,7 @@ from .refusals import LISTENING, refusal
 FORMS = "tcp:HOST:PORT, tcpin:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD"
 
 _CHUNK = 65536  # bytes read at once: more than the largest datagram
+_FULL_S = 0.02  # for which a serial line may take nothing; with 0 pyserial tries for ever
 _WAITING = 32768  # bytes that may wait to be sent: behind them a command would be late
 _SILENT = 10.0  # s after which a UDP peer that sends nothing gets nothing
 
@@ -291,7 +292,7 @@ class _Serial:
         import serial
 
         address, baud = connection.address, connection.number
-        self._line = serial.Serial(address, baud, timeout=0, write_timeout=0)
+        self._line = serial.Serial(address, baud, timeout=0, write_timeout=_FULL_S)
 
     def read(self, timeout: float) -> bytes:
         try:
@@ -309,7 +310,7 @@ class _Serial:
             self._line.write(data)
         except OSError as error:
             if type(error).__name__ == "SerialTimeoutException":
-                return  # the line is full
+                return  # the line is full: the packet is lost
             raise Lost(str(error)) from error
 
     def close(self) -> None:

@@ -15,6 +15,7 @@ from ...models.recordings.checks.finding import Finding
 from ...models.recordings.resample import continuous
 from ...models.recordings.steady_times import Steady, steady_times
 from .clock import rate_findings
+from .streams import FIX_3D
 from .table import Table
 
 _SMOOTH = {
@@ -35,7 +36,6 @@ _FEWEST = 3
 """Records; fewer have no order."""
 _SINGLE = 0.1
 """Share of records that run back from which on stamps jitter, and none of them is better."""
-_FIX = 3
 _WEEK_S = 604800.0
 _RUNS = 5
 """Places of records that run back that are told one by one."""
@@ -101,7 +101,7 @@ def gps_findings(tables: Mapping[str, Table]) -> list[Finding]:
     table = tables.get("GPS")
     if table is None or not {"GWk", "GMS", "Status"} <= table.keys():
         return []
-    fix = (table["Status"] >= _FIX) & np.isfinite(table["GMS"]) & (table["GWk"] > 0)
+    fix = (table["Status"] >= FIX_3D) & np.isfinite(table["GMS"]) & (table["GWk"] > 0)
     own, stamps = table["t"][fix], (table["GWk"] * _WEEK_S + table["GMS"] * 1e-3)[fix]
     new = np.concatenate([[True], np.diff(stamps) > 0])[: own.size]  # a second receiver repeats it
     order = (np.diff(own[new], prepend=-np.inf) > 0) if own.size else new

@@ -25,7 +25,7 @@ from .signals import (
     series,
     undelayed,
 )
-from .streams import UNAIDED, aid_spans, missing_states
+from .streams import UNAIDED, aid_spans, has_fix, missing_states
 from .table import Table, whole
 from .wiring import Wiring, direction_findings, thruster_outputs, wiring
 
@@ -68,7 +68,6 @@ WANTED = (
 _HORIZ_VEL, _HORIZ_POS, _CONST_POS = 1 << 1, 1 << 3 | 1 << 4, 1 << 7
 _ARMED_EVENT, _DISARMED_EVENT = 10, 11
 _AIDS = ("VISO", "VISP", "VISV")
-_FIX_3D = 3
 _BAROMETERS = {"BARO": 0, "BAR2": 1, "BAR3": 2}
 _LATEST_S = 1e9  # of a clock that counts from the boot
 
@@ -107,7 +106,7 @@ def signals_from_bin(
         rate_notes = (*rate_notes, *delay)
     aids = [name for name in _AIDS if name in tables]
     no_aid, stops = aid_spans(tables, aids, last)
-    aids += ["GPS"] if _has_fix(tables) else []
+    aids += ["GPS"] if has_fix(tables.get("GPS"), "Status") else []
     spans = {"wiring": wired.spans, **_states(tables, first, last), **_aiding(tables, core)}
     voltage = _voltage(tables)
     batteries = [name for name in ("BAT",) if name in tables]
@@ -276,13 +275,6 @@ def _aiding(tables: Mapping[str, Table], core: int) -> dict[str, Spans]:
     flags = whole(status["SS"])
     aided = (flags & _HORIZ_VEL > 0) & (flags & _HORIZ_POS > 0) & (flags & _CONST_POS == 0)
     return {"aiding": sampled_spans(status["t"], ["" if a else UNAIDED for a in aided])}
-
-
-def _has_fix(tables: Mapping[str, Table]) -> bool:
-    """Whether a GPS had a fix most of the time."""
-    table = tables.get("GPS")
-    fixes = np.zeros(0) if table is None or "Status" not in table else table["Status"]
-    return fixes.size > 0 and bool(np.median(fixes) >= _FIX_3D)
 
 
 def _states(tables: Mapping[str, Table], first: float, last: float) -> dict[str, Spans]:

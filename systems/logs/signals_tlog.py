@@ -22,7 +22,7 @@ from .signals import (
     series,
     undelayed,
 )
-from .streams import aid_spans, missing_states
+from .streams import aid_spans, has_fix, missing_states
 from .table import Table
 from .tlog import TlogLog
 from .wiring import Wiring, direction_findings, thruster_outputs, wiring
@@ -49,7 +49,6 @@ WANTED = (
     "SYS_STATUS",
 )
 AIDS = ("VISION_POSITION_DELTA", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE", "ODOMETRY")
-_FIX_3D = 3
 _BEYOND = 0.05
 """Share of the angles beyond a turn that damaged messages do not make."""
 
@@ -130,9 +129,7 @@ def _parameters(table: Table | None) -> tuple[list[Parameter], list[str]]:
 def _aids(log: TlogLog) -> list[str]:
     """Names of the sources of horizontal position and velocity that were heard."""
     aids = sorted({name for name, _, _ in log.heard if name in AIDS})
-    fixes = log.tables.get("GPS_RAW_INT")
-    gps = fixes is not None and np.median(fixes["fix_type"]) >= _FIX_3D
-    return [*aids, "GPS"] if gps else aids
+    return [*aids, "GPS"] if has_fix(log.tables.get("GPS_RAW_INT"), "fix_type") else aids
 
 
 def _attitude(tables: Mapping[str, Table]) -> Series:

@@ -11,8 +11,16 @@ from .table import Table
 
 DEAD_RECKONING = "dead-reckoning"
 UNAIDED = "unaided"
+FIX_3D = 3
+"""Least kind of a GPS fix with a position and a height, in MAVLink and DataFlash alike."""
 _SILENT_S, _SILENT_PERIODS = 2.0, 10.0
 """An aid that is silent for this long, and for this many of its periods, has stopped."""
+
+
+def has_fix(table: Table | None, field: str) -> bool:
+    """Whether a GPS has had a 3-D fix most of the time; `field` has the kind of its fixes."""
+    fixes = np.zeros(0) if table is None or field not in table else table[field]
+    return fixes.size > 0 and bool(np.median(fixes) >= FIX_3D)
 
 
 def aid_spans(

@@ -175,6 +175,16 @@ class Sensor(abc.ABC):
         residual = values - self.predicted(X_WB, V_WB_B, slow)
         return Innovation(residual, J[:, :6], J[:, 6:9], J[:, 9:12], J[:, 12])
 
+    def off(
+        self,
+        X_WB: Float[Array, "7"],
+        V_WB_B: Float[Array, "6"],
+        slow: Float[Array, "1"],
+        values: Float[Array, "m"],
+    ) -> Float[Array, "m"]:
+        """The error of the values that would explain them, in their units; see `innovation`."""
+        return self.innovation(X_WB, V_WB_B, slow, values).residual
+
     def add_to(self, station: Any, name: str) -> None:
         """Add it to a station's builder (`systems.station.simulated.StationBuilder`)."""
         station.measure(name, self)

@@ -77,6 +77,17 @@ class Compass(Gauge):
         level = jnp.linalg.norm(se3.rotate(X_WB, bow)[:2]) * jnp.cos(off[0])
         return Innovation(-h, H, slow=level[None])
 
+    def off(
+        self,
+        X_WB: Float[Array, "7"],
+        V_WB_B: Float[Array, "6"],
+        slow: Float[Array, "1"],
+        values: Float[Array, "1"],
+    ) -> Float[Array, "1"]:
+        """The difference of yaw, in [−π, π) rad."""
+        del V_WB_B
+        return wrap(values - self.expected(X_WB) - slow)
+
     def expected(self, X_WB: Float[Array, "7 *batch"]) -> Float[Array, "1 *batch"]:
         """Noise-free reading: the yaw of B."""
         return se3.yaw(X_WB)[None]

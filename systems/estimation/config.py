@@ -20,10 +20,9 @@ class EkfConfig:
             `tests/test_filtering.py` without a DVL).
         horizon: longest latency of a reading (s).
         gate: probability that a good reading passes the chi-square gate.
-        patience: number of consecutive rejections after which a sensor is judged. Either it is at
-            fault and left out until as many readings pass in a row, or the filter may have
-            diverged: then the covariance grows by the squared residual and the reading is fused
-            (`systems.estimation.trust`).
+        patience: number of consecutive rejections after which something must have changed: the
+            sensor, whose offset is then a state, or the filter, whose covariance then grows by
+            the squared residual (`systems.estimation.changes`). Fewer do if they are much alike.
         output_rate: estimates per second (Hz).
         silence: time without an accepted reading after which a sensor is not trusted (s).
         lost_velocity: standard deviation of velocity above which the state is lost (m/s).
@@ -36,7 +35,7 @@ class EkfConfig:
     imu_factor: float = 1.2
     horizon: float = 0.24
     gate: float = 0.999
-    patience: int = 10
+    patience: int = 3
     output_rate: float = 20.0
     silence: float = 3.0
     lost_velocity: float = 0.5

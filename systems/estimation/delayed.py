@@ -8,127 +8,31 @@ estimate is that of an ordinary Kalman filter without delays. The present state 
 the preintegrated increment of the buffered samples (the predictor of Khosravian et al. 2015).
 """
 
-import math
-from dataclasses import replace
-from itertools import accumulate
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
-from scipy.stats import chi2
+from jaxtyping import Array, Bool, Float
 
-from ...models.config.checks import require
-from ...models.sensors import Imu, Sensor
-from . import error_state, inertial, measurement, recovery
-from .config import EkfConfig
+from . import changes, error_state, inertial, jolts, measurement, recovery
 from .error_state import Navigation
 from .inertial import Motion, Samples
+from .layout import SAMPLE, Layout
+from .readings import Shown, offset_places
 from .state import SUMS, FilterState, Readings, health, status
-from .trust import (
-    Shown,
-    Trust,
-    counted,
-    imu_off,
-    judged,
-    others,
-    pulls,
-    sizes,
-    suspected,
-    with_doubt,
-)
+from .trust import Trust, counted, pulls
 
-_SAMPLE = 7
-"""Columns of a slot: has sample, force 3, mean rate 3 | has reading, values, for each sensor | rate
-at the end 3 | `inertial.LEFT_OPEN`."""
+_NEGLECTED = 1.0  # s: correlation time of errors of second order, which turn with the body
+_APPROXIMATE = 2.0  # factor on the covariance that is told while a sensor has changed
 _LONGEST = 0.1  # s: longest interval between predictions of the covariance
 
 
-class DelayedFilter(eqx.Module):
-    """The filter's constants, with pure `init`, `step` and `present`.
-
-    `aids` are the sensors that are fused, besides the IMU: all that `observes` something.
-    """
-
-    imu: Imu = eqx.field(static=True)
-    aids: tuple[Sensor, ...] = eqx.field(static=True)
-    config: EkfConfig = eqx.field(static=True)
-
-    def __check_init__(self) -> None:
-        """Check that readings arrive within the horizon and that no noise is zero."""
-        for sensor in self.aids:
-            remedy = "give more than zero: a filter divides by it"
-            require(min(sensor.noise_std) > 0, sensor, "noise", remedy)
-            longest = sensor.latencies[1] + 2 * self.period
-            require(
-                not sensor.late or self.slots * self.period >= longest - 1e-9,
-                self.config,
-                "horizon",
-                f"give at least the {type(sensor).__name__}'s latest latency and two samples, "
-                f"{longest:.3g} s",
-            )
-
-    @property
-    def period(self) -> float:
-        """Time between inertial samples (s)."""
-        return 1 / self.imu.rate
-
-    @property
-    def slots(self) -> int:
-        """Number of buffered samples."""
-        return math.ceil(self.config.horizon * self.imu.rate - 1e-9)
-
-    @property
-    def flags(self) -> np.ndarray:
-        """Column of each sensor's flag in a slot; its values follow."""
-        return np.array([*accumulate((n + 1 for n in sizes(self.aids)), initial=_SAMPLE)][:-1])
-
-    @property
-    def rate_column(self) -> int:
-        """Column of the rate in a slot, after the sensors' values."""
-        return _SAMPLE + sum(sizes(self.aids)) + len(self.aids)
-
-    @property
-    def slot(self) -> int:
-        """Number of columns of a slot."""
-        return self.rate_column + 3 + inertial.LEFT_OPEN
-
-    @property
-    def errors(self) -> int:
-        """Number of components of the error state."""
-        return error_state.INERTIAL + len(self.aids)
-
-    def samples_at_once(self, most: int) -> int:
-        """Largest divisor of `most` so that `take_in` of so many samples misses no reading."""
-        gaps = [(1 / each.rate, each.latencies) for each in self.aids]
-        shortest = min(period - (latest - earliest) for period, (earliest, latest) in gaps)
-        fit = [
-            n for n in range(1, most + 1) if most % n == 0 and n * self.period <= shortest + 1e-9
-        ]
-        return max(fit, default=1)
-
-    @property
-    def _noisy_imu(self) -> Imu:
-        f, imu = self.config.imu_factor, self.imu
-        return replace(
-            imu,
-            accelerometer_density=f * imu.accelerometer_density,
-            gyroscope_density=f * imu.gyroscope_density,
-        )
-
-    def deviations(self) -> Float[Array, "e"]:
-        """Standard deviations of the initial error."""
-        c = self.config
-        slow = (each.slow_error[0] for each in self.aids)
-        biases = (self.imu.gyroscope_bias,) * 3 + (self.imu.accelerometer_bias,) * 3
-        stds = (*c.position_std, *c.attitude_std, *c.velocity_std, *biases, *slow)
-        return jnp.asarray(stds, jnp.result_type(float))
+class DelayedFilter(Layout):
+    """Pure `init`, `step` and `present` of the filter whose constants it has."""
 
     def init(self, X_WB: Float[Array, "7"], V_WB_B: Float[Array, "6"]) -> FilterState:
         """The state at time 0 for an estimated pose and twist, biases unknown."""
         zero = jnp.zeros_like(V_WB_B[:3])
-        start = Navigation(X_WB, V_WB_B[:3], zero, zero, jnp.zeros(len(self.aids), zero.dtype))
+        sensors = jnp.zeros(self.errors - error_state.INERTIAL, zero.dtype)
+        start = Navigation(X_WB, V_WB_B[:3], zero, zero, sensors)
         return FilterState(
             start,
             error_state.of_body_axes(jnp.diag(self.deviations() ** 2), start),
@@ -172,10 +76,10 @@ class DelayedFilter(eqx.Module):
 
         memory, rows = jax.lax.scan(over, state.samples, (samples, number[self.slots :]))
         open_ = self.rate_column + 3
-        rest = jnp.zeros((n, open_ - _SAMPLE), dtype)
-        new = jnp.concatenate([rows[:, :_SAMPLE], rest, rows[:, _SAMPLE:]], axis=1)
+        rest = jnp.zeros((n, open_ - SAMPLE), dtype)
+        new = jnp.concatenate([rows[:, :SAMPLE], rest, rows[:, SAMPLE:]], axis=1)
         ring = jnp.concatenate([state.ring, new])
-        following = jnp.concatenate([ring[1:, 4:_SAMPLE], ring[-1:, 4:_SAMPLE]])
+        following = jnp.concatenate([ring[1:, 4:SAMPLE], ring[-1:, 4:SAMPLE]])
         shown, usable = state.shown.with_readings(self.aids, *readings.joined())
 
         def place(old: Array, reading: Array, i: int) -> Array:
@@ -185,12 +89,12 @@ class DelayedFilter(eqx.Module):
             return jnp.where(here[:, None], row[None], old)
 
         columns = [
-            ring[:, :_SAMPLE],
+            ring[:, :SAMPLE],
             *(
                 place(ring[:, flag : flag + reading.size - 1], reading, i)
                 for i, (flag, reading) in enumerate(zip(self.flags, readings.aids, strict=True))
             ),
-            (ring[:, 4:_SAMPLE] + following) / 2,
+            (ring[:, 4:SAMPLE] + following) / 2,
             ring[:, open_:],
         ]
         ring = jnp.concatenate(columns, axis=1)
@@ -217,15 +121,14 @@ class DelayedFilter(eqx.Module):
         ) -> tuple[tuple[Navigation, Motion, Array], None]:
             x, motion, since = given
             dt, values = slot
-            force, omega = values[1:4] - x.accel_bias, values[4:_SAMPLE] - x.gyro_bias
+            force, omega = values[1:4] - x.accel_bias, values[4:SAMPLE] - x.gyro_bias
             still = error_state.held_force(x, omega, self.imu.gravity)
             force = jnp.where(values[open_] > 0, still, force)
             known = jnp.all(values[open_:] <= 0)
             motion = motion.after(force - still, omega, jnp.where(known, dt, 0))
             sample = error_state.sample_increment(force, omega, dt)
-            decay = jnp.stack(error_state.decays(self.aids, dt))
             x = error_state.apply(x, sample, self.imu.gravity)
-            x = x._replace(sensors=decay * x.sensors)
+            x = x._replace(sensors=error_state.passed(self.aids, x.sensors, dt))
             left_open = jnp.where(dt > 0, motion.variances(values[open_:]), 0)
             held = jnp.where(values[open_] > 0, dt, 0)[None]
             gone = jnp.concatenate([dt[None], force * dt, omega * dt, held, left_open])
@@ -240,58 +143,77 @@ class DelayedFilter(eqx.Module):
     ) -> FilterState:
         """Predict P and fuse the readings of the slot that left with sample number k."""
         x, F, P = self._predicted(state, slot)
-        plain, trust = self._innovations(state, x, slot), state.trust
         used = jnp.stack([slot[flag] > 0 for flag in self.flags])
         time = (k - self.slots) * self.period
+        stuck = state.shown.stuck(self.aids)
+        trust, x, P, doubted = self._reopened(state, x, P, slot, used, stuck, time)
 
-        off = imu_off(self.imu, self.aids)
-        agree, against = others(trust, time, self.config.patience, self.config.silence)
-        well = (agree > against) & (state.samples.calm > self.config.silence)
-        trust, (left_out, follow) = judged(
-            trust, used, off, self.config.patience, well, against > agree
-        )
-        gates = tuple(float(chi2.ppf(self.config.gate, size)) for size in sizes(self.aids))
-        limits = jnp.asarray(gates, P.dtype)
-        predicted = recovery.unconfirmed(plain, P)
-        conflict = recovery.contradict(plain, trust.unconfirmed, limits)
-        conflict = conflict & used & ~left_out & (measurement.plain_nis(plain, P)[0] > limits)
-        age = jnp.maximum(time - trust.accepted_at, self.period)
-        for i, (each, sensor) in enumerate(zip(plain, self.aids, strict=True)):
-            marks = (conflict[i], follow[i])
-            P = recovery.opened(P, x, sensor, each, *marks, age[i], self.imu.gravity)
-        found = [
-            each._replace(R=f * each.R + jnp.diag(jnp.where(mark, each.residual**2, 0)))
-            for each, f, mark in zip(
-                plain, jnp.unstack(trust.noise_factor), jnp.unstack(conflict), strict=True
-            )
-        ]
-        plain_nis, together, S = measurement.plain_nis(plain, P)
-        done = measurement.update(x, P, found, used & ~left_out, gates)
+        plain = self._innovations(state, x, slot)
+        found = measurement.raised(plain, trust.noise_factor, doubted)
+        plain_nis, _, _ = measurement.plain_nis(plain, P)
+        _, joined, S = measurement.plain_nis(found, P)
+        done = measurement.update(x, P, found, used, self.gates)
 
-        innovations = (together.residual, jnp.sqrt(jnp.diag(S)))
-        trust = counted(
-            self.aids, trust, used, done.accepted, done.nis, plain_nis, gates, innovations, time
+        seen = measurement.Seen(time, used, joined, S, doubted)
+        trust = pulls(self.aids, trust, F, seen, done)
+        trust = trust._replace(
+            unconfirmed=jnp.where(done.accepted, trust.predicted, trust.unconfirmed),
+            stuck_at=jnp.where(stuck, time, trust.stuck_at),
         )
-        trust = trust._replace(unconfirmed=jnp.where(done.accepted, predicted, trust.unconfirmed))
-        pulled = pulls(self.aids, trust.pulled @ F.T, done, together, used)
-        trust = suspected(
-            self.aids,
-            trust,
-            left_out | follow,
-            state.shown.stuck(self.aids),
-            used,
-            done.accepted,
-            pulled,
-            time,
-            state.since[0],
-        )
+        trust = counted(self.aids, trust, seen, done, plain_nis, self.gates)
+        trust, x, P = changes.settled(self.aids, trust, done, self.config.patience)
         return state._replace(
-            nominal=done.nominal,
-            P=done.P,
-            since=jnp.zeros_like(state.since),
-            before=done.nominal,
-            trust=trust,
+            nominal=x, P=P, since=jnp.zeros_like(state.since), before=x, trust=trust
         )
+
+    def _reopened(
+        self,
+        state: FilterState,
+        x: Navigation,
+        P: Float[Array, "e e"],
+        slot: Float[Array, "row"],
+        used: Bool[Array, "n"],
+        stuck: Bool[Array, "n"],
+        time: Float[Array, ""],
+    ) -> tuple[Trust, Navigation, Float[Array, "e e"], Bool[Array, "n"]]:
+        """Trust, state and P with what the readings show to have changed uncertain.
+
+        And which of the readings are doubted, as nothing confirmed the one before.
+        """
+        trust, limits = state.trust, jnp.asarray(self.gates, P.dtype)
+        found = measurement.raised(self._innovations(state, x, slot), trust.noise_factor)
+        nis, joined, S = measurement.plain_nis(found, P)
+        fails = used & (nis > limits)
+        doubted = recovery.contradict(found, trust.unconfirmed, limits) & fails
+        seen = measurement.Seen(time, used, joined, S, doubted)
+        age = jnp.maximum(time - trust.accepted_at, self.period)
+        ahead = (self.slots + 1) * self.period
+        velocity = jnp.asarray([each.observes == "velocity" for each in self.aids])
+        unseen = jnp.min(jnp.where(velocity, age, jnp.inf))
+        steps = jolts.consequences(x, state.samples, ahead, unseen, self.imu.gravity)
+        fault = time - trust.jolted_at < recovery.MENDS
+        explain, moves = jolts.explain(self.aids, found, P, steps, age, fault, limits)
+        noisy = changes.noise_explains(self.imu, self.aids, joined.residual, state.samples)
+        halts = stuck & ~trust.suspect(time, 0.0)
+        signs = changes.Signs(fails, explain.any(axis=1), moves.any(axis=1), noisy, halts)
+        change = changes.found_changes(self.aids, trust, seen, signs, self.config)
+        for i, (each, sensor) in enumerate(zip(found, self.aids, strict=True)):
+            marks = (doubted[i] & ~change.jolt[i], change.filter[i])
+            P = recovery.opened(P, x, sensor, each, *marks, age[i], self.imu.gravity)
+        P = jolts.opened(P, steps, (change.jolt[:, None] & (explain | moves)).any(axis=0))
+        trust = trust._replace(
+            predicted=recovery.unconfirmed(found, P),
+            jolted_at=jnp.where(change.jolt.any(), time, trust.jolted_at),
+            imu_factor=jnp.where(
+                change.imu.any(),
+                jnp.maximum(trust.imu_factor, state.samples.noisy(self.imu)),
+                trust.imu_factor,
+            ),
+        )
+        x, P = changes.taken_back(x, P, change)
+        off = measurement.off(self.aids, x, self._rate(slot), self._values(slot))
+        trust, x, P = changes.opened(self.aids, trust, x, P, change, off, seen)
+        return trust, x, P, doubted & ~change.jolt
 
     def _predicted(
         self, state: FilterState, slot: Float[Array, "row"]
@@ -305,26 +227,31 @@ class DelayedFilter(eqx.Module):
             F,
             slot[1:4] - x.accel_bias,
             (slot[0] > 0) & (slot[self.rate_column + 3] <= 0),
-            slot[self.rate_column : self.rate_column + 3] - x.gyro_bias,
+            self._rate(slot) - x.gyro_bias,
             state.motion.usual[0],
             self.imu.gravity,
         )
         return x, F, P
 
+    def _rate(self, slot: Float[Array, "row"]) -> Float[Array, "3"]:
+        """The gyroscope's rate at a slot's end, with its bias (rad/s)."""
+        return slot[self.rate_column : self.rate_column + 3]
+
+    def _values(self, slot: Float[Array, "row"]) -> list[Array]:
+        """The sensors' readings in a slot."""
+        return [
+            slot[flag + 1 : flag + 1 + each.value_size]
+            for each, flag in zip(self.aids, self.flags, strict=True)
+        ]
+
     def _innovations(
         self, state: FilterState, x: Navigation, slot: Float[Array, "row"]
     ) -> list[measurement.Innovation]:
         """Those of a slot's readings at the sensors' configured noises."""
-        rate = slot[self.rate_column : self.rate_column + 3]
-        turning = slot[self.rate_column + 3 + inertial.LEFT_OPEN // 2] > 0  # without a rate
         between = state.samples.rate_covariance(self.imu.integrating)
+        turning = slot[self.rate_column + 3 + inertial.LEFT_OPEN // 2] > 0  # without a rate
         between = between + jnp.where(turning, state.motion.usual[1], 0) * jnp.eye(3)
-        return [
-            measurement.innovation(
-                each, i, x, rate, between, slot[flag + 1 : flag + 1 + each.value_size]
-            )
-            for i, (each, flag) in enumerate(zip(self.aids, self.flags, strict=True))
-        ]
+        return measurement.innovations(self.aids, x, self._rate(slot), between, self._values(slot))
 
     def covariance(self, state: FilterState) -> Float[Array, "e e"]:
         """P at the horizon, of δ (`systems.estimation.error_state`)."""
@@ -345,13 +272,19 @@ class DelayedFilter(eqx.Module):
             gone[1:4] / some,
             gone[4:7] / some,
             time,
-            self._noisy_imu,
+            self.noisy_imu,
             self.aids,
             unmeasured,
             state.trust.imu_factor,
             between,
         )
         P = F @ state.P @ F.T + Q
+        places, _ = offset_places(self.aids, self.errors)
+        walk = jnp.zeros(self.errors, P.dtype).at[places].set(state.trust.walk)
+        P = P + jnp.diag(walk * time)
+        sinks = error_state.neglected_acceleration(state.before, state.P, self.imu.gravity)
+        down = error_state.VELOCITY.stop - 1
+        P = P.at[down, down].add(2 * _NEGLECTED * sinks * time)
         return F, (P + P.T) / 2
 
     def _time(self, k: Float[Array, ""]) -> Float[Array, ""]:
@@ -375,7 +308,8 @@ class DelayedFilter(eqx.Module):
 
         The buffered samples are applied to the state at the horizon; beyond the newest one its rate
         and the mean force of the last few are held. The covariance is predicted over the buffered
-        samples in one step, and beyond them grows by the recent one-step prediction errors.
+        samples in one step, and beyond them grows by the recent one-step prediction errors. While
+        a sensor has changed it is larger, as how that sensor is wrong is only approximated.
         """
         x, ring = state.nominal, state.ring
         time = ring[:, 0] * self.period
@@ -393,8 +327,8 @@ class DelayedFilter(eqx.Module):
         rate = foreseen[3:]
         beyond = error_state.sample_increment(foreseen[:3], rate, ahead * ring[-1, 0])
         now = error_state.apply(now, beyond, self.imu.gravity)
-        suspect = state.trust.suspect((state.samples.count - 1 - self.slots) * self.period)
-        P, pulled = error_state.in_body_axes(now, P, state.trust.pulled)
+        P = error_state.in_body_axes(now, P)
         P = P + error_state.foreseen_covariance(state.samples.steps, now.v_B, ahead, self.errors)
-        P = with_doubt(P, pulled, suspect)
+        doubtful = (state.trust.noise_factor > 1).any()
+        P = jnp.where(doubtful, _APPROXIMATE, 1) * P
         return now.X_WB, jnp.concatenate([now.v_B, rate]), (P + P.T) / 2

@@ -46,7 +46,8 @@ class _Flat:
         core, state = self.core, self.unravel(flat)
         X, V, P = core.present(state, jnp.minimum(t, core.period))
         k = jnp.round(t / core.period) - 1
-        return X, V, P.reshape(-1), core.status(state, k), core.health(state, P, k)
+        P_shown = P[: core.shown, : core.shown].reshape(-1)
+        return X, V, P_shown, core.status(state, k), core.health(state, P, k)
 
     def take_in(self, flat: Array, *given: Array) -> tuple[Array, Array, Array]:
         """`DelayedFilter.take_in` and the first `move`: state, slot that needs `fuse`, slots.
@@ -99,7 +100,8 @@ class Ekf(LeafSystem):
     `observes` something `config.horizon` in the past in the order of their times of validity
     (`systems.estimation.delayed`), and predicts the present state with the buffered samples. The
     order and frame of the error are those of `systems.estimation.error_state`: `covariance` is its
-    square matrix by rows, whose first six rows and columns belong to [δp, δθ] in body axes. What no
+    square matrix by rows without the sensors' offsets; its first six rows and columns belong to
+    [δp, δθ] in body axes. What no
     sensor observes is dead reckoning: its variance grows, as that of horizontal position does with
     the shipped sensors. `status` has the components `status_names`, `health` those of
     `health_names`.
@@ -155,7 +157,7 @@ class Ekf(LeafSystem):
         gaussian = RandomDistribution.kGaussian
         self._initial_noise = self.DeclareVectorInputPort("initial_noise", 9, gaussian)
 
-        outputs = {"X_WB": 7, "V_WB_B": 6, "covariance": core.errors**2}
+        outputs = {"X_WB": 7, "V_WB_B": 6, "covariance": core.shown**2}
         outputs |= {"status": len(status_names([*aids])), "health": len(health_names([*aids]))}
         self._ratio, self._period = round(core.imu.rate / core.config.output_rate), core.period
         self._samples = core.samples_at_once(self._ratio)

@@ -1,10 +1,11 @@
 """Inertial navigation on SE(3) and the linear propagation of its error.
 
 Nominal state: pose `X_WB`, velocity v of Bo in W expressed in B, biases of gyroscope and
-accelerometer, and one slow error of each other sensor: scale of the DVL, offset of the depth gauge,
-wander of the compass. The true state is `retract(nominal, δ)` with the error δ in R¹⁵⁺ⁿ
+accelerometer, one slow error of each other sensor (scale of the DVL, offset of the depth gauge,
+wander of the compass), and of each value of theirs an offset that drifts, zero unless a fault is
+suspected (`systems.estimation.trust`). The true state is `retract(nominal, δ)` with δ in R¹⁵⁺ⁿ⁺²ᵐ
 
-    δ = [δp 3, δθ 3 | δv 3 | δb_g 3 | δb_a 3 | slow errors n],
+    δ = [δp 3, δθ 3 | δv 3 | δb_g 3 | δb_a 3 | slow errors n | offsets m | their drifts m],
     p_WB = p̂_WB + δp,    R_WB = R̂_WB exp(δθ),    v_W = R_z(n̂ᵀ δθ) (v̂_W + δv),
 
 n̂ the vertical in estimated body axes, R_z a rotation about it; the other errors are additive. So δp
@@ -32,7 +33,7 @@ from ...models import se3
 from ...models.sensors import Imu, Sensor
 
 INERTIAL = 15
-"""Components of δ without the slow errors of sensors besides the IMU."""
+"""Components of δ without those of sensors besides the IMU."""
 POSE, POSITION, ROTATION = slice(0, 6), slice(0, 3), slice(3, 6)
 VELOCITY, GYRO_BIAS, ACCEL_BIAS = slice(6, 9), slice(9, 12), slice(12, 15)
 SENSORS = slice(INERTIAL, None)
@@ -45,7 +46,8 @@ class Navigation(NamedTuple):
     v_B: Float[Array, "3"]
     gyro_bias: Float[Array, "3"]
     accel_bias: Float[Array, "3"]
-    sensors: Float[Array, "n"]
+    sensors: Float[Array, "s"]
+    """Slow errors, offsets, drifts."""
 
 
 class Unmeasured(NamedTuple):
@@ -125,12 +127,10 @@ def body_axes(x: Navigation) -> tuple[Float[Array, "e e"], Float[Array, "e e"]]:
     return C, C_inverse.at[VELOCITY, ROTATION].set(-R @ tilting)
 
 
-def in_body_axes(
-    x: Navigation, P: Float[Array, "e e"], errors: Float[Array, "n e"]
-) -> tuple[Float[Array, "e e"], Float[Array, "n e"]]:
-    """The covariance and the rows of errors of δ_B, of those of δ."""
+def in_body_axes(x: Navigation, P: Float[Array, "e e"]) -> Float[Array, "e e"]:
+    """The covariance of δ_B, of that of δ."""
     C = body_axes(x)[0]
-    return C @ P @ C.T, errors @ C.T
+    return C @ P @ C.T
 
 
 def of_body_axes(P: Float[Array, "e e"], x: Navigation) -> Float[Array, "e e"]:
@@ -279,14 +279,31 @@ def transition(
         jnp.concatenate([zero, zero, zero, eye, zero], 1),
         jnp.concatenate([zero, zero, zero, zero, eye], 1),
     ]
-    F = jax.scipy.linalg.block_diag(jnp.concatenate(rows), jnp.diag(jnp.stack(rho)))
-    rest = jnp.zeros((6 + len(aids), 3), force.dtype)
+    values = (rho.size - len(aids)) // 2
+    drifting = jnp.diag(rho) + T * jnp.eye(rho.size, k=values).at[: len(aids)].set(0)
+    F = jax.scipy.linalg.block_diag(jnp.concatenate(rows), drifting)
+    rest = jnp.zeros((6 + rho.size, 3), force.dtype)
     N_g = jnp.concatenate([C_p, -J, C_v, rest])
     N_a = jnp.concatenate([-(T / 2) * eye, zero, -eye, rest])
     s_g, s_a = (factor * x**2 / 2 for x in (imu.gyroscope_density, imu.accelerometer_density))
     Q = (s_g * T + of_angle) * (N_g @ N_g.T) + (s_a * T + of_velocity) * (N_a @ N_a.T)
     Q = _with_moments(Q, s_g, s_a, g_B, T, between) + jnp.diag(_walks(imu, aids, rho, T))
     return body_axes(after)[1] @ F @ body_axes(before)[0], of_body_axes(Q, after)
+
+
+def neglected_acceleration(
+    x: Navigation, P: Float[Array, "e e"], gravity: float
+) -> Float[Array, ""]:
+    """Mean square (m²/s⁴) of the vertical acceleration that is of second order in δ.
+
+    A tilt θ of variances p, q and covariance c about two horizontal axes takes g θ² / 2, with a
+    mean square of g² (3 p² + 3 q² + 2 p q + 4 c²) / 4 if it is Gaussian; and it turns an error of
+    the accelerometer into the vertical. A depth gauge resolves both.
+    """
+    R = se3.rotation_matrix(x.X_WB)
+    (p, c, _), (_, q, _), _ = R @ P[ROTATION, ROTATION] @ R.T
+    (u, _, _), (_, v, _), _ = R @ P[ACCEL_BIAS, ACCEL_BIAS] @ R.T
+    return gravity**2 * (3 * p * p + 3 * q * q + 2 * p * q + 4 * c * c) / 4 + p * v + q * u
 
 
 def _with_moments(
@@ -311,19 +328,16 @@ def _with_moments(
 
 
 def _walks(
-    imu: Imu, aids: Sequence[Sensor], rho: Sequence[Array], time: Float[Array, ""]
+    imu: Imu, aids: Sequence[Sensor], rho: Float[Array, "s"], time: Float[Array, ""]
 ) -> Float[Array, "e"]:
     """Variances that biases and slow errors, which decay by `rho`, gain over a time (s)."""
     dtype = time.dtype
-    slow = (
-        jnp.zeros(1, dtype)
-        if math.isinf(each.slow_error[1])
-        else (each.slow_error[0] ** 2 * (1 - r * r))[None]
-        for each, r in zip(aids, rho, strict=True)
-    )
+    stds = [0.0 if math.isinf(each.slow_error[1]) else each.slow_error[0] for each in aids]
+    stds += [0.0] * (rho.size - len(stds))
+    slow = jnp.asarray(stds, dtype) ** 2 * (1 - rho**2)
     gyroscope = jnp.full(3, imu.gyroscope_walk**2, dtype) * time
     accelerometer = jnp.full(3, imu.accelerometer_walk**2, dtype) * time
-    return jnp.concatenate([jnp.zeros(9, dtype), gyroscope, accelerometer, *slow])
+    return jnp.concatenate([jnp.zeros(9, dtype), gyroscope, accelerometer, slow])
 
 
 def foreseen_covariance(
@@ -344,7 +358,17 @@ def foreseen_covariance(
     return J @ steps @ J.T
 
 
-def decays(aids: Sequence[Sensor], time: Float[Array, ""]) -> list[Float[Array, ""]]:
-    """Factor on each sensor's slow error over a time (s)."""
+def passed(
+    aids: Sequence[Sensor], sensors: Float[Array, "s"], time: Float[Array, ""]
+) -> Float[Array, "s"]:
+    """The sensors' errors after a time (s): slow ones decay, offsets drift."""
+    n, m = len(aids), (sensors.size - len(aids)) // 2
+    drifts = jnp.concatenate([jnp.zeros(n, sensors.dtype), sensors[n + m :], jnp.zeros(m)])
+    return decays(aids, time) * sensors + time * drifts
+
+
+def decays(aids: Sequence[Sensor], time: Float[Array, ""]) -> Float[Array, "s"]:
+    """Factors on the sensors' slow errors, offsets and drifts over a time (s)."""
     lasting = [each.slow_error[1] for each in aids]
-    return [jnp.ones_like(time) if math.isinf(x) else jnp.exp(-time / x) for x in lasting]
+    lasting += [math.inf] * (2 * sum(each.value_size for each in aids))
+    return jnp.exp(-time / jnp.asarray(lasting, time.dtype))

@@ -19,12 +19,15 @@ FEW = 5
 """Number of samples whose mean force predicts the next."""
 
 _REMEMBERED = 2.0  # s: time constant of the averages of the differences between samples
+_MINUTE = 60.0  # s: the same of what is usual
 _RECENT = 0.25  # s: time constant of the recent motion
 _USUAL = 10.0  # s: time constant of the averages of the vehicle's motion
 _KEPT_UP = 1.0  # s for which an acceleration or a rate of turn lasts
 _FADES = 0.3  # s: time constant with which the last rate decays while rates are missing
 _STUCK_TOGETHER = 5  # repeats of all three values of a triad: noise makes them improbable
 _STUCK_ALONE = 50  # repeats of one value, whose resolution may be as coarse as its noise
+_NOISIER = 2.0  # times the variance of the last minute
+_SETTLES = 5.0  # s after which the last minute is known
 _ODD = 10.0  # standard deviations beyond which a sample is odd
 _ODD_RUN = 5  # more odd samples in a row than this are true motion
 
@@ -47,6 +50,10 @@ class Samples(NamedTuple):
     """Odd samples in a row."""
     calm: Float[Array, ""]
     """Time since a sample was last bad or a spike (s); what begins a motion is neither."""
+    jolts: Float[Array, "2 2 3"]
+    """The last two rare steps, newest first, of force (m/s²) and rate (rad/s)."""
+    jolted: Float[Array, "2 2"]
+    """Times since then (s)."""
     count: Float[Array, ""]
     """Number of samples until now."""
     forces: Float[Array, "few 3"]
@@ -57,6 +64,8 @@ class Samples(NamedTuple):
     """Mean square of the one-step prediction error of [force, rate]."""
     bends: Float[Array, "6 6"]
     """Mean square of the second differences of [force, rate]."""
+    usual: Float[Array, "6"]
+    """The same over a minute."""
 
     @classmethod
     def start(cls, rate: Float[Array, "3"]) -> "Samples":
@@ -69,11 +78,14 @@ class Samples(NamedTuple):
             jnp.zeros(2, rate.dtype),
             zero,
             jnp.full((), 1e3, rate.dtype),
+            jnp.zeros((2, 2, 3), rate.dtype),
+            jnp.full((2, 2), 1e3, rate.dtype),
             zero,
             jnp.zeros((FEW, 3), rate.dtype),
             jnp.stack([rate, rate]),
             square,
             square,
+            jnp.zeros(6, rate.dtype),
         )
 
     @property
@@ -91,6 +103,16 @@ class Samples(NamedTuple):
         Second differences of smooth motion are near zero. T is the period of the samples.
         """
         return self.bends[3:, 3:] * T / 24, self.bends[:3, :3] * T / 6
+
+    def noisy(self, imu: Imu) -> Float[Array, ""]:
+        """Variance that the samples have gained since the last minute, relative to their noise's.
+
+        It is 1 where their second differences are not several times those of the last minute;
+        those of independent samples of variance s² have a variance of 6 s².
+        """
+        now = jnp.diag(self.bends)
+        gained = (now - self.usual) / 6 / jnp.asarray(imu.noise_std, now.dtype) ** 2
+        return jnp.maximum(1, jnp.max(jnp.where(now > _NOISIER * self.usual, gained, 0)))
 
     def rate_covariance(self, integrating: bool) -> Float[Array, "3 3"]:
         """Covariance of the rate at a sample's end, taken as the mean of the rows before and after.
@@ -150,7 +172,7 @@ def take(
     limits = jnp.repeat(jnp.asarray([imu.accelerometer_range, imu.gyroscope_range], dtype), 3)
     repeats = jnp.where(sample == memory.shown, memory.repeats + 1, 0)
     within = jnp.isfinite(sample) & (jnp.abs(sample) < limits)
-    by_triad = jnp.stack([repeats[:3], repeats[3:]])
+    by_triad = repeats.reshape(2, 3)
     stuck = (by_triad.min(axis=1) >= _STUCK_TOGETHER) | (by_triad.max(axis=1) >= _STUCK_ALONE)
     good = jnp.stack([within[:3].all(), within[3:].all()]) & ~stuck
     sample = jnp.where(within, sample, 0)
@@ -163,16 +185,16 @@ def take(
     if any(imu.position):
         force = _at_origin(force, X_BS[4:], rate, (rate - memory.rates[-1]) * imu.rate)
 
-    # The sample's prediction error is compared with the standard deviation of such errors.
+    # its prediction error is compared with the standard deviation of such errors
     step = jnp.concatenate([force, rate]) - memory.foreseen
-    noise = jnp.asarray(imu.noise_std, dtype)
-    floor = jnp.asarray((2.0,) * 3 + (0.5,) * 3, dtype)
-    bound = _ODD * jnp.sqrt(jnp.diag(memory.steps) + noise**2) + floor
-    far = (jnp.abs(step) > bound) & jnp.repeat(good, 3) & (memory.count > FEW)
+    rare = _ODD * jnp.sqrt(jnp.diag(memory.steps) + jnp.asarray(imu.noise_std, dtype) ** 2)
+    bound = rare + jnp.asarray((2.0,) * 3 + (0.5,) * 3, dtype)
+    judged = jnp.repeat(good, 3) & (memory.count > FEW)
+    far = (jnp.abs(step) > bound) & judged
     odd = jnp.where(far.any(), memory.odd + 1, 0.0).astype(dtype)
     refused = jnp.stack([far[:3].any(), far[3:].any()]) & (odd <= _ODD_RUN)
     spike = (odd < 1) & (memory.odd > 0) & (memory.odd <= _ODD_RUN)  # the odd samples ended
-    squares = jnp.stack([jnp.sum(step[:3] ** 2), jnp.sum(step[3:] ** 2)])
+    squares = jnp.sum(step.reshape(2, 3) ** 2, axis=1)
     believed = good & ~refused
 
     missing = jnp.where(believed, 0.0, memory.missing + T)
@@ -192,8 +214,38 @@ def take(
         calm=jnp.where(good.all() & ~spike, memory.calm + T, 0.0),
         count=memory.count + 1,
     )
+    after = _jolted(after, step, (jnp.abs(step) > rare) & judged, refused, T)
     row = jnp.concatenate([(number >= 1).astype(dtype)[None], force, mean, left_open])
     return jax.tree.map(lambda new, old: jnp.where(number >= 0, new, old), after, memory), row
+
+
+def _jolted(
+    memory: Samples,
+    step: Float[Array, "6"],
+    beyond: Bool[Array, "6"],
+    refused: Bool[Array, "2"],
+    T: float,
+) -> Samples:
+    """The memory after a step of which some values are `beyond` what is usual and not `refused`.
+
+    A jolt lasts while the mean of the last few forces follows: its size is the largest difference
+    from that mean, or the sum of the steps of the rate.
+    """
+    jolts = jnp.stack([beyond[:3].any(), beyond[3:].any()]) & ~refused
+    old, since = memory.jolts, memory.jolted + T
+    lasts = since[0] <= FEW * T
+    force, rate = step[:3], step[3:]
+    larger = jnp.sum(force**2) > jnp.sum(old[0, 0] ** 2)
+    going_on = jnp.stack([jnp.where(larger, force, old[0, 0]), old[0, 1] + rate])
+    newest = jnp.where(lasts[:, None], going_on, jnp.stack([force, rate]))
+    moves_on = (jolts & ~lasts)[:, None]
+    after = jnp.stack([newest, jnp.where(moves_on, old[0], old[1])])
+    times = jnp.stack(
+        [jnp.where(lasts, since[0], T), jnp.where(moves_on[:, 0], since[0], since[1])]
+    )
+    return memory._replace(
+        jolts=jnp.where(jolts[:, None], after, old), jolted=jnp.where(jolts, times, since)
+    )
 
 
 def _at_origin(
@@ -219,11 +271,15 @@ def _learn(
     """The averages after a sample; a sample that is left out does not change them."""
     known = believed.all() & (memory.count > FEW)
 
-    def mean_square(old: Array, x: Array) -> Array:
+    def mean(old: Array, x: Array, time: float) -> Array:
         """Arithmetic mean over the first samples, then an exponential average."""
-        fading = 1 - jnp.exp(-jnp.asarray(1 / (imu.rate * _REMEMBERED), x.dtype))
-        weight = jnp.maximum(1 / jnp.maximum(memory.count - FEW, 1), fading)
-        return jnp.where(known, old + weight * (x[:, None] * x[None] - old), old)
+        fading = 1 - jnp.exp(-jnp.asarray(1 / (imu.rate * time), x.dtype))
+        first = 1 / jnp.maximum(memory.count - FEW, 1)
+        weight = jnp.where(memory.count < min(time, _SETTLES) * imu.rate, first, fading)
+        return jnp.where(known, old + weight * (x - old), old)
+
+    def mean_square(old: Array, x: Array) -> Array:
+        return mean(old, x[:, None] * x[None], _REMEMBERED)
 
     step = jnp.clip(step, -bound, bound)
     forces = jnp.concatenate([memory.forces[1:], force[None]])
@@ -234,4 +290,5 @@ def _learn(
         rates=rates[1:],
         steps=mean_square(memory.steps, step),
         bends=mean_square(memory.bends, bend),
+        usual=mean(memory.usual, bend**2, _MINUTE),
     )

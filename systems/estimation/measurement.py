@@ -1,9 +1,11 @@
 """Measurement updates of an error-state filter: gate, gain, Joseph form."""
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import accumulate
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -19,6 +21,7 @@ from .error_state import (
     moved,
     retract,
 )
+from .readings import offsets
 
 
 class Innovation(NamedTuple):
@@ -29,33 +32,53 @@ class Innovation(NamedTuple):
     R: Float[Array, "m m"]
 
 
-def innovation(
-    sensor: Sensor,
-    number: int,
+def innovations(
+    aids: Sequence[Sensor],
     nominal: Navigation,
     rate: Float[Array, "3"],
     rate_covariance: Float[Array, "3 3"],
-    values: Float[Array, "m"],
-) -> Innovation:
-    """The innovation of sensor `number`; `rate` is the gyroscope's, with its bias.
+    values: Sequence[Float[Array, "_"]],
+) -> list[Innovation]:
+    """The innovations of all sensors' readings; `rate` is the gyroscope's, with its bias.
 
     `rate_covariance` is that of the rate between samples, without the bias.
     """
     V = jnp.concatenate([nominal.v_B, rate - nominal.gyro_bias])
-    slow = nominal.sensors[number : number + 1]
-    found = sensor.innovation(nominal.X_WB, V, slow, values)
-    H = jnp.zeros((values.size, INERTIAL + nominal.sensors.size), V.dtype)
-    for part, slope in ((POSE, found.pose), (VELOCITY, found.velocity)):
-        H = H if slope is None else H.at[:, part].set(slope)
-    if found.rate is not None:
-        H = H.at[:, GYRO_BIAS].set(-found.rate)
-    if found.slow is not None:
-        H = H.at[:, INERTIAL + number].set(found.slow)
-    H = H @ body_axes(nominal)[0]
-    R = jnp.diag(jnp.asarray([std**2 for std in sensor.noise_std], V.dtype))
-    if found.rate is not None:
-        R = R + found.rate @ rate_covariance @ found.rate.T
-    return Innovation(found.residual, H, R)
+    found = []
+    for i, (sensor, place) in enumerate(zip(aids, offsets(aids), strict=True)):
+        seen = partial(sensor.innovation, nominal.X_WB, V, nominal.sensors[i : i + 1])
+        right = values[i] - nominal.sensors[place]
+        one = seen(right)
+        H = jnp.zeros((sensor.value_size, INERTIAL + nominal.sensors.size), V.dtype)
+        for part, slope in ((POSE, one.pose), (VELOCITY, one.velocity)):
+            H = H if slope is None else H.at[:, part].set(slope)
+        if one.rate is not None:
+            H = H.at[:, GYRO_BIAS].set(-one.rate)
+        if one.slow is not None:
+            H = H.at[:, INERTIAL + i].set(one.slow)
+        H = H @ body_axes(nominal)[0]
+        of_offset = jax.jacfwd(lambda y, seen=seen: seen(y).residual)(right)
+        H = H.at[:, INERTIAL + place.start : INERTIAL + place.stop].set(of_offset)
+        R = jnp.diag(jnp.asarray([std**2 for std in sensor.noise_std], V.dtype))
+        if one.rate is not None:
+            R = R + one.rate @ rate_covariance @ one.rate.T
+        found.append(Innovation(one.residual, H, R))
+    return found
+
+
+def off(
+    aids: Sequence[Sensor],
+    nominal: Navigation,
+    rate: Float[Array, "3"],
+    values: Sequence[Float[Array, "_"]],
+) -> Float[Array, "m"]:
+    """The errors that would explain the readings, beyond the sensors' estimated ones."""
+    V = jnp.concatenate([nominal.v_B, rate - nominal.gyro_bias])
+    found = []
+    for i, (sensor, place) in enumerate(zip(aids, offsets(aids), strict=True)):
+        slow = nominal.sensors[i : i + 1]
+        found.append(sensor.off(nominal.X_WB, V, slow, values[i] - nominal.sensors[place]))
+    return jnp.concatenate(found)
 
 
 def small_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
@@ -94,6 +117,21 @@ def together(found: Sequence[Innovation]) -> Innovation:
     return Innovation(jnp.concatenate(residuals), jnp.concatenate(rows), R)
 
 
+def raised(
+    found: Sequence[Innovation],
+    factors: Float[Array, " n"],
+    doubted: Bool[Array, " n"] | None = None,
+) -> list[Innovation]:
+    """The innovations with noise variances times factors, and with the residual's square where
+    a reading is doubted.
+    """
+    marks = jnp.zeros(len(found), bool) if doubted is None else doubted
+    return [
+        each._replace(R=f * each.R + jnp.diag(jnp.where(mark, each.residual**2, 0)))
+        for each, f, mark in zip(found, jnp.unstack(factors), jnp.unstack(marks), strict=True)
+    ]
+
+
 def normalized_squares(
     S: Float[Array, "m m"], residual: Float[Array, "m"], sizes: Sequence[int]
 ) -> Float[Array, " n"]:
@@ -112,6 +150,21 @@ def plain_nis(
     joined = together(found)
     S = joined.H @ (P @ joined.H.T) + joined.R
     return normalized_squares(S, joined.residual, [each.residual.size for each in found]), joined, S
+
+
+class Seen(NamedTuple):
+    """The readings of one time and what was expected of them."""
+
+    time: Float[Array, ""]
+    """Of the readings (s)."""
+    used: Bool[Array, "n"]
+    """Which sensors' readings came and can be used."""
+    joined: Innovation
+    """The innovations of all sensors, stacked."""
+    S: Float[Array, "m m"]
+    """Their covariance."""
+    doubted: Bool[Array, "n"]
+    """Which readings contradict one before that nothing confirmed (`recovery.contradict`)."""
 
 
 class Update(NamedTuple):

@@ -20,6 +20,7 @@ _OBSERVED = {
     "position": error_state.POSITION,
     "attitude": error_state.ROTATION,
 }
+MENDS = 5.0  # s within which the filter may still be wrong after a fault of the IMU
 _ALONE = 9.0
 """Ratio of a prediction's variance to a reading's above which the reading decides alone."""
 
@@ -45,6 +46,7 @@ def levelled(
     H = jnp.zeros((3, P.shape[0]), P.dtype)
     H = H.at[:, error_state.ROTATION].set(error_state.skew(up_B))
     H = H.at[:, error_state.VELOCITY].set(error_state.skew(omega))
+    H = H.at[:, error_state.ACCEL_BIAS].set(jnp.eye(3))
     H = H @ error_state.body_axes(x)[0]
     uncertain = jnp.max(jnp.diag(H @ P @ H.T)) > 4 * usual
 
@@ -60,9 +62,12 @@ def levelled(
 def unconfirmed(found: Sequence[Innovation], P: Float[Array, "e e"]) -> Float[Array, "n"]:
     """For each reading the variance with which it was predicted, if nothing confirms it; else 0.
 
-    Nothing does if the prediction is much worse than the reading, which then decides alone.
+    Nothing does if the prediction is much worse than the reading, which then decides alone. A
+    sensor's offset is none of the prediction.
     """
-    variances = [jnp.sum((each.H @ P) * each.H, axis=1) for each in found]
+    own = P.shape[0] - 2 * sum(each.residual.size for each in found)
+    slopes = [each.H[:, :own] for each in found]
+    variances = [jnp.sum((H @ P[:own, :own]) * H, axis=1) for H in slopes]
     alone = [
         jnp.any(v > _ALONE * jnp.diag(each.R)) for v, each in zip(variances, found, strict=True)
     ]
@@ -94,10 +99,10 @@ def opened(
 ) -> Float[Array, "e e"]:
     """P with the observed quantity as uncertain as the residual is large, if either mark is set.
 
-    A sensor that is to be followed contradicts the filter since its last accepted reading, `age`
-    (s) ago. The quantity then went wrong through its rate, which is as uncertain: a position
-    through velocity, a velocity through gravity along a wrong vertical. Where two readings are
-    in `conflict`, one of them is an outlier.
+    A sensor that is to be followed shows that the filter went wrong since the last accepted
+    reading, `age` (s) ago. That happened through a rate, which is as uncertain: a position through
+    velocity, a velocity through gravity along a wrong vertical. Where two readings are in
+    `conflict`, one of them is an outlier.
     """
     part = _OBSERVED[str(sensor.observes)]
     square = jnp.where(follow | conflict, found.residual**2, 0)
@@ -105,10 +110,13 @@ def opened(
     P = P.at[part, part].add(H.T @ (square[:, None] * H))
     rates = jnp.where(follow, square, 0) / age**2
     if sensor.observes == "position":
-        P = P.at[error_state.VELOCITY, error_state.VELOCITY].add(H.T @ (rates[:, None] * H))
-    elif sensor.observes == "velocity":
+        return P.at[error_state.VELOCITY, error_state.VELOCITY].add(H.T @ (rates[:, None] * H))
+    if sensor.observes == "velocity":
         G = error_state.skew(_up(x, gravity) / gravity**2)
-        P = P.at[error_state.ROTATION, error_state.ROTATION].add(jnp.max(rates) * (G @ G.T))
+        tilt = jnp.max(rates) * (G @ G.T)
+        P = P.at[error_state.ROTATION, error_state.ROTATION].add(tilt)
+        moved = square * age**2 / 4  # meanwhile
+        P = P.at[error_state.POSITION, error_state.POSITION].add(H.T @ (moved[:, None] * H))
     return P
 
 

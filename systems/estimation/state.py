@@ -11,7 +11,8 @@ from . import error_state
 from .config import EkfConfig
 from .error_state import Navigation
 from .inertial import Motion, Samples
-from .trust import Shown, Trust
+from .readings import Shown
+from .trust import Trust, trusted
 
 SUMS = 10
 """Components of `FilterState.since`."""
@@ -82,9 +83,10 @@ def health(
     """The health vector of `health_names` at the horizon's time (s), for the shown covariance P."""
     c, variance, trust = config, jnp.diag(P), state.trust
     fit = (time - trust.accepted_at <= c.silence) & (trust.rejected < c.patience)
-    fit = fit & (trust.distrusted < 1) & (trust.noise_factor <= 1)
+    fit = fit & (trust.noise_factor <= 1) & trusted(aids, P, state.nominal)
     fit = fit & ~state.shown.stuck(aids) & ~trust.suspect(time, c.silence)
     imu = (state.samples.calm > 1) & (trust.imu_factor < 2)
+    imu = imu & (time - trust.jolted_at > c.silence)
     fit = jnp.concatenate([imu[None], fit])
     lost = jnp.any(variance[error_state.VELOCITY] > c.lost_velocity**2)
     lost = lost | jnp.any(variance[error_state.ROTATION] > c.lost_attitude**2)

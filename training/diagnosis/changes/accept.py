@@ -10,6 +10,7 @@ from ....models.effects.unknown import Unknown
 from ..disturbance.found import best_law
 from ..filter.problem import DiagnosisProblem, Evaluation
 from ..filter.varying import Part, parts_of
+from ..selection.forecasting import part_forecasts_better
 from ..selection.hypotheses import Design, Fit, is_curved, known_within
 from ..selection.model_selection import (
     Choice,
@@ -58,7 +59,7 @@ def with_changes(state: Selection, search: Search) -> Selection:
         if number == _MOST:
             return state
         wider = _accepted(found, search, session, change)
-        if wider is None:
+        if wider is None or not _forecasts_better(wider, found, search):
             break
         found = wider
     if found is state:
@@ -68,6 +69,16 @@ def with_changes(state: Selection, search: Search) -> Selection:
         if left > max(_ELSEWHERE * before, state.threshold):
             return state
     return search.without_redundant(found)
+
+
+def _forecasts_better(state: Selection, before: Selection, search: Search) -> bool:
+    """Whether the last change improves forecasts, where states were estimated.
+
+    Errors of an estimator last for seconds and look like a change.
+    """
+    if not state.current.noise.estimated:
+        return True
+    return part_forecasts_better(state, before, search.nuisance, search.horizon)
 
 
 def _best(state: Selection, search: Search, session: Session) -> Change | None:

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..filter.problem import Evaluation
+from ..filter.problem import DiagnosisProblem, Evaluation
+from ..filter.varying import parts_of
 from ..validation.claims import improves
 from ..validation.simulation import Contender
 from ..validation.validation import forecast_square
@@ -35,8 +36,7 @@ def forecast_better(
     in_use = [*taken, *parameters_of(problem.library, names)]  # so that one program judges all
 
     def square(seen: Evaluation, rows: list[int]) -> Float[np.ndarray, "h g F"]:
-        contender = Contender(problem.without_each(seen, rows))
-        return forecast_square(problem, contender, horizon, in_use, estimated=True)
+        return _square(problem, seen, rows, horizon, in_use)
 
     before, found = square(state.current, taken), {}
     for h in names:
@@ -46,3 +46,34 @@ def forecast_better(
         if improves(square(seen, rows), before, np.random.default_rng(0)):
             found[h] = fits[h]
     return found
+
+
+def part_forecasts_better(
+    state: Selection, before: Selection, nuisance: Sequence[int], horizon: float
+) -> bool:
+    """Whether the last cause, which acts in a part of the data, improves forecasts there.
+
+    `before` is the selection without it.
+    """
+    problem = state.problem
+    part = parts_of(problem.library)[-1]
+    rows = [*nuisance, *parameters_of(problem.library, state.hypotheses)]
+    taken = [*nuisance, *parameters_of(problem.library, before.hypotheses)]
+    without = problem.evaluate(problem.moved(before.current.theta, before.problem.library), taken)
+    acts = (np.abs(part.envelope[:-1]) * problem.data.weight).sum(axis=0) > 0
+    labels = np.unique(problem.data.fold)
+    here = np.isin(labels, problem.data.fold[acts])
+    both = (problem.evaluate(state.current.theta, rows), rows), (without, taken)
+    new, old = (_square(problem, seen, own, horizon, rows)[..., here] for seen, own in both)
+    return improves(new, old, np.random.default_rng(0))
+
+
+def _square(
+    problem: DiagnosisProblem,
+    seen: Evaluation,
+    rows: list[int],
+    horizon: float,
+    in_use: Sequence[int],
+) -> Float[np.ndarray, "h g F"]:
+    contender = Contender(problem.without_each(seen, rows))
+    return forecast_square(problem, contender, horizon, in_use, estimated=True)

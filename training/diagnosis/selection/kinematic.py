@@ -3,7 +3,7 @@
 One-step errors of an estimator's states are partly its own, and depend on the motion. Those of the
 attitude against the rates are not: no force is in them, and they stay bounded over seconds, while
 the turn of a biased gyro adds up. A bias counts if it turns the attitude over seconds by more than
-these errors, and clearly so.
+these errors, and clearly so, and if it is larger than what calibration leaves of it in any case.
 """
 
 import numpy as np
@@ -11,6 +11,7 @@ import scipy.stats
 from jaxtyping import Float
 
 from ....models.effects.attitude import GyroBias
+from ....models.sensors import Imu
 from ..data.arrays import Data
 from ..filter.noise import OVER
 from .state import Fits, Selection
@@ -33,7 +34,8 @@ def borne_out(state: Selection, fits: Fits, alpha: float) -> Fits:
         t = mean[i] / max(float(spread[i]), 1e-300) * np.sqrt(len(sums))
         chance = 2 * float(scipy.stats.t.sf(abs(t), len(sums) - 1)) * len(fits)
         left = abs(mean[i] + seconds * float(fit.values[0]))
-        if abs(mean[i]) > spread[i] and chance < alpha and left < _ACCOUNTED * abs(mean[i]):
+        clear = abs(mean[i]) > max(spread[i], seconds * Imu().gyroscope_bias)
+        if clear and chance < alpha and left < _ACCOUNTED * abs(mean[i]):
             found[h] = fit
     return found
 

@@ -609,7 +609,8 @@ def test_a_log_may_keep_the_rate_of_its_slowest_stream():
     assert rate(100, 100, 100) == 50
     assert rate(50, 48.5, 100) == 50  # a stream that drops a few
     assert rate(50, 100, 30) == 25
-    assert rate(4, 100, 10) == 20
+    assert rate(50, 50, 10) == 20
+    assert rate(10, 100, 50) == rate(100, 10, 50) == rate(4, 100, 10) == 10
 
 
 def test_the_demo_log_is_what_its_command_makes():

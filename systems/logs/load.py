@@ -32,8 +32,10 @@ from .signals_tlog import WANTED as TLOG_WANTED
 from .sound import sound
 from .tlog import read_tlog
 
-RATES = (50.0, 40.0, 25.0, 20.0)
-"""Rates (Hz) at which logs are imported unless another one is given; the last by default."""
+RATE = 20.0
+"""Rate (Hz) at which logs are imported unless another one is given."""
+_RATES = (50.0, 40.0, 25.0, RATE)
+_SLOW = 10.0
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class LogOptions:
 def import_log(  # long: a third of it says what it takes and refuses
     path: str | os.PathLike[str],
     *,
-    rate: float | None = RATES[-1],
+    rate: float | None = RATE,
     vehicle: str | None = None,
     options: LogOptions | None = None,
     accept: Sequence[str] = (),
@@ -75,8 +77,7 @@ def import_log(  # long: a third of it says what it takes and refuses
 
     Args:
         path: the log; its kind is determined from its content.
-        rate: of the recording (Hz); None takes that of the slowest stream of state and outputs,
-            within 20 to 50 Hz.
+        rate: of the recording (Hz); None takes that of its streams (`own_rate`).
         vehicle: preset or file whose thruster directions the PWM is to have; None takes the preset
             with the thrusters of the log's frame (`wiring`). It is named in the result.
         options: what is taken from the log.
@@ -89,7 +90,7 @@ def import_log(  # long: a third of it says what it takes and refuses
     """
     path = Path(path)
     options = options or LogOptions()
-    _check_options(RATES[-1] if rate is None else rate, options)
+    _check_options(RATE if rate is None else rate, options)
     if vehicle is not None:
         load_vehicle(vehicle)
         vehicle = absolute(vehicle)
@@ -147,19 +148,22 @@ def import_log(  # long: a third of it says what it takes and refuses
 
 
 def own_rate(signals: Signals) -> float:
-    """The largest of `RATES` that every stream of state and outputs reaches, or else the least.
+    """The largest of 50, 40, 25 and 20 Hz that every stream of state and outputs reaches, or 20.
 
-    Without a horizontal velocity the accelerometer is such a stream: nothing else tells of surge
-    and sway, and it has no reading at a sample between two of its own. One below the least rate
-    is too slow to tell of them.
+    It is 10 if attitude or body rates are slower than 20: of a rotation nothing is known between
+    two of their samples. Without a horizontal velocity the accelerometer counts as such a stream:
+    nothing else tells of surge and sway, and it has no reading at a sample between two of its own.
+    One below 20 Hz is too slow to tell of them.
     """
+    if min(signals.attitude.rate, signals.rates.rate) < 0.95 * RATE:
+        return _SLOW
     streams = [signals.attitude, signals.rates, signals.outputs, signals.velocity]
     v = signals.velocity
     if v is None or not np.isfinite(v.x[:2]).any():
         force = signals.specific_force
-        streams.append(force if force is not None and force.rate >= RATES[-1] else None)
+        streams.append(force if force is not None and force.rate >= RATE else None)
     slowest = min(s.rate for s in streams if s is not None)
-    return next((rate for rate in RATES if rate <= 1.05 * slowest), RATES[-1])
+    return next((rate for rate in _RATES if rate <= 1.05 * slowest), RATE)
 
 
 def load_data(  # long: half of it says what it takes and refuses
@@ -210,7 +214,7 @@ def load_data(  # long: half of it says what it takes and refuses
     else:
         logged, _ = import_log(
             path,
-            rate=RATES[-1] if rate is None and resample else rate,
+            rate=RATE if rate is None and resample else rate,
             vehicle=vehicle,
             options=options,
             accept=accept,

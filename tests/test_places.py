@@ -20,7 +20,9 @@ from spinndrift.models.vehicles.places import absolute, load_named, named_in
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.acceptance import acceptance
 from spinndrift.sims.cli import main
+from spinndrift.sims.scenarios.located import located
 from spinndrift.sims.scenarios.scenario import load_scenario
+from spinndrift.systems.controllers.kinds import Own
 from spinndrift.systems.logs.load import load_data
 
 T = np.arange(0.0, 10.0, 0.05)
@@ -92,6 +94,23 @@ def test_a_scenario_names_a_vehicle_beside_it(tmp_path, monkeypatch):
         load_scenario("a/s.yaml")
     with pytest.raises(UserError, match=r"^--scenario-text: station\.vehicle: .*`none\.yaml`"):
         load_scenario("station_keeping_calm", "station: {vehicle: none.yaml}")
+
+
+def test_a_scenario_names_models_and_code_beside_it(tmp_path, monkeypatch):
+    folder = tmp_path / "a"
+    folder.mkdir()
+    shutil.copy(ROOT / "examples/own_controller.py", folder / "mine.py")
+    (folder / "model.spinn").touch()
+    monkeypatch.chdir(tmp_path)
+    own = "controller: !Own {system: 'mine.py:PidController'}"
+    controller = located(load_scenario("station_keeping_calm", own), folder).controller
+    assert isinstance(controller, Own)
+    assert controller.code == f"{folder / 'mine.py'}:PidController"
+    scenario = load_scenario("station_keeping_calm")
+    named = replace(scenario, station=replace(scenario.station, model=Path("model.spinn")))
+    assert located(named, folder).station.model == folder / "model.spinn"
+    assert located(named, tmp_path) == named  # it is nowhere
+    assert located(scenario, folder) == scenario
 
 
 # ---------------------------------------------------------------------------------- what is refused

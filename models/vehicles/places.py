@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 from ..config.errors import UserError
+from ..files.places import found_in
 from .vehicle import Vehicle, load_vehicle
 
 
@@ -13,17 +14,8 @@ def absolute(named: str) -> str:
 
 
 def named_in(named: str, folder: str | os.PathLike[str]) -> str:
-    """A vehicle as a file in `folder` names it; a vehicle's file with its absolute path.
-
-    A relative path starts in `folder`, or else in the working folder. A file that is not at its
-    path any more is looked for beside what names it, so that both can be moved together. One that
-    is nowhere stays as it is.
-    """
-    path = Path(named)
-    if not path.suffix:
-        return named
-    places = (folder / path, path, folder / Path(path.name))
-    return next((os.path.abspath(place) for place in places if os.path.isfile(place)), named)
+    """A vehicle as a file in `folder` names it: a preset, or where its file is (`found_in`)."""
+    return found_in(named, folder) if Path(named).suffix else named
 
 
 def load_named(named: str, source: str, option: str = "--vehicle") -> Vehicle:

@@ -11,13 +11,13 @@ from ...models.config import typed_yaml
 from ...models.config.checks import SECONDS, check_numbers, require
 from ...models.config.errors import UserError
 from ...models.config.yaml_text import parse
-from ...models.vehicles.places import named_in
 from ...systems.controllers.kinds import ControllerKind, MppiImpedance
 from ...systems.mavlink.config import Mavlink
 from ...systems.own import OwnSystem
 from ...systems.station.config import StationConfig
 from ..vehicle.config import VehicleServer
 from .criteria import Finish, ReachGoal, Safety, Success
+from .located import located
 from .maneuvers import Maneuvers
 
 _FOLDER = Path(__file__).parent
@@ -183,7 +183,8 @@ def load_scenario(name_or_path: str | Path, text: str = "") -> Scenario:
     `text` is YAML that overrides the file: mappings are merged key by key, other values replace the
     file's, and so does a value with another `!Tag`.
 
-    A vehicle's file is found from the scenario's folder, else from the working folder.
+    Files that it names (vehicles, models, code) are found from its folder, or else from the working
+    folder; those in `text` from the working folder.
 
     Raises:
         UserError: there is no such scenario, it is not valid, with or without `text`, or its
@@ -201,7 +202,7 @@ def load_scenario(name_or_path: str | Path, text: str = "") -> Scenario:
                 f"{', '.join(scenario_names())}, or the path of a .yaml file"
             )
         path = _FOLDER / f"{name_or_path}.yaml"
-    stated = _located(typed_yaml.load(Scenario, path), path.parent)
+    stated = located(typed_yaml.load(Scenario, path), path.parent)
     scenario = overridden(stated, text) if text.strip() else stated
     try:
         vehicle = scenario.station.load_vehicle()
@@ -215,18 +216,6 @@ def load_scenario(name_or_path: str | Path, text: str = "") -> Scenario:
             same = scenario.station.effects == stated.station.effects
             where = f"{name_or_path if same else _TEXT}: station.effects[{i}]"
             raise UserError(f"{where}: {error}") from error
-    return scenario
-
-
-def _located(scenario: Scenario, folder: Path) -> Scenario:
-    """The scenario with vehicles' files that are found from its folder, or else from here."""
-    station = scenario.station
-    station = replace(station, vehicle=named_in(station.vehicle, folder))
-    scenario = replace(scenario, station=station)
-    controller = scenario.controller
-    if isinstance(controller, MppiImpedance) and controller.vehicle:
-        controller = replace(controller, vehicle=named_in(controller.vehicle, folder))
-        scenario = replace(scenario, controller=controller)
     return scenario
 
 

@@ -142,6 +142,7 @@ def test_the_pylon_crossing_reaches_its_goal(instance: int, actuation: str, tmp_
         assert as_it_was(link)
 
 
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("actuation", ["manual_control", "thruster_passthrough"])
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGSTOP])
 def test_however_it_ends_the_thrusters_stop(

@@ -336,7 +336,7 @@ def simulate(core: DelayedFilter, key: Array, steps: int, blind_after: Array, gr
 def _many(core: DelayedFilter, seed: Array, blind_after: Array, gross: Array) -> Run:
     keys = jax.random.split(jax.random.key(seed), SEEDS)
     run = partial(simulate, core, steps=STEPS, blind_after=blind_after, gross=gross)
-    return jax.vmap(run)(keys)
+    return jax.lax.map(run, keys)  # under vmap every sample would fuse
 
 
 def many(seed: int, blind_after: float = np.inf, gross: float = 0.0) -> Run:

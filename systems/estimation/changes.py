@@ -91,7 +91,7 @@ class Signs(NamedTuple):
     jolted: Bool[Array, "n"]
     """Whether jolts of the IMU explain it (`jolts.explain`)."""
     moved: Bool[Array, "n"]
-    """Whether they would have moved it as far."""
+    """Whether their effect is as large as its residual, so that they may explain correlation."""
     noisy: Bool[Array, "n"]
     """Whether the IMU's noise explains it (`noise_explains`)."""
     stuck: Bool[Array, "n"]
@@ -103,9 +103,9 @@ class Change(NamedTuple):
 
     sensor: Bool[Array, "n"]
     filter: Bool[Array, "n"]
-    """Whether a sensor's reading shows that the filter is wrong."""
+    """Whether a sensor's reading shows that the filter is wrong, but not because of a jolt."""
     jolt: Bool[Array, "n"]
-    """Whether it is so because of the IMU's jolts."""
+    """Whether it shows that a jolt of the IMU was an error."""
     noise: Bool[Array, "n"]
     """Whether a sensor's readings scatter more than it says."""
     imu: Bool[Array, "n"]

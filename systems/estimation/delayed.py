@@ -191,7 +191,7 @@ class DelayedFilter(Layout):
         velocity = jnp.asarray([each.observes == "velocity" for each in self.aids])
         unseen = jnp.min(jnp.where(velocity, age, jnp.inf))
         steps = jolts.consequences(x, state.samples, ahead, unseen, self.imu.gravity)
-        fault = time - trust.jolted_at < recovery.MENDS
+        fault = time - trust.jolted_at < jolts.MENDS
         explain, moves = jolts.explain(self.aids, found, P, steps, age, fault, limits)
         noisy = changes.noise_explains(self.imu, self.aids, joined.residual, state.samples)
         halts = stuck & ~trust.suspect(time, 0.0)

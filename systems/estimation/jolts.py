@@ -2,7 +2,7 @@
 
 A step Δ that is an error is one of the bias. Since then, over a time T, it has changed angle,
 velocity and position along one direction each, which is why a few readings tell how much of a step
-was an error: the covariance is opened along these directions alone.
+was an error: the covariance grows along these directions, and little in the others.
 """
 
 from collections.abc import Sequence
@@ -23,9 +23,10 @@ _BESIDE = 0.3
 """Deviation of an error in the other directions, as a share of its size: readings have corrected
 part of it meanwhile, and directions turn with the vehicle."""
 _EXPLAINS = 2.0  # times its effect is the largest residual that a jolt explains by itself
-_LATER = 5.0  # readings after a jolt that it may explain by itself
-_SLOWER = 20.0  # readings after a jolt that it may shift together
-_LATELY = 10.0  # s after a jolt for which it may explain readings if it was a fault
+_LATER = 5.0  # readings after a jolt whose rejection it may explain
+_SLOWER = 20.0  # readings after a jolt whose correlation it may explain
+_LATELY = 10.0  # s after a jolt for which it may explain readings after a fault of the IMU
+MENDS = 5.0  # s within which the filter may still be wrong after a fault of the IMU
 _LONGEST = 1.0  # s for which its effect grows unnoticed
 
 

@@ -20,7 +20,6 @@ _OBSERVED = {
     "position": error_state.POSITION,
     "attitude": error_state.ROTATION,
 }
-MENDS = 5.0  # s within which the filter may still be wrong after a fault of the IMU
 _ALONE = 9.0
 """Ratio of a prediction's variance to a reading's above which the reading decides alone."""
 

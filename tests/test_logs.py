@@ -600,7 +600,8 @@ def test_the_demo_log_has_what_its_readme_says(demo):
 
 
 def test_a_log_may_keep_the_rate_of_its_slowest_stream():
-    assert import_log(DEMO, rate=None)[0].dt == pytest.approx(0.02)
+    assert import_log(DEMO, fine=True)[0].dt == pytest.approx(0.02)
+    assert import_log(DEMO)[0].dt == pytest.approx(0.05)
 
     def rate(*each):
         one, two, three = (Series(np.arange(0, 10, 1 / hz), np.zeros(1), "") for hz in each)

@@ -4,6 +4,8 @@ Commands are held (zero order), velocities interpolated linearly, poses along th
 body twist from one sample to the next. Arrays are component first, as in `models/se3.py`.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -55,20 +57,28 @@ def mean(
     width: float,
 ) -> Float[np.ndarray, "*c N"]:
     """Mean over t_new ± width/2 of the linear interpolant: for sensors faster than the grid."""
-    steps = 0.5 * (x[..., 1:] + x[..., :-1]) * np.diff(t)
-    area = np.concatenate([np.zeros((*x.shape[:-1], 1)), np.cumsum(steps, axis=-1)], axis=-1)
-
-    def integral(times: np.ndarray) -> np.ndarray:
-        i, s = _locate(times, t)
-        h = t[i + 1] - t[i]
-        return area[..., i] + h * s * (x[..., i] + 0.5 * s * (x[..., i + 1] - x[..., i]))
-
+    path = integral(t, x)
     low = np.clip(t_new - width / 2, t[0], t[-1])
     high = np.clip(t_new + width / 2, t[0], t[-1])
     span = high - low
     inside = span > _SMALL
-    averaged = (integral(high) - integral(low)) / np.where(inside, span, 1.0)
+    averaged = (path(high) - path(low)) / np.where(inside, span, 1.0)
     return np.where(inside, averaged, linear(t_new, t, x))
+
+
+def integral(
+    t: Float[np.ndarray, " n"], x: Float[np.ndarray, "*c n"]
+) -> Callable[[Float[np.ndarray, " N"]], Float[np.ndarray, "*c N"]]:
+    """Integral of the linear interpolant from t[0] on; constant outside the samples."""
+    steps = 0.5 * (x[..., 1:] + x[..., :-1]) * np.diff(t)
+    area = np.concatenate([np.zeros((*x.shape[:-1], 1)), np.cumsum(steps, axis=-1)], axis=-1)
+
+    def path(times: np.ndarray) -> np.ndarray:
+        i, s = _locate(times, t)
+        h = t[i + 1] - t[i]
+        return area[..., i] + h * s * (x[..., i] + 0.5 * s * (x[..., i + 1] - x[..., i]))
+
+    return path
 
 
 def hermite(

@@ -1,12 +1,12 @@
 """Cuts and resamples a log's signals to one uniform grid: the trajectories of a recording.
 
 Attitude is interpolated along the geodesic, position by the Hermite cubic with the estimated
-velocity as its slope, velocity linearly and then rotated into the body; rates and IMU are means
-about each instant (`models/recordings/resample.py`). Accelerometer and pressure are measurements:
-they have a value where there was a sample, and are NaN elsewhere. The command of a step is the mean
-over that step of the linear interpolation of the logged outputs: a zero-order hold of these samples
-would delay the commands by half a sampling period (50 ms at the 10 Hz of a DataFlash log). Commands
-that act until the next one (`Signals.held`) are held.
+velocity as its slope, velocity along the accelerometer (`between.py`) and then rotated into the
+body; rates and IMU are means about each instant (`models/recordings/resample.py`). Accelerometer
+and pressure are measurements: they have a value where there was a sample, and are NaN elsewhere.
+The command of a step is the mean over that step of the linear interpolation of the logged outputs:
+a zero-order hold of these samples would delay the commands by half a sampling period (50 ms at the
+10 Hz of a DataFlash log). Commands that act until the next one (`Signals.held`) are held.
 """
 
 from itertools import pairwise
@@ -23,6 +23,7 @@ from ...models.recordings.resample import (
     rotations,
     slerp,
 )
+from .between import velocity_at
 from .segments import Segment, segments
 from .signals import Series, Signals
 from .streams import DEAD_RECKONING, UNAIDED
@@ -127,7 +128,7 @@ def at_instants(
     if signals.position is not None and signals.velocity is not None:
         slope = _at(signals.velocity, signals.position.t)
         p = hermite(t, signals.position.t, signals.position.x, slope)
-        v_W = linear(t, signals.velocity.t, signals.velocity.x)
+        v_W = velocity_at(signals, t)
         sensors["vertical_velocity"] = v_W[2]
         if aided:
             v = rotations(q).inv().apply(v_W.T).T

@@ -33,7 +33,7 @@ from .sound import sound
 from .tlog import read_tlog
 
 RATE = 20.0
-"""Rate (Hz) at which logs are imported unless another one is given."""
+"""Rate (Hz) of an imported log, if none is given and attitude and body rates are not slower."""
 _RATES = (50.0, 40.0, 25.0, RATE)
 _SLOW = 10.0
 
@@ -67,7 +67,8 @@ class LogOptions:
 def import_log(  # long: a third of it says what it takes and refuses
     path: str | os.PathLike[str],
     *,
-    rate: float | None = RATE,
+    rate: float | None = None,
+    fine: bool = False,
     vehicle: str | None = None,
     options: LogOptions | None = None,
     accept: Sequence[str] = (),
@@ -77,7 +78,8 @@ def import_log(  # long: a third of it says what it takes and refuses
 
     Args:
         path: the log; its kind is determined from its content.
-        rate: of the recording (Hz); None takes that of its streams (`own_rate`).
+        rate: of the recording (Hz); None takes 20, or 10 where `own_rate` does.
+        fine: without a rate, take that of the streams (`own_rate`).
         vehicle: preset or file whose thruster directions the PWM is to have; None takes the preset
             with the thrusters of the log's frame (`wiring`). It is named in the result.
         options: what is taken from the log.
@@ -106,7 +108,8 @@ def import_log(  # long: a third of it says what it takes and refuses
             )
             signals = replace(signals, notes=(*signals.notes, note))
         else:
-            rate = own_rate(signals) if rate is None else rate
+            if rate is None:
+                rate = own_rate(signals) if fine else min(own_rate(signals), RATE)
             trajectories, lines, dropped = fuse(
                 signals,
                 rate=rate,
@@ -180,11 +183,10 @@ def load_data(  # long: half of it says what it takes and refuses
 
     Args:
         path: file, folder with a `recording.yaml`, or folder of a ROS 2 bag.
-        rate: Hz; None keeps that of the data (20 for logs, or that of `own_rate` if `resample` is
-            False).
+        rate: Hz; None keeps that of the data; that of logs is said in `import_log`.
         vehicle: preset or file; None keeps the one that the data name, or that of a log's frame.
         options: what is taken from a log.
-        resample: False keeps the unevenly spaced samples of CSV files.
+        resample: False keeps the unevenly spaced samples of CSV files, and the rate of a log.
         accept: words of severe findings in a log that are accepted (docs/checks.md).
         progress: called with the fraction done, 0 to 1.
 
@@ -214,7 +216,8 @@ def load_data(  # long: half of it says what it takes and refuses
     else:
         logged, _ = import_log(
             path,
-            rate=RATE if rate is None and resample else rate,
+            rate=rate,
+            fine=not resample,
             vehicle=vehicle,
             options=options,
             accept=accept,

@@ -15,9 +15,11 @@ from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.diagnosis.data.checks import limits
 from spinndrift.training.diagnosis.filter.kalman import filtered, log_density, make_filter
 from spinndrift.training.diagnosis.filter.noise import Noise, process_covariance
+from spinndrift.training.diagnosis.filter.problem import DiagnosisProblem
 from spinndrift.training.diagnosis.filter.transition import Latent, Transition
 from spinndrift.training.diagnosis.findings.reported import residual
 from spinndrift.training.diagnosis.pipeline import DiagnoseConfig, Diagnoser
+from spinndrift.training.diagnosis.selection.refit_all import one_step, with_coefficients
 from spinndrift.training.diagnosis.selection.state import Selection
 
 VEHICLE = load_vehicle("bluerov2_heavy")
@@ -153,3 +155,35 @@ def test_nothing_is_named_without_u_and_v_where_nothing_is_hidden(tmp_path):
         assert ("no instrument tells" in told) == (given is recording)
         causes = {e.cause for e in problem.library.entries}
         assert not causes & {"dvl_scale", "dvl_lever_arm", "current_steady", "tether"}
+
+
+def test_far_from_the_belief_sensitivities_are_those_of_the_simulation(tmp_path):
+    """A latent velocity carries an error on through all later steps, as the model at hand lets it:
+    here with another mass, without its Munk moment, and with twice the drag of the belief."""
+    _, recording, force = hidden(tmp_path)
+    problem = DiagnosisProblem.of(felt(recording, force), VEHICLE)
+    problem = with_coefficients(problem, "all")
+    library, theta = problem.library, problem.believed.copy()
+    most = max(problem.believes("added_mass", axis) for axis in ("surge", "sway", "heave"))
+    for axis in ("surge", "sway", "heave"):
+        theta[library.at("added_mass", axis)] = most - problem.believes("added_mass", axis)
+        drag = problem.believes("quadratic_drag", axis)
+        theta[library.at("quadratic_drag", axis)] = drag
+    problem = problem.along(theta)
+    kalman = one_step(problem, theta)
+    rows = [i for a in ("surge", "sway") for i in library.at("axis_thrust", a)]
+    seen = problem.evaluate(theta, rows, kalman)
+    for axis, row in zip((0, 1), rows, strict=True):
+        probe = np.zeros((1, library.size))
+        probe[0, row] = 1e-3
+        shape = (len(problem.data.u), 12, -1)
+        changed = problem.whitened(seen, probe)[1].reshape(shape)
+        errors = problem.errors(theta + probe[0] / 2) - problem.errors(theta - probe[0] / 2)
+        exact = np.einsum("nijr,njr->nir", kalman.whiten, errors)
+        own = changed[:, 6 + axis] * problem.data.weight, exact[:, 6 + axis]
+        sizes = [np.linalg.norm(x) for x in own]
+        assert np.sum(own[0] * own[1]) > 0.97 * sizes[0] * sizes[1]
+        assert sizes[0] == pytest.approx(sizes[1], rel=0.1)
+        turned = [np.linalg.norm(x[:, 9:]) for x in (changed, exact)]
+        assert turned[0] < 0.2 * sizes[0], "no moment turns it"
+        assert turned[1] < 0.2 * sizes[1]

@@ -55,6 +55,9 @@ substeps a step, a pose half a substep late shows, without noise, as a clock off
 _OF_A_COMMAND = 0.5
 """Least lag or delay of sampled commands, as a share of their period or, if longer, of the step
 over which they were averaged: lines between samples of held commands come early by half of it."""
+_ALONG, _AGREE = 4, 0.01
+"""Most simulations of latent velocities under refitted coefficients, and the change of velocities
+(share) at which they agree with these."""
 _FINEST = 0.02
 """Shortest step (s) that the extended model supports: it sets the length of delay buffers."""
 
@@ -142,9 +145,9 @@ class Diagnoser:
         nuisance = refitted(problem, config.refit)
         if nuisance:
             first = self._refitted(problem)
-            if problem.data.latent:  # velocities without a record follow from the coefficients
-                problem = self.problem = problem.along(first.theta)
-                base, first = self._believed(problem), self._refitted(problem, first.theta)
+            if problem.data.latent:
+                base, first = self._along(first)
+                problem = self.problem
         start = Selection.start(problem, base, first, config.seed)
         found, nuisance, structures = self._find(start, nuisance)
         problem = found.problem
@@ -248,6 +251,21 @@ class Diagnoser:
                 "believed model is unstable on these data; check units of commands and twists, or "
                 "give a --vehicle or --model that is near"
             ) from error
+
+    def _along(self, first: Evaluation) -> tuple[Evaluation, Evaluation]:
+        """The believed and the refitted model about velocities that follow from the refitted one.
+
+        What has no record follows from the coefficients, and where the vehicle is tilted the heave
+        velocity of a climb follows from it: until those velocities and coefficients agree.
+        """
+        for _ in range(_ALONG):
+            before = self.problem.data.V
+            self.problem = self.problem.along(first.theta)
+            first = self._refitted(self.problem, first.theta)
+            after = self.problem.data.V
+            if np.std(after - before) < _AGREE * np.std(after):
+                break
+        return self._believed(self.problem), first
 
     def _refitted(
         self, problem: DiagnosisProblem, start: Float[np.ndarray, " p"] | None = None

@@ -74,8 +74,10 @@ def _predict(
         start = along.restart(state, given.X, V)
         end = along.step(start, given)
         middle = (start.V + end.V) / 2
+        # what was not measured moves on as the model at hand lets it, over many steps
+        own = (plain, rest) if measured is None else (along.model, along.inertia)
         jacobian, slope = step_jacobian(
-            plain, rest, start.X, middle, given.command, given.length[0], count
+            *own, start.X, middle, given.command, given.length[0], count, given.voltage
         )
         recent = end.recent.keeping(end.V, slope)
         end = end._replace(recent=recent)
@@ -98,6 +100,7 @@ def step_jacobian(
     u: Float[Array, "n R"],
     dt: Float[Array, "*_"],
     count: int,
+    voltage: Float[Array, "1 *#R"] | None = None,
 ) -> tuple[Float[Array, "12 12 R"], Float[Array, "6 6 R"]]:
     """exp(J dt) of δ' = δV - ad_V δ, δV' = ∂a/∂x δ; ∂a/∂V.
 
@@ -106,13 +109,11 @@ def step_jacobian(
     over all of it grows.
     """
     halvings = math.ceil(math.log2(count))
-    F = model.allocate(u)
     eye = jnp.eye(12, dtype=V.dtype)[3:]
 
     def drift(d: Array) -> Array:
         turned = se3.retract(X, jnp.concatenate([jnp.zeros_like(d[:3]), d[:3]]))
-        _, wrench = model.base.balance(turned, V + d[3:], F)
-        return jnp.tensordot(inertia.inverse, wrench, 1)
+        return model.drift(inertia, turned, V + d[3:], u, voltage)
 
     zero = jnp.zeros((9, *V.shape[1:]), V.dtype)
     tangents = jnp.broadcast_to(

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from ...models.recordings.resample import integral, linear, rotations, slerp
 from .signals import Series, Signals
 
-_GRAVITY = 9.80665
+GRAVITY = 9.80665
 _PERIODS = 3.0
 """Periods of a stream beyond the wanted times that are looked at."""
 
@@ -30,12 +30,12 @@ def velocity_at(signals: Signals, t: Float[np.ndarray, " n"]) -> Float[np.ndarra
     Components for which no accelerometer helps are interpolated linearly.
     """
     assert signals.velocity is not None
-    v = _near(signals.velocity, t)
+    v = near(signals.velocity, t)
     line = linear(t, v.t, v.x)
-    force = None if signals.specific_force is None else _near(signals.specific_force, t)
+    force = None if signals.specific_force is None else near(signals.specific_force, t)
     if force is None or force.t.size < 2 or v.t.size < 5:
         return line
-    up = np.array([[0.0], [0.0], [_GRAVITY]])
+    up = np.array([[0.0], [0.0], [GRAVITY]])
     R = rotations(slerp(force.t, signals.attitude.t, signals.attitude.x))
     acceleration = replace(force, x=R.apply(force.x.T).T - up)
     bent = _along(t, v, acceleration)
@@ -68,8 +68,8 @@ def _along(
     return np.where(inside & (pauses == 0), bent, linear(t, slow.t, slow.x))
 
 
-def _near(series: Series, t: Float[np.ndarray, " n"]) -> Series:
-    """Samples in the wanted time and a few periods around it."""
+def near(series: Series, t: Float[np.ndarray, " n"]) -> Series:
+    """Samples in the wanted times t and a few periods around them."""
     apart = _PERIODS / max(series.rate, 1e-3)
     first = max(int(np.searchsorted(series.t, t[0] - apart)) - 1, 0)
     last = min(int(np.searchsorted(series.t, t[-1] + apart)) + 1, series.t.size)

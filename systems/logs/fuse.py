@@ -2,11 +2,12 @@
 
 Attitude is interpolated along the geodesic, position by the Hermite cubic with the estimated
 velocity as its slope, velocity along the accelerometer (`between.py`) and then rotated into the
-body; rates and IMU are means about each instant (`models/recordings/resample.py`). Accelerometer
-and pressure are measurements: they have a value where there was a sample, and are NaN elsewhere.
-The command of a step is the mean over that step of the linear interpolation of the logged outputs:
-a zero-order hold of these samples would delay the commands by half a sampling period (50 ms at the
-10 Hz of a DataFlash log). Commands that act until the next one (`Signals.held`) are held.
+body; rates and IMU are means about each instant (`models/recordings/resample.py`). Without a
+horizontal estimate height and climb are those of `vertical.py`. Accelerometer and pressure are
+measurements: they have a value where there was a sample, and are NaN elsewhere. The command of a
+step is the mean over that step of the linear interpolation of the logged outputs: a zero-order hold
+of these samples would delay the commands by half a sampling period (50 ms at the 10 Hz of a
+DataFlash log). Commands that act until the next one (`Signals.held`) are held.
 """
 
 from itertools import pairwise
@@ -27,6 +28,7 @@ from .between import velocity_at
 from .segments import Segment, segments
 from .signals import Series, Signals
 from .streams import DEAD_RECKONING, UNAIDED
+from .vertical import vertical
 
 _FAST_HZ, _MEAN_S = 200.0, 0.01
 _LONGEST_S = 300.0
@@ -134,7 +136,8 @@ def at_instants(
             v = rotations(q).inv().apply(v_W.T).T
         else:
             p[:2] = np.nan
-            v[2] = v_W[2] * rotations(q).as_matrix()[:, 2, 2]
+            _vertical(signals, t, p, sensors)
+            v[2] = sensors["vertical_velocity"] * rotations(q).as_matrix()[:, 2, 2]
     if signals.specific_force is not None:
         sensors["imu_specific_force"] = _readings(signals.specific_force, t, dt).T
     if signals.rates.source.startswith(("RAW_IMU", "SCALED_IMU", "IMU", "GYR")):
@@ -153,6 +156,16 @@ def at_instants(
         sensors,
         float(t[0]),
     )
+
+
+def _vertical(
+    signals: Signals, t: np.ndarray, p: np.ndarray, sensors: dict[str, np.ndarray]
+) -> None:
+    """Height and climb by pressure and accelerometer, where they tell: they err less."""
+    found = vertical(signals, t)
+    if found is not None:
+        p[2] = found.z + np.median(p[2] - found.z)
+        sensors["vertical_velocity"] = found.w
 
 
 def _first(rates: Series, segment: Segment, dt: float) -> float:

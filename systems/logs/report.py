@@ -10,6 +10,7 @@ from ...models.recordings.kinematics import agreement
 from ...models.se3 import TWIST
 from .fuse import slower
 from .signals import Series, Signals
+from .vertical import read_throughout
 
 _SLOW_OUTPUTS_HZ, _SLOW_STATE_HZ = 25.0, 10.0
 _STILL = 0.03
@@ -84,9 +85,22 @@ def tell(
         tuple(lines),
         tuple(has),
         (*bad, *_lacking(signals), *_unread(signals, kept, dt), *_unexcited(kept), *signals.lacks),
-        (*signals.notes, *_left_out(signals)),
+        (*_smoothed(signals, kept, dt), *signals.notes, *_left_out(signals)),
         tuple(dropped),
     )
+
+
+def _smoothed(signals: Signals, kept: Sequence[Trajectory], dt: float) -> list[str]:
+    """A sentence on stretches whose height and climb are from pressure and accelerometer."""
+    unaided = [k for k in kept if "vertical_velocity" in k.sensors and np.isnan(k.X_WB[:, 4]).all()]
+    times = [k.start + dt * np.arange(len(k)) for k in unaided]
+    seconds = sum(dt * t.size for t in times if read_throughout(signals, t) is not None)
+    if not seconds:
+        return []
+    return [
+        f"In {seconds:.0f} s without a horizontal estimate height and climb are smoothed from "
+        "pressure and accelerometer, which errs less than the autopilot's climb."
+    ]
 
 
 def _left_out(signals: Signals) -> list[str]:

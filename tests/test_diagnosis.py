@@ -589,14 +589,16 @@ def test_a_swaying_mass_ahead_of_the_origin_is_seen_in_yaw(tmp_path):
 def test_errors_that_follow_each_other_are_not_called_adequate():
     """Of velocities alone: a filter's estimates err slowly in positions too, a law has a name."""
 
-    def left(position, velocity, causes=()):
-        sizes = 3 * [position] + 3 * [0.0] + 3 * [velocity] + 3 * [0.0]
+    def left(position, velocity, causes=(), attitude=0.0):
+        sizes = 3 * [position] + 3 * [attitude] + 3 * [velocity] + 3 * [0.0]
         residual = {
             name: AxisResidual(1.0, size, 0.0) for name, size in zip(CHANNELS, sizes, strict=True)
         }
         return following(residual, causes)
 
     assert left(0.0, 0.1) == left(0.8, 0.8) == []
+    assert left(np.nan, 0.8, attitude=0.8) == [], "without positions, the attitude tells"
+    assert left(np.nan, 0.8) == left(0.0, 0.8, attitude=0.8) != []
     (told,) = left(0.0, 0.8)
     assert told.startswith("errors of u, v, w follow each other")
     assert verdict((), [told]) == "unexplained"

@@ -184,14 +184,16 @@ def following(
 ) -> list[str]:
     """A sentence where only errors of velocities are autocorrelated and no law was named.
 
-    A filter's estimates have autocorrelated errors of position too.
+    A filter's estimates have autocorrelated errors of pose too: of position, or of attitude where
+    no position was measured.
     """
     lasting = ("disturbance", "environment")
     if any(kind(c.name).family in lasting for c in causes if c.name != Unknown.name):
         return []
     alike = {name: residual[name].autocorrelation for name in CHANNELS}
     of = [name for name in CHANNELS[6:] if alike[name] > _FOLLOWING]
-    if len(of) < _SEVERAL or any(abs(alike[name]) > _FOLLOWING / 2 for name in CHANNELS[:3]):
+    poses = [name for name in CHANNELS[:3] if np.isfinite(alike[name])] or CHANNELS[3:6]
+    if len(of) < _SEVERAL or any(abs(alike[name]) > _FOLLOWING / 2 for name in poses):
         return []
     return [
         f"errors of {', '.join(of)} follow each other (correlations up to "

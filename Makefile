@@ -39,7 +39,8 @@ $(INSTALLED): requirements.txt pyproject.toml
 				"(on Debian: apt-get install python3-venv)" >&2; exit 1; }; \
 	fi
 	@echo "installing the versions that requirements.txt names (about 1 GB, once)"
-	@$(PIP) install $(if $(CI),--quiet) --no-deps -r requirements.txt
+	@# bytecode is compiled at first use: most of it never is
+	@$(PIP) install $(if $(CI),--quiet) --no-compile --no-deps -r requirements.txt
 	@$(PIP) install --quiet --no-deps --no-index --no-build-isolation --editable .
 	@$(PIP) check
 	@rm -f .venv/.installed-* && touch $@

@@ -127,6 +127,9 @@ def test_the_accelerometer_counts_for_the_rate_where_nothing_else_tells_of_surge
     assert rate(25, horizontal=True) == 50
     assert rate(25, horizontal=False) == 25
     assert rate(2, horizontal=False) == 50
+    assert rate(12.5, horizontal=False) == 12.5
+    assert rate(9.9, horizontal=False) == 10
+    assert rate(12.5, horizontal=True) == 50
 
 
 def test_the_rate_of_a_stream_is_that_without_gaps_however_many_there_are():

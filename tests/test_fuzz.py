@@ -13,8 +13,8 @@ from spinndrift.models.config.errors import UserError
 
 pytestmark = pytest.mark.whole
 
-COUNT = 1000
-FRAMES = 200
+COUNT = 300
+FRAMES = 60
 """Inputs of twenty frames each."""
 BAGS = 30
 """A bag is written anew for each input."""

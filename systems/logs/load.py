@@ -78,7 +78,7 @@ def import_log(  # long: a third of it says what it takes and refuses
 
     Args:
         path: the log; its kind is determined from its content.
-        rate: of the recording (Hz); None takes 20, or 10 where `own_rate` does.
+        rate: of the recording (Hz); None takes 20, or 10 (`usual_rate`).
         fine: without a rate, take that of the streams (`own_rate`).
         vehicle: preset or file whose thruster directions the PWM is to have; None takes the preset
             with the thrusters of the log's frame (`wiring`). It is named in the result.
@@ -109,7 +109,7 @@ def import_log(  # long: a third of it says what it takes and refuses
             signals = replace(signals, notes=(*signals.notes, note))
         else:
             if rate is None:
-                rate = own_rate(signals) if fine else min(own_rate(signals), RATE)
+                rate = own_rate(signals) if fine else usual_rate(signals)
             trajectories, lines, dropped = fuse(
                 signals,
                 rate=rate,
@@ -150,21 +150,28 @@ def import_log(  # long: a third of it says what it takes and refuses
     return Recording(dataset.assign_attrs(command_period=period)), report
 
 
+def usual_rate(signals: Signals) -> float:
+    """20 Hz, or 10 if attitude or body rates are slower: between two of their samples nothing is
+    known of a rotation.
+    """
+    return _SLOW if min(signals.attitude.rate, signals.rates.rate) < 0.95 * RATE else RATE
+
+
 def own_rate(signals: Signals) -> float:
     """The largest of 50, 40, 25 and 20 Hz that every stream of state and outputs reaches, or 20.
 
-    It is 10 if attitude or body rates are slower than 20: of a rotation nothing is known between
-    two of their samples. Without a horizontal velocity the accelerometer counts as such a stream:
-    nothing else tells of surge and sway, and it has no reading at a sample between two of its own.
-    One below 20 Hz is too slow to tell of them.
+    It is 10 where `usual_rate` is. Without a horizontal velocity the accelerometer counts as such a
+    stream: nothing else tells of surge and sway, and it has no reading at a sample between two of
+    its own. From 10 to 20 Hz its own rate is taken; one below 10 Hz is too slow to tell of them.
     """
-    if min(signals.attitude.rate, signals.rates.rate) < 0.95 * RATE:
+    if usual_rate(signals) == _SLOW:
         return _SLOW
     streams = [signals.attitude, signals.rates, signals.outputs, signals.velocity]
-    v = signals.velocity
-    if v is None or not np.isfinite(v.x[:2]).any():
-        force = signals.specific_force
-        streams.append(force if force is not None and force.rate >= RATE else None)
+    v, force = signals.velocity, signals.specific_force
+    if force is not None and (v is None or not np.isfinite(v.x[:2]).any()):
+        if _SLOW <= 1.05 * force.rate < 0.95 * RATE:
+            return max(_SLOW, float(np.floor(2 * force.rate) / 2))
+        streams.append(force if force.rate >= _SLOW else None)
     slowest = min(s.rate for s in streams if s is not None)
     return next((rate for rate in _RATES if rate <= 1.05 * slowest), RATE)
 

@@ -205,8 +205,8 @@ def _of_latent(data: Data) -> list[str]:
     if data.felt:
         axes = ", ".join(AXES[i] for i in data.felt)
         found.append(
-            f"{axes}: the accelerometer tells of accelerations alone, so drag there, and speeds, "
-            "are known no better than the thrust that the model believes"
+            f"{axes}: the accelerometer alone tells of them: a constant push there looks like its "
+            "bias, and fast changes alone tell thrust from drag"
         )
     if data.unseen:
         found.append(

@@ -104,6 +104,8 @@ def test_states_and_likelihood_are_those_of_the_joint_normal_distribution():
 def test_a_sensor_that_pauses_or_lacks_tells_nothing():
     whole = log()
     depth, force = whole.pressure_depth, whole.specific_force
+    assert depth is not None
+    assert force is not None
     for name, series in (("pressure_depth", depth), ("specific_force", force)):
         assert vertical(replace(whole, **{name: None}), WANTED) is None
         for kept in (np.abs(series.t - 30) > 0.4, series.t < 50, series.t > 5):

@@ -224,8 +224,11 @@ def losses(task: Task) -> Entries:
         out = code.results / "losses" / method
         if not (out / "report.html").exists():  # written last
             out.parent.mkdir(exist_ok=True)
-            options = ("--method", method, "--steps", "1", "--seed", "0", "--resume")
-            code.spinndrift("train", str(data), *options, "--out", str(out))
+            options = ("--method", method, "--steps", "1", "--seed", "0")
+            with tempfile.TemporaryDirectory(dir=out.parent) as folder:
+                begun = Path(folder, method)
+                code.spinndrift("train", str(data), *options, "--out", str(begun))
+                begun.replace(out)
         with (out / "metrics.csv").open(encoding="utf-8", newline="") as handle:
             row = next(csv.DictReader(handle))
         numbers = {name: float(row[name]) for name in ("loss", "gradient_norm")}

@@ -39,15 +39,18 @@ def log(period=0.1, bias=(0.0, 0.0, 0.0), noise=0.0):
     )
 
 
-def measured(signals) -> tuple[Series, Series]:
-    """Velocity and specific force of `log`, which are there."""
+def velocities(signals) -> Series:
     assert signals.velocity is not None
+    return signals.velocity
+
+
+def forces(signals) -> Series:
     assert signals.specific_force is not None
-    return signals.velocity, signals.specific_force
+    return signals.specific_force
 
 
 def lines(signals, t=WANTED):
-    v, _ = measured(signals)
+    v = velocities(signals)
     return np.stack([np.interp(t, v.t, x) for x in v.x])
 
 
@@ -58,7 +61,7 @@ def off(found, t=WANTED):
 def test_motion_between_samples_is_that_of_the_accelerometer():
     signals = log(bias=(0.2, -0.1, 0.3), noise=0.05)
     assert (off(velocity_at(signals, WANTED)) < 0.2 * off(lines(signals))).all()
-    v, _ = measured(signals)
+    v = velocities(signals)
     inside = v.t[5:-5]
     np.testing.assert_allclose(velocity_at(signals, inside), v.x[:, 5:-5], atol=1e-12)
 
@@ -66,7 +69,7 @@ def test_motion_between_samples_is_that_of_the_accelerometer():
 @pytest.mark.parametrize("wrong", ["sign", "axes", "other motion"])
 def test_an_accelerometer_that_does_not_tell_of_the_motion_is_not_followed(wrong):
     signals = log()
-    _, force = measured(signals)
+    force = forces(signals)
     x = {
         "sign": -force.x,
         "axes": np.roll(force.x, 1, axis=0),
@@ -78,7 +81,7 @@ def test_an_accelerometer_that_does_not_tell_of_the_motion_is_not_followed(wrong
 
 def test_pauses_and_ends_of_the_accelerometer_are_lines():
     signals = log()
-    _, force = measured(signals)
+    force = forces(signals)
     kept: np.ndarray = (force.t > 6.0) & ~((force.t > 9.0) & (force.t < 11.0))
     short = replace(signals, specific_force=replace(force, t=force.t[kept], x=force.x[:, kept]))
     found, plain = velocity_at(short, WANTED), lines(signals)
@@ -91,7 +94,7 @@ def test_pauses_and_ends_of_the_accelerometer_are_lines():
 
 def test_components_that_are_unknown_stay_so_and_the_others_are_found():
     signals = log()
-    v, _ = measured(signals)
+    v = velocities(signals)
     x = v.x.copy()
     x[:2] = np.nan
     found = velocity_at(replace(signals, velocity=replace(v, x=x)), WANTED)
@@ -105,6 +108,6 @@ def test_without_enough_samples_it_is_the_line(missing):
     if missing == "no accelerometer":
         signals = replace(signals, specific_force=None)
     else:
-        v, _ = measured(signals)
+        v = velocities(signals)
         signals = replace(signals, velocity=replace(v, t=v.t[:4], x=v.x[:, :4]))
     np.testing.assert_allclose(velocity_at(signals, WANTED), lines(signals), atol=1e-12)

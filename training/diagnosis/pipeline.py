@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ...models.config.errors import UserError
 from ...models.dynamics import Dynamics
 from ...models.effects.base import Effect
 from ...models.effects.extended import Extended
@@ -38,6 +37,7 @@ from .findings.conclusion import conclude
 from .findings.heading_off import off_causes
 from .findings.ratios import ratios
 from .findings.small_speeds import zone_causes
+from .refitting import believed, with_refitted
 from .selection.hypotheses import Fit
 from .selection.model_selection import Hypothesis, parameters_of
 from .selection.refit_all import identify, with_coefficients
@@ -55,9 +55,6 @@ substeps a step, a pose half a substep late shows, without noise, as a clock off
 _OF_A_COMMAND = 0.5
 """Least lag or delay of sampled commands, as a share of their period or, if longer, of the step
 over which they were averaged: lines between samples of held commands come early by half of it."""
-_ALONG, _AGREE = 4, 0.01
-"""Most simulations of latent velocities under refitted coefficients, and the change of velocities
-(share) at which they agree with these."""
 _FINEST = 0.02
 """Shortest step (s) that the extended model supports: it sets the length of delay buffers."""
 
@@ -141,13 +138,15 @@ class Diagnoser:
         self.progress(0.02, "one-step predictions")
         if config.refit == "all":
             problem = self.problem = with_coefficients(problem, "all")
-        base = first = self._believed(problem)
         nuisance = refitted(problem, config.refit)
         if nuisance:
-            first = self._refitted(problem)
-            if problem.data.latent:
-                base, first = self._along(first)
-                problem = self.problem
+            remark = "all coefficients together"
+            problem, base, first = with_refitted(
+                problem, config.refit, lambda f: self.progress(0.03 + 0.07 * f, remark)
+            )
+            self.problem = problem
+        else:
+            base = first = believed(problem)
         start = Selection.start(problem, base, first, config.seed)
         found, nuisance, structures = self._find(start, nuisance)
         problem = found.problem
@@ -241,44 +240,6 @@ class Diagnoser:
             noise=reported.noise_levels(problem, final),
             findings=self.checked,
         )
-
-    def _believed(self, problem: DiagnosisProblem) -> Evaluation:
-        try:
-            return problem.evaluate(problem.believed)
-        except FloatingPointError as error:
-            raise UserError(
-                f"{error} within a step of {problem.data.longest:.3g} s from recorded states: the "
-                "believed model is unstable on these data; check units of commands and twists, or "
-                "give a --vehicle or --model that is near"
-            ) from error
-
-    def _along(self, first: Evaluation) -> tuple[Evaluation, Evaluation]:
-        """The believed and the refitted model about velocities that follow from the refitted one.
-
-        What has no record follows from the coefficients, and where the vehicle is tilted the heave
-        velocity of a climb follows from it: until those velocities and coefficients agree.
-        """
-        for _ in range(_ALONG):
-            before = self.problem.data.V
-            self.problem = self.problem.along(first.theta)
-            first = self._refitted(self.problem, first.theta)
-            after = self.problem.data.V
-            if np.std(after - before) < _AGREE * np.std(after):
-                break
-        return self._believed(self.problem), first
-
-    def _refitted(
-        self, problem: DiagnosisProblem, start: Float[np.ndarray, " p"] | None = None
-    ) -> Evaluation:
-        """The believed model with the coefficients of `refit` fitted, from `start` on."""
-        if self.config.refit == "all":
-            remark = "all coefficients together"
-            return problem.evaluate(
-                identify(problem, lambda f: self.progress(0.03 + 0.07 * f, remark), start)
-            )
-        rows = refitted(problem, self.config.refit)
-        start = problem.believed if start is None else start
-        return problem.evaluate(problem.polish(start, rows)[0])
 
     def _together(
         self, found: Selection, rows: list[int]

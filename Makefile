@@ -39,8 +39,7 @@ $(INSTALLED): requirements.txt pyproject.toml
 				"(on Debian: apt-get install python3-venv)" >&2; exit 1; }; \
 	fi
 	@echo "installing the versions that requirements.txt names (about 1 GB, once)"
-	@# bytecode is compiled at first use: most of it never is
-	@$(PIP) install $(if $(CI),--quiet) --no-compile --no-deps -r requirements.txt
+	@$(PIP) install $(if $(CI),--quiet) --no-deps -r requirements.txt
 	@$(PIP) install --quiet --no-deps --no-index --no-build-isolation --editable .
 	@$(PIP) check
 	@rm -f .venv/.installed-* && touch $@

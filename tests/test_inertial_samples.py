@@ -63,3 +63,22 @@ def test_samples_that_are_repeated_late_or_not_finite_are_left_out():
     for taken, value in ((0.01, 9.0), (0.005, 9.0), (0.015, np.nan), (0.016, np.inf)):
         samples.add(taken, np.full(6, value))
     np.testing.assert_allclose(samples.mean(0.0, 0.02), 1.0)
+
+
+def test_a_loop_that_hung_is_followed_by_no_jolt():
+    """190 ms without samples, which then come at once: deviations are those of a held sample."""
+    samples, told, meant = InertialSamples(), [], []
+    for k in range(1, 200):
+        now = k * PERIOD
+        late = range(61, 80) if k == 80 else [k]
+        for n in late if not 61 <= k < 80 else ():
+            samples.add(n * PERIOD - 0.002, motion(n * PERIOD - 0.002))
+        if k > 20:
+            told.append(samples.mean(now - PERIOD, now))
+            meant.append((integral(now) - integral(now - PERIOD)) / PERIOD)
+    off = np.array(told) - np.array(meant)
+    assert np.abs(off[:35]).max() < 0.1  # of rates of one
+    assert np.abs(off).max() < 2.1, "no more than two rates of opposite signs"
+    assert np.abs(off[85:]).max() < 0.1
+    # no motion was lost
+    assert np.abs(off.sum(axis=0) * PERIOD).max() < 23 * 0.012**2

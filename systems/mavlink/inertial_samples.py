@@ -10,8 +10,9 @@ class InertialSamples:
     """Means of specific force and angular rate over successive intervals of the local clock.
 
     Samples are joined by straight lines, the newest is held; their integral is kept, so that what
-    an interval has held too long is corrected in the next one, and no motion is lost or counted
-    twice.
+    intervals have held too long is corrected in the following ones, and no motion is lost or
+    counted twice. A correction lasts as long as the sample was held: all at once, after a link or a
+    loop that hung, it would be a jolt of many times the motion.
     """
 
     def __init__(self, hold: float = 0.2):
@@ -19,6 +20,8 @@ class InertialSamples:
         self._hold = hold
         self._kept: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=200)
         self._told: np.ndarray | None = None
+        self._owed = 0.0
+        """Time (s) over which what was held is still to be corrected."""
 
     def add(self, taken: float, value: Float[np.ndarray, "6"]) -> None:
         """A sample of a local time (s); one that is not later than the last is left out."""
@@ -39,9 +42,14 @@ class InertialSamples:
         if not self._kept or end - self._kept[-1][0] > self._hold or start < self._kept[0][0]:
             self._told = None
             return np.full(6, np.nan)
-        before = self._integral(start) if self._told is None else self._told
-        self._told = self._integral(end)
-        return (self._told - before) / (end - start)
+        span, begun = end - start, self._integral(start)
+        if self._told is None:
+            self._told, self._owed = begun, 0.0
+        share = min(1.0, span / self._owed) if self._owed > 0 else 1.0
+        moved = self._integral(end) - begun + share * (begun - self._told)
+        self._told = self._told + moved
+        self._owed = max(self._owed - span, end - self._kept[-1][0])
+        return moved / span
 
     def _integral(self, t: float) -> np.ndarray:
         kept = list(self._kept)

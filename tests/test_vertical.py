@@ -25,14 +25,14 @@ def climb(t):
     return 0.28 * np.cos(0.7 * t) + 0.31 * np.cos(3.1 * t)
 
 
-def log(rate=25.0, bias=(0.3, -0.2, 0.0), seed=0):
+def log(rate=25.0, bias=(0.006, -0.004, 0.05), seed=0):
     """A rolling vehicle without horizontal motion, accelerations at `rate` and depth at 10 Hz."""
     rng = np.random.default_rng(seed)
     t, slow = np.arange(0.0, 60.0, 1 / rate), np.arange(0.033, 60.0, 0.1)
     R = Rotation.from_euler("ZYX", np.stack([0.1 * t, 0.1 * np.sin(t), 0.5 * np.cos(t)], axis=1))
     a = -0.196 * np.sin(0.7 * t) - 0.961 * np.sin(3.1 * t)
     f = R.inv().apply(np.stack([0 * t, 0 * t, a + GRAVITY], axis=1)).T
-    f = f + np.asarray(bias)[:, None] * 0.02 + FELT * rng.normal(size=f.shape)
+    f = f + np.asarray(bias)[:, None] + FELT * rng.normal(size=f.shape)
     depth = -height(slow) + PRESSURE * rng.normal(size=slow.size)
     some = Series(t, np.zeros((3, t.size)), "some")
     return Signals(

@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ...models.recordings.resample import integral, linear, rotations, slerp
+from ..mavlink import codec
 from .signals import Series, Signals
 
-GRAVITY = 9.80665
 _PERIODS = 3.0
 """Periods of a stream beyond the wanted times that are looked at."""
 
@@ -35,9 +35,7 @@ def velocity_at(signals: Signals, t: Float[np.ndarray, " n"]) -> Float[np.ndarra
     force = None if signals.specific_force is None else near(signals.specific_force, t)
     if force is None or force.t.size < 2 or v.t.size < 5:
         return line
-    up = np.array([[0.0], [0.0], [GRAVITY]])
-    R = rotations(slerp(force.t, signals.attitude.t, signals.attitude.x))
-    acceleration = replace(force, x=R.apply(force.x.T).T - up)
+    acceleration = acceleration_of(signals, force)
     bent = _along(t, v, acceleration)
     others, left = replace(v, t=v.t[::2], x=v.x[:, ::2]), slice(1, (v.t.size - 1) // 2 * 2, 2)
     off = [
@@ -49,6 +47,12 @@ def velocity_at(signals: Signals, t: Float[np.ndarray, " n"]) -> Float[np.ndarra
     ]
     nearer = np.sum(off[0] ** 2, axis=1) < np.sum(off[1] ** 2, axis=1)  # not if any is unknown
     return np.where(nearer[:, None], bent, line)
+
+
+def acceleration_of(signals: Signals, force: Series) -> Series:
+    """Acceleration in W (m/s²) by a specific force."""
+    R = rotations(slerp(force.t, signals.attitude.t, signals.attitude.x))
+    return replace(force, x=R.apply(force.x.T).T - np.array([[0.0], [0.0], [codec.G]]))
 
 
 def _along(

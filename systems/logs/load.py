@@ -169,9 +169,10 @@ def own_rate(signals: Signals) -> float:
     streams = [signals.attitude, signals.rates, signals.outputs, signals.velocity]
     v, force = signals.velocity, signals.specific_force
     if force is not None and (v is None or not np.isfinite(v.x[:2]).any()):
-        if _SLOW <= 1.05 * force.rate < 0.95 * RATE:
+        if force.rate >= 0.95 * RATE:
+            streams.append(force)
+        elif 1.05 * force.rate >= _SLOW:
             return max(_SLOW, float(np.floor(2 * force.rate) / 2))
-        streams.append(force if force.rate >= _SLOW else None)
     slowest = min(s.rate for s in streams if s is not None)
     return next((rate for rate in _RATES if rate <= 1.05 * slowest), RATE)
 

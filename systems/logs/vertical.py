@@ -11,7 +11,6 @@ Striebel 1965; as one banded system of equations). The levels of the noise of pr
 accelerometer are those under which the pressures are most likely.
 """
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +18,8 @@ import scipy.linalg
 import scipy.optimize
 from jaxtyping import Float
 
-from ...models.recordings.resample import linear, mean, rotations, slerp
-from .between import GRAVITY, near
+from ...models.recordings.resample import linear, mean
+from .between import acceleration_of, near
 from .signals import Series, Signals
 
 _GRID, _SLOWEST = 0.02, 0.1
@@ -30,8 +29,7 @@ _PAUSE = 0.5
 _LEAST = 50
 """Readings of pressure that tell the levels of noise."""
 _BIAS, _DRIFT = 0.2, 0.01
-"""Standard deviation of the bias at first (m/s²), of which a tilt wrong by a degree makes 0.17
-forwards and 1.5e-3 vertically, and that of its change in a second."""
+"""Standard deviations (m/s²) of an accelerometer's bias at first, and of its change in a second."""
 _START = np.log([0.02, 0.05])
 _RANGE = np.log([[1e-4, 1.0], [1e-3, 3.0]])
 """Of the standard deviations of a pressure (m) and of the acceleration's mean over a second
@@ -65,9 +63,7 @@ def vertical(signals: Signals, t: Float[np.ndarray, " n"]) -> Vertical | None:
     h = float(np.clip(1.0 / force.rate, _GRID, _SLOWEST))
     first, last = max(depth.t[0], force.t[0]), min(depth.t[-1], force.t[-1])
     grid = np.arange(first, last, h)
-    R = rotations(slerp(force.t, signals.attitude.t, signals.attitude.x)).as_matrix()
-    up = replace(force, x=np.einsum("nj,jn->n", R[:, 2], force.x) - GRAVITY)
-    a = mean(grid[:-1] + h / 2, up.t, up.x, h)
+    a = mean(grid[:-1] + h / 2, force.t, acceleration_of(signals, force).x[2], h)
     inside = (depth.t >= grid[0]) & (depth.t < grid[-1])
     level = float(np.mean(depth.x[inside]))
     problem = _Problem(h, a, depth.t[inside] - grid[0], level - depth.x[inside])

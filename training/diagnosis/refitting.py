@@ -40,19 +40,19 @@ def with_refitted(
     velocity of a climb follows from it. Where velocities were not measured the problem is about
     those that agree with the coefficients that they lead to.
     """
-    base, first = believed(problem), _refitted(problem, how, progress)
+    base, first = believed(problem), _fitted(problem, how, progress)
     if not problem.data.latent:
         return problem, base, first
     for _ in range(_ALONG):
         before = problem.data.V
         problem = problem.along(first.theta)
-        first = _refitted(problem, how, progress, first.theta)
+        first = _fitted(problem, how, progress, first.theta)
         if np.std(problem.data.V - before) < _AGREE * np.std(before):
             break
     return problem, believed(problem), first
 
 
-def _refitted(
+def _fitted(
     problem: DiagnosisProblem,
     how: Refit,
     progress: Callable[[float], None],

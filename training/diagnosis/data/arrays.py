@@ -17,6 +17,7 @@ from ....models.se3 import AXES, TWIST, XYZ
 from ....models.vehicles.vehicle import Vehicle
 from .lost import known_errors, with_lost_zero
 from .readings import sensors_of_latent
+from .reckoned import reckoned_axes
 
 SEGMENT = 256
 """Longest piece (samples) that a run is cut into; pieces are filtered side by side."""
@@ -61,6 +62,7 @@ class Data:
         unmeasured: coordinates of the position that are integrals of the velocity alone (then no
             error of position is used: in B the coordinates are mixed), and velocities that were not
             recorded. These are latent: `filter.reference` fills them with a simulation.
+        reckoned: axes of W (0 to 2) whose position is an integral of the recorded velocity.
         specific_force: of the accelerometer (m/s²), where velocities are latent (N + 1, 3, R).
         climb: vertical velocity in W (m/s), where w follows from it and the latent ones (N + 1, R).
         began: time of each piece's first sample since the start of its run (s) (1, R).
@@ -86,6 +88,7 @@ class Data:
     command: str
     has_voltage: bool
     unmeasured: tuple[str, ...] = ()
+    reckoned: tuple[int, ...] = ()
     specific_force: Float[np.ndarray, "M 3 R"] | None = None
     climb: Float[np.ndarray, "M R"] | None = None
     began: Float[np.ndarray, "1 R"] | None = None
@@ -279,6 +282,7 @@ def make_data(
         command=recording.thrust_from,
         has_voltage="voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any()),
         unmeasured=unmeasured,
+        reckoned=reckoned_axes(arrays["X"], arrays["V"], arrays["step"], weight),
         started=_started(recording, kept, run),
         labels=run_labels(recording, kept),
         zones=zones,

@@ -11,7 +11,7 @@ from ....models.recordings.checks.small_speeds import DeadZone, dead_zones
 from ....models.recordings.pieces import good_pieces
 from ....models.recordings.schema import UNEVEN
 from ....models.recordings.store import Recording
-from ....models.se3 import AXES, TWIST
+from ....models.se3 import AXES, TWIST, XYZ
 from .arrays import Data
 from .faults import INSTRUMENTS, STUCK, Faults, faults_of
 
@@ -250,11 +250,12 @@ def limits(
         found.append("commands are wrenches: single thrusters are not identifiable")
     if data.latent:
         found += _of_latent(data)
-    elif data.unmeasured:
+    elif data.reckoned:
+        axes = data.unmeasured or [XYZ[i] for i in data.reckoned]
+        how = "were not measured" if data.unmeasured else "follow the recorded velocities"
         found.append(
-            f"{', '.join(data.unmeasured)} of the position were not measured (dead-reckoned from "
-            "the velocities): scale and direction of the DVL and errors of the heading, which need "
-            "both, are not identifiable"
+            f"{', '.join(axes)} of the position {how} (dead-reckoned): errors of the DVL and of "
+            "the heading show in the forces alone, so that small ones are not identifiable"
         )
     if not data.has_voltage:
         found.append("no voltage was recorded: voltage_sag is not identifiable")

@@ -2,7 +2,8 @@
 
 Actuators settle under the commands before a run (`AlongRecords.init`). The motion starts at a
 record, and again at later ones (`restart`); it advances by recorded steps under recorded commands
-(`step`, `scan`); it is seen as instruments record it (`observe`).
+(`step`, `scan`); it is seen as instruments record it (`observe`). Positions that a recorder has
+dead-reckoned are seen as integrals of the velocity and attitude that instruments show.
 """
 
 import math
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ....models import se3
 from ....models.dynamics import Memory
 from ....models.effects.deterministic_step import advance
 from ....models.effects.extended import Extended, Random
@@ -83,12 +85,16 @@ class Step(NamedTuple):
 
 
 class State(NamedTuple):
-    """State of a model: actuators, pose, twist, its history, random states of effects."""
+    """State of a model: actuators, pose, twist, its history, random states of effects.
+
+    `astray` is what a dead-reckoned position has beyond the true one (m, in W).
+    """
 
     memory: Memory
     X: Float[Array, "7 *b"]
     V: Float[Array, "6 *b"]
     recent: Recent
+    astray: Float[Array, "3 *b"]
     random: Random = ()
 
 
@@ -97,18 +103,24 @@ class AlongRecords(eqx.Module):
 
     Attributes:
         changes: of its effects in parts of the records, for `at`.
+        reckoned: axes of W whose position is dead-reckoned (`Data.reckoned`).
     """
 
     model: Extended
     inertia: Inertia
     substeps: int = eqx.field(static=True)
     changes: tuple[Modulated, ...] = ()
+    reckoned: tuple[int, ...] = eqx.field(static=True, default=())
 
     @classmethod
     def of(
-        cls, model: Extended, substeps: int, changes: tuple[Modulated, ...] = ()
+        cls,
+        model: Extended,
+        substeps: int,
+        changes: tuple[Modulated, ...] = (),
+        reckoned: tuple[int, ...] = (),
     ) -> "AlongRecords":
-        return cls(model, model.inertia(), substeps, changes)
+        return cls(model, model.inertia(), substeps, changes, reckoned if model.reads else ())
 
     def at(self, number: Int[Array, ""] | int) -> "AlongRecords":
         """With the effects as they are at a sample."""
@@ -132,18 +144,19 @@ class AlongRecords(eqx.Module):
         step = records.step[:1]
         level = self.model.actuate(memory, past[-1], step, 1)[1][..., 0]
         rate = self.model.drift(self.inertia, X, V, level, records.voltage[:1])
-        return State(memory, X, V, Recent.steady(rate, step))
+        return State(memory, X, V, Recent.steady(rate, step), jnp.zeros_like(V[:3]))
 
     def restart(self, state: State, X: Array, V: Array, when: Array | None = None) -> State:
         """At a record of pose and twist (`when` true): what instruments read without noise.
 
         What delayed instruments do not show yet happened under earlier commands.
         """
-        fresh = self.model.infer(X, V, state.recent)
+        X_true, V_true = self.model.infer(X, V, state.recent)
+        fresh = X_true, V_true, X[4:] - X_true[4:]
         if when is not None:
-            old = state.X, state.V
+            old = state.X, state.V, state.astray
             fresh = tuple(jnp.where(when, a, b) for a, b in zip(fresh, old, strict=True))
-        return state._replace(X=fresh[0], V=fresh[1])
+        return state._replace(X=fresh[0], V=fresh[1], astray=fresh[2])
 
     def step(self, state: State, given: Step, push: Float[Array, "6 *b"] | None = None) -> State:
         """After a recorded step, under a wrench `push` in addition."""
@@ -152,11 +165,31 @@ class AlongRecords(eqx.Module):
             self.substeps, given.voltage, push,
         )  # fmt: skip
         recent = state.recent.after(Recent.over(state.V, V, rates, given.length))
-        return State(memory, X, V, recent, state.random)
+        end = state._replace(memory=memory, X=X, V=V, recent=recent)
+        if not self.reckoned:
+            return end
+        gained = given.length / 2 * (self._misread(state) + self._misread(end))
+        return end._replace(astray=state.astray + gained)
 
     def observe(self, state: State) -> tuple[Float[Array, "7 *b"], Float[Array, "6 *b"]]:
         """Pose and twist as they are recorded, without noise."""
-        return self.model.observe(state.X, state.V, state.recent)
+        X, V = self.model.observe(state.X, state.V, state.recent)
+        if not self.reckoned:
+            return X, V
+        return with_position(X, state.X[4:] + state.astray, self.reckoned), V
+
+    def _misread(self, state: State) -> Float[Array, "3 *b"]:
+        """Recorded velocity in W by the recorded attitude, less the true one (m/s)."""
+        X, V = self.model.observe(state.X, state.V, state.recent)
+        return se3.rotate(X, V[:3]) - se3.rotate(state.X, state.V[:3])
+
+
+def with_position(
+    X: Float[Array, "7 *b"], p: Float[Array, "3 *b"], axes: tuple[int, ...]
+) -> Float[Array, "7 *b"]:
+    """The pose with another position along some axes of W."""
+    rows = [4 + i for i in axes]
+    return X.at[jnp.array(rows)].set(p[jnp.array(axes)])
 
 
 def scan(step: Callable[[State, Step], tuple[State, Out]], state: State, records: Records) -> Out:

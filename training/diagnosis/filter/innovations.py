@@ -62,8 +62,9 @@ def _predict(
     count: int,
     measured: Array | None = None,
     changes: tuple[Modulated, ...] = (),
+    reckoned: tuple[int, ...] = (),
 ) -> Predictions:
-    every = AlongRecords.of(model.with_effects(effects), count, changes)
+    every = AlongRecords.of(model.with_effects(effects), count, changes, reckoned)
     plain = model.with_effects(())
     rest = plain.inertia()
 
@@ -145,8 +146,11 @@ def predict(model: Extended, library: Library, theta: np.ndarray, data: Data) ->
     effects, changes = library.filled(theta), changes_of(library, theta)
     measured = jnp.asarray(data.measured) if data.latent else None
     count = substeps(data.longest)
-    found = _predict(model, effects, Records.of(data), count, measured, changes)
-    found = found._replace(late=sum((e.pose_delay() for e in effects), np.zeros(6)))
+    found = _predict(model, effects, Records.of(data), count, measured, changes, data.reckoned)
+    late = sum((e.pose_delay() for e in effects), np.zeros(6))
+    if data.reckoned:
+        late[:3] = 0.0  # the position is an integral of what the twist shows
+    found = found._replace(late=late)
     if not data.unmeasured:
         return found
     found = found._replace(error=found.error * data.measured[None, :, None])

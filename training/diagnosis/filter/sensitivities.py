@@ -17,7 +17,7 @@ from ....models.effects.extended import Extended
 from ....models.effects.library import Library, kind
 from ....models.effects.recent import Recent
 from ..data.arrays import Data
-from .along_records import Records, settle
+from .along_records import Records, settle, with_position
 from .innovations import Predictions
 from .kalman import Filter
 from .varying import Modulated, at_sample, changes_of
@@ -45,6 +45,7 @@ def _whitened(
     lanes: int,
     instruments: bool,
     changes: tuple[Modulated, ...] = (),
+    reckoned: tuple[int, ...] = (),
 ) -> Float[Array, "L N12 R"]:
     """Whitened innovations of lane 0 (the base) and changes of them in the other lanes."""
     every = model.with_effects(effects)
@@ -67,7 +68,11 @@ def _whitened(
             away = jnp.sum(p.jacobian[:, :, None] * away[None], axis=1)
             x, v = se3.retract(p.X[:, None], away[:6]), p.V[:, None] + away[6:]
             recent = recent.after(p.latest)
-            direct = _apart(at_sample(every, changes, number + 1).observe(x, v, _wide(recent)))
+            seen = at_sample(every, changes, number + 1).observe(x, v, _wide(recent))
+            if reckoned:  # records are alike in all lanes at the start of the step
+                way = dt / 2 * se3.rotate(seen[0], seen[1][:3])
+                seen = with_position(seen[0], way, reckoned), seen[1]
+            direct = _apart(seen)
             if instead is not None:  # an accelerometer and its bias have these places
                 direct = direct * (1 - instead[0]).at[:3].set(0.0)[:, None, None]
             moved = kept
@@ -167,7 +172,8 @@ def whitened_sensitivities(
             by_lane = (theta + chunk).T[:, :, None]
             effects = _of_family(library.filled(by_lane), believed, instruments)
             arguments = predictions, records, filters, instead, size + 1, instruments
-            call = _threads().submit(run, model, effects, *arguments, changes_of(library, by_lane))
+            changes = changes_of(library, by_lane)
+            call = _threads().submit(run, model, effects, *arguments, changes, data.reckoned)
             running.append((some, call))
             if len(running) > AHEAD:
                 collect()

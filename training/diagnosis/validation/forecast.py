@@ -24,10 +24,15 @@ class Learned(Protocol):
 
 
 def states(
-    model: Extended, records: Records, every: int, count: int, rest: Learned | None = None
+    model: Extended,
+    records: Records,
+    every: int,
+    count: int,
+    rest: Learned | None = None,
+    reckoned: tuple[int, ...] = (),
 ) -> tuple[Float[Array, "N 7 R"], Float[Array, "N 6 R"]]:
     """`forecast` of arrays, in `count` substeps, to be compiled or differentiated."""
-    along = AlongRecords.of(model, count)
+    along = AlongRecords.of(model, count, reckoned=reckoned)
 
     def forecast_step(state: State, given: Step) -> tuple[State, tuple[Array, Array]]:
         state = along.restart(state, given.X, given.V, given.number % every == 0)
@@ -53,5 +58,6 @@ def forecast(
     Windows start at steps 0, `every`, 2 `every`, … from the record there; actuator states continue
     from window to window. `rest` is added to the model's acceleration.
     """
-    X, V = _states(model, Records.of(data), every, substeps(data.longest), rest)
+    given = every, substeps(data.longest), rest, data.reckoned
+    X, V = _states(model, Records.of(data), *given)
     return np.asarray(X), np.asarray(V)

@@ -84,7 +84,7 @@ def simulate(
         problem.model, used, contender.random_effects, Records.of(data, pieces), box,
         (jnp.asarray(levels[0]), jnp.asarray(levels[1]), jnp.asarray(levels[2])),
         jax.random.key(seed), every,
-        math.ceil(data.longest / _LONGEST - 1e-6), 1 + samples, changes,
+        math.ceil(data.longest / _LONGEST - 1e-6), 1 + samples, changes, data.reckoned,
     )  # fmt: skip
     return Simulated(np.asarray(e), pieces, every)
 
@@ -145,9 +145,10 @@ def _errors(
     count: int,
     lanes: int,
     changes: tuple[Modulated, ...] = (),
+    reckoned: tuple[int, ...] = (),
 ) -> Float[Array, "N 12 S R"]:
     """Recorded less simulated: lane 0 without noise, the others with it and that of the records."""
-    whole = AlongRecords.of(model.with_effects(effects), count, changes)
+    whole = AlongRecords.of(model.with_effects(effects), count, changes, reckoned)
     S, R, dtype = lanes, records.V.shape[2], records.V.dtype
     on = (jnp.arange(S)[None, :, None] > 0).astype(dtype)
     laws = model.with_effects(random_effects)

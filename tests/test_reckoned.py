@@ -64,7 +64,7 @@ def integrated(X, V):
 
 
 def test_a_reckoned_position_is_the_integral_of_what_is_recorded(commanded):
-    """Of velocities 5 % too large and turned, under an attitude that is off by up to ten degrees."""
+    """Velocities are 5 % too large and turned, attitudes off by up to ten degrees."""
     (X_true, V_true), (X, V) = (
         tuple(np.array(a) for a in part) for part in simulated(MODEL, commanded, ALL)
     )

@@ -57,9 +57,7 @@ def commanded():
 
 def integrated(X, V):
     """The way of recorded velocities and attitudes, by the trapezoidal rule (N, 3, R)."""
-    v_W = np.stack(
-        [rotations(X[:, :4, r].T).apply(V[:, :3, r]) for r in range(X.shape[2])], axis=2
-    )
+    v_W = np.stack([rotations(X[:, :4, r].T).apply(V[:, :3, r]) for r in range(X.shape[2])], axis=2)
     return np.cumsum((v_W[1:] + v_W[:-1]) / 2 * DT, axis=0)
 
 

@@ -250,8 +250,7 @@ def make_data(
     extra = sensors_of_latent(recording, latent) | spread
     data, lengths = recording.dataset, recording.lengths
     thrust, volts = recording.thrust(vehicle)
-    kept = _kept(lengths, without)
-    behind = max(1, round(remembered / recording.dt))
+    kept, behind = _kept(lengths, without), max(1, round(remembered / recording.dt))
     segment = min(segment, _longest_piece(kept, lengths))
     pieces: list[dict[str, np.ndarray]] = []
     scenario, run = [], []

@@ -66,16 +66,11 @@ def _whitened(
             # propagate the state differences that instrument effects imply, then observe them
             away = _apart(model.infer(X0[:, None], V0[:, None], _wide(recent)))
             away = jnp.sum(p.jacobian[:, :, None] * away[None], axis=1)
-            x, v = se3.retract(p.X[:, None], away[:6]), p.V[:, None] + away[6:]
+            ends = se3.retract(p.X[:, None], away[:6]), p.V[:, None] + away[6:]
             recent = recent.after(p.latest)
-            seen = at_sample(every, changes, number + 1).observe(x, v, _wide(recent))
-            if reckoned:  # records are alike in all lanes at the start of the step
-                way = dt / 2 * se3.rotate(seen[0], seen[1][:3])
-                seen = with_position(seen[0], way, reckoned), seen[1]
-            direct = _apart(seen)
+            direct = _shown(at_sample(every, changes, number + 1), ends, recent, dt, reckoned)
             if instead is not None:  # an accelerometer and its bias have these places
                 direct = direct * (1 - instead[0]).at[:3].set(0.0)[:, None, None]
-            moved = kept
         else:
             x, v = (a[:, None] for a in p.start)
             middle_V = (v + p.V[:, None]) / 2
@@ -84,7 +79,7 @@ def _whitened(
             memory, push = model.feel(memory, v, dt)
             a = model.drift(inertia, middle_X, middle_V, level[..., 0], volts[None, None], push)
             direct = dt / 2 * jnp.concatenate([jnp.zeros_like(a), a - a[:, :1]])
-            moved = kept - direct
+        moved = kept if instruments else kept - direct
         nu = jnp.sum(p.jacobian[:, :, None] * moved[None], axis=1) - direct
         nu = nu.at[:, 0].add(p.error)
         if instead is not None:
@@ -100,6 +95,20 @@ def _whitened(
     xs += (None if instead is None else instead[1], jnp.arange(len(u)))
     z = jax.lax.scan(body, (memory, zero, zero, first), xs)[1].astype(jnp.float32)
     return jnp.moveaxis(z, 2, 0).reshape(lanes, -1, z.shape[3])
+
+
+def _shown(
+    model: Extended,
+    ends: tuple[Array, Array],
+    recent: Recent,
+    dt: Array,
+    reckoned: tuple[int, ...],
+) -> Float[Array, "12 L R"]:
+    """Differences of what instruments show after a step before which the records are alike."""
+    X, V = model.observe(*ends, _wide(recent))
+    if reckoned:
+        X = with_position(X, dt / 2 * se3.rotate(X, V[:3]), reckoned)
+    return _apart((X, V))
 
 
 def _wide(recent: Recent) -> Recent:
@@ -134,9 +143,8 @@ def whitened_sensitivities(
     double precision, which poses need, all others one in single precision, `LANES` (or `FEW`) at a
     time. Up to `AHEAD` calls run in parallel.
     """
-    records, latent = Records.of(data), predictions.latent
+    records, latent, instead = Records.of(data), predictions.latent, None
     predictions = predictions._replace(late=None, latent=None)
-    instead = None
     if latent is not None:
         # latent velocities are those of the predictions
         own = np.array(data.latent)
@@ -172,8 +180,8 @@ def whitened_sensitivities(
             by_lane = (theta + chunk).T[:, :, None]
             effects = _of_family(library.filled(by_lane), believed, instruments)
             arguments = predictions, records, filters, instead, size + 1, instruments
-            changes = changes_of(library, by_lane)
-            call = _threads().submit(run, model, effects, *arguments, changes, data.reckoned)
+            more = changes_of(library, by_lane), data.reckoned
+            call = _threads().submit(run, model, effects, *arguments, *more)
             running.append((some, call))
             if len(running) > AHEAD:
                 collect()

@@ -111,3 +111,23 @@ def test_without_enough_samples_it_is_the_line(missing):
         v = velocities(signals)
         signals = replace(signals, velocity=replace(v, t=v.t[:4], x=v.x[:, :4]))
     np.testing.assert_allclose(velocity_at(signals, WANTED), lines(signals), atol=1e-12)
+
+
+def test_a_value_that_stands_still_is_kept():
+    """Of a lost stream: between two equal samples, which rounding makes too, motion goes on."""
+    signals = log(bias=(0.2, -0.1, 0.3))
+    v = velocities(signals)
+    x = v.x.copy()
+    lost = (v.t > 8) & (v.t < 11)
+    x[:2, lost] = 0.0
+    twice = int(np.searchsorted(v.t, 5.0))
+    x[2, twice + 1] = x[2, twice]
+    signals = replace(signals, velocity=replace(v, x=x))
+    found, straight = velocity_at(signals, WANTED), lines(signals)
+    here = (v.t[lost][0] <= WANTED) & (WANTED <= v.t[lost][-1])
+    assert np.all(found[:2, here] == 0)
+    around = (WANTED > 7) & ~here & (WANTED < 12)
+    assert np.abs(found[:2, around] - straight[:2, around]).max() > 0.02
+    assert np.abs(found[2, here] - straight[2, here]).max() > 0.02
+    pair = (v.t[twice] < WANTED) & (v.t[twice + 1] > WANTED)
+    assert np.all(found[2, pair] != straight[2, pair])

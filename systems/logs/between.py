@@ -8,18 +8,21 @@ like that of a heavier vehicle. With f the specific force and I the integral of 
 
 which keeps every sample; a bias of the accelerometer has no effect. Whether the accelerometer tells
 is asked of the samples: every second one must be nearer to this curve through the others than to
-their lines.
+their lines. A value that stands still is kept: its stream was lost, and the checks of the data are
+to see that.
 """
 
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ...models.recordings.resample import integral, linear, rotations, slerp
 from ..mavlink import codec
 from .signals import Series, Signals
 
+_HELD = 3
+"""Equal samples from which a value stands still; two are equal by rounding."""
 _PERIODS = 3.0
 """Periods of a stream beyond the wanted times that are looked at."""
 
@@ -69,7 +72,20 @@ def _along(
     long = np.concatenate([[0], np.cumsum(np.diff(derivative.t) > np.median(np.diff(slow.t)))])
     last = derivative.t.size - 1
     pauses = long[np.clip(after, 0, last)] - long[np.clip(before, 0, last)]
-    return np.where(inside & (pauses == 0), bent, linear(t, slow.t, slow.x))
+    follows = inside & (pauses == 0) & ~_held(slow.x)[:, i]
+    return np.where(follows, bent, linear(t, slow.t, slow.x))
+
+
+def _held(x: Float[np.ndarray, "c n"]) -> Bool[np.ndarray, "c m"]:
+    """Whether each of the m = n - 1 steps between samples is one of a value that stands still."""
+    same = np.diff(x, axis=1) == 0
+    long = np.ones_like(same[:, : max(same.shape[1] - _HELD + 2, 0)])
+    for k in range(_HELD - 1):
+        long &= same[:, k : k + long.shape[1]]
+    found = np.zeros_like(same)
+    for k in range(_HELD - 1):
+        found[:, k : k + long.shape[1]] |= long
+    return found
 
 
 def near(series: Series, t: Float[np.ndarray, " n"]) -> Series:

@@ -44,7 +44,14 @@ from .selection.refit_all import identify, with_coefficients
 from .selection.search import Search, refitted
 from .selection.state import Fits, Selection
 from .validation.blackbox import train
-from .validation.claims import LEFT, Judgement, asserted, clearly_better
+from .validation.claims import (
+    LEFT,
+    Judgement,
+    asserted,
+    better_in_part,
+    clearly_better,
+    names_of_horizons,
+)
 from .validation.simulation import Contender, Simulated
 from .validation.validation import Judged, judge, model_gain, white_part
 
@@ -371,6 +378,9 @@ def _diagnose(
     again = Diagnoser(recording, vehicle, base, replace(config, refit="all"), progress).run()
     progress(1.0, "done")
     second = again.diagnosis
-    if not clearly_better(again.asserted, found.asserted, config.seed):
+    models = again.asserted, found.asserted
+    parts = names_of_horizons(models[0], config.horizon, again.data.dt), config.seed
+    preferred = not second.left and better_in_part(*models, *parts)
+    if not (preferred or clearly_better(*models, config.seed)):
         return found
     return replace(again, diagnosis=replace(second, seconds=first.seconds + second.seconds))

@@ -178,6 +178,14 @@ def improves(
     return bool(mean < np.log(1 - PRACTICAL) / len(parts) and high < 0)
 
 
+def better_in_part(new: Judged, old: Judged, at: list[str], seed: int) -> bool:
+    """Whether a model saves a practical share of another one's error in a part, and loses none.
+
+    Of position, rotation and velocity at each horizon none may be worse by such a share.
+    """
+    return beaten_by(old, new, at, seed) is not None and beaten_by(new, old, at, seed) is None
+
+
 def clearly_better(new: Judged, old: Judged, seed: int) -> bool:
     """Whether a model saves a practical share of another one's forecast error, over all horizons.
 

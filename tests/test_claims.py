@@ -16,6 +16,7 @@ from spinndrift.training.diagnosis.findings.sentences import (
 )
 from spinndrift.training.diagnosis.validation.claims import (
     asserted,
+    better_in_part,
     clearly_better,
     explained,
     improves,
@@ -73,6 +74,17 @@ def test_the_share_that_is_explained_is_that_of_the_error():
     assert not clearly_better(models["base"], models["extended"], 0)
     assert not clearly_better(judged(0.95), judged(1.0), 0)
     assert clearly_better(judged(1.0), judged(np.inf), 0)
+
+
+def test_a_model_is_better_in_a_part_only_if_it_is_worse_in_none():
+    old = judged(1.0)
+    turned = np.array([[1.0, 1.0, 1.0], [1.0, 0.7, 1.0]])
+    assert better_in_part(judged(turned), old, AT, 0)
+    assert not clearly_better(judged(turned), old, 0)
+    assert not better_in_part(old, judged(turned), AT, 0)
+    assert not better_in_part(judged(0.97), old, AT, 0)
+    elsewhere = turned * np.array([[1.0, 1.0, 1.4], [1.0, 1.0, 1.0]])
+    assert not better_in_part(judged(elsewhere), old, AT, 0)
 
 
 def test_a_cause_forecasts_better_by_a_practical_share_of_one_part():

@@ -298,6 +298,8 @@ def test_the_command_flies_and_leaves_the_truth(tmp_path):
         process.wait()
     assert "FRAME_CONFIG 2, MOT_1_DIRECTION 1" in told
     assert "0.2 s simulated" in told
+    assert f"--defaults {out / 'vehicle.parm'}" in told
+    assert "FRAME_CONFIG 2\nMOT_1_DIRECTION 1\n" in (out / "vehicle.parm").read_text()
     data = Recording.load(out / "truth.nc").dataset
     pwm = data["pwm"].to_numpy()[0, 0]
     np.testing.assert_array_equal(pwm[0], [1500, 1500, 1600, 1600, 1500, 1500, 1500, 1500])

@@ -1,5 +1,7 @@
 """Logs with one thing wrong: what the import finds, and what it makes of it."""
 
+import lzma
+
 import numpy as np
 import pytest
 from log_writers import PARAMETERS, dataflash, dialect, dive, heartbeat, outputs, parameter
@@ -7,8 +9,10 @@ from recordings_changed import changed
 
 from helpers import ROOT, shared_data
 from spinndrift.models.config.errors import UserError
+from spinndrift.models.recordings.checks.examine import examine
 from spinndrift.models.recordings.checks.finding import findings_of
 from spinndrift.models.recordings.outputs import outputs_of
+from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.systems.logs.frame import settled
 from spinndrift.systems.logs.load import import_log
 
@@ -232,3 +236,38 @@ def test_the_motion_decides_whether_a_reversed_output_is_mirrored():
     kept, (finding,) = settled(recorded, (3,))
     assert "its PWM is mirrored" in finding.text
     assert kept.dataset["pwm"].equals(recorded.dataset["pwm"])
+
+
+def test_a_dvl_without_lock_is_told_beside_an_accelerometer(tmp_path):
+    """The estimate stands still at zero while the vehicle moves: its accelerometer must not fill it.
+
+    From a dive of a real autopilot with its position at 10 Hz, whose accelerometer foretells the
+    velocity elsewhere.
+    """
+    raw = lzma.decompress((ROOT / "sims/data/sitl_dive.tlog.xz").read_bytes())
+    out, at, number, place = bytearray(), 0, 0, None
+    while at + 8 < len(raw):
+        size = raw[at + 9] + 12
+        stamp, frame = raw[at : at + 8], raw[at + 8 : at + 8 + size]
+        at += 8 + size
+        if int.from_bytes(frame[7:10], "little") == dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
+            number += 1
+            if number % 5:
+                continue
+            if 1500 < number < 2000:
+                frame, place = stopped(frame, place)
+        out += stamp + frame
+    recording, _, _ = imported(tmp_path, bytes(out))
+    recording = examine(recording, load_vehicle(recording.vehicle), "dive.tlog", ())
+    (told,) = [f.place for f in findings_of(recording.dataset) if f.word == "velocity-held"]
+    assert told.endswith("u,v")
+
+
+def stopped(frame, place):
+    """A LOCAL_POSITION_NED that stands still at a place, by default its own; and that place."""
+    message = dialect.MAVLink(None).decode(bytearray(frame))
+    message.x, message.y = place = place or (message.x, message.y)
+    message.vx = message.vy = 0.0
+    sender = dialect.MAVLink(None, srcSystem=frame[5], srcComponent=frame[6])
+    sender.seq = frame[4]
+    return bytes(message.pack(sender)), place

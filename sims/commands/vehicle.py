@@ -35,8 +35,9 @@ class Vehicle:
     vehicle_server. With --backend ardupilot-json the plant is the physics of a real ArduSub, which
     is started with --model JSON:127.0.0.1 and sets the pace.
 
-    With --out a folder is written: scenario.yaml and truth.nc, a Recording of the true motion. Ends
-    after --duration or at Ctrl-C.
+    With --out a folder is written: scenario.yaml and truth.nc, a Recording of the true motion, and,
+    at the start, ArduSub's parameters for the vehicle, vehicle.parm. Ends after --duration or at
+    Ctrl-C.
     """
 
     EXAMPLES: ClassVar = (
@@ -112,6 +113,7 @@ class Vehicle:
         """Be the physics of a real ArduSub."""
         with interrupts_held():
             from ..vehicle.json_backend import ADDRESS, JsonBackend, open_physics
+            from ..vehicle.write import write_parameters
 
         if self.speed is not None:
             raise UserError(
@@ -128,8 +130,11 @@ class Vehicle:
         if own is not None:
             self._say("vehicle_server of the scenario is not used: ArduSub has its own settings")
         self._say(f"serving {_where(text, datagrams.port)}")
-        wanted = ", ".join(f"{k} {v:g}" for k, v in backend.physics.parameters().items())
-        self._say(f"its parameters for this vehicle: {wanted}")
+        wanted = backend.physics.parameters()
+        listed = ", ".join(f"{k} {v:g}" for k, v in wanted.items())
+        self._say(f"its parameters for this vehicle: {listed}")
+        if self.out is not None:
+            self._say(f"give them by --defaults {write_parameters(self.out, wanted)}")
         backend.run(stop, self.duration)
         self._say(backend.summary())
         return backend.truth

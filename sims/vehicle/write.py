@@ -1,5 +1,6 @@
 """The folder that a served vehicle leaves."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from ...models.config import typed_yaml
@@ -8,8 +9,17 @@ from ...models.files.owned import FolderKind
 from ..scenarios.scenario import Scenario
 from .truth import TruthLog
 
-VEHICLE = FolderKind("vehicle", ("scenario.yaml", "truth.nc"))
-"""What `spinndrift vehicle` writes."""
+PARAMETERS = "vehicle.parm"
+VEHICLE = FolderKind("vehicle", ("scenario.yaml", "truth.nc", PARAMETERS))
+"""What `spinndrift vehicle` writes; the parameters are for a real ArduSub."""
+
+
+def write_parameters(parameters: Mapping[str, float], folder: Path) -> Path:
+    """Write parameters as ArduSub's `--defaults` reads them, into a folder that is held."""
+    with atomic_files(folder) as partial:
+        lines = "".join(f"{name} {value:g}\n" for name, value in parameters.items())
+        (partial / PARAMETERS).write_text(lines, encoding="utf-8")
+    return folder / PARAMETERS
 
 
 def write_vehicle(truth: TruthLog, scenario: Scenario, folder: Path) -> None:

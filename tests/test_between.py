@@ -124,7 +124,7 @@ def test_a_value_that_stands_still_is_kept():
     x[2, twice + 1] = x[2, twice]
     signals = replace(signals, velocity=replace(v, x=x))
     found, straight = velocity_at(signals, WANTED), lines(signals)
-    here = (v.t[lost][0] <= WANTED) & (WANTED <= v.t[lost][-1])
+    here = (v.t[lost][0] <= WANTED) & (v.t[lost][-1] >= WANTED)
     assert np.all(found[:2, here] == 0)
     around = (WANTED > 7) & ~here & (WANTED < 12)
     assert np.abs(found[:2, around] - straight[:2, around]).max() > 0.02

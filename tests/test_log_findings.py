@@ -239,7 +239,7 @@ def test_the_motion_decides_whether_a_reversed_output_is_mirrored():
 
 
 def test_a_dvl_without_lock_is_told_beside_an_accelerometer(tmp_path):
-    """The estimate stands still at zero while the vehicle moves: its accelerometer must not fill it.
+    """The estimate stands still while the vehicle moves: its accelerometer must not fill it.
 
     From a dive of a real autopilot with its position at 10 Hz, whose accelerometer foretells the
     velocity elsewhere.

@@ -266,6 +266,7 @@ def test_a_dvl_without_lock_is_told_beside_an_accelerometer(tmp_path):
 def stopped(frame, place):
     """A LOCAL_POSITION_NED that stands still at a place, by default its own; and that place."""
     message = dialect.MAVLink(None).decode(bytearray(frame))
+    assert isinstance(message, dialect.MAVLink_local_position_ned_message)
     message.x, message.y = place = place or (message.x, message.y)
     message.vx = message.vy = 0.0
     sender = dialect.MAVLink(None, srcSystem=frame[5], srcComponent=frame[6])

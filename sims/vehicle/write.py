@@ -9,8 +9,8 @@ from ...models.files.owned import FolderKind
 from ..scenarios.scenario import Scenario
 from .truth import TruthLog
 
-PARAMETERS = "vehicle.parm"
-VEHICLE = FolderKind("vehicle", ("scenario.yaml", "truth.nc", PARAMETERS))
+_PARAMETERS = "vehicle.parm"
+VEHICLE = FolderKind("vehicle", ("scenario.yaml", "truth.nc", _PARAMETERS))
 """What `spinndrift vehicle` writes; the parameters are for a real ArduSub."""
 
 
@@ -18,8 +18,8 @@ def write_parameters(parameters: Mapping[str, float], folder: Path) -> Path:
     """Write parameters as ArduSub's `--defaults` reads them, into a folder that is held."""
     with atomic_files(folder) as partial:
         lines = "".join(f"{name} {value:g}\n" for name, value in parameters.items())
-        (partial / PARAMETERS).write_text(lines, encoding="utf-8")
-    return folder / PARAMETERS
+        (partial / _PARAMETERS).write_text(lines, encoding="utf-8")
+    return folder / _PARAMETERS
 
 
 def write_vehicle(truth: TruthLog, scenario: Scenario, folder: Path) -> None:

@@ -1,9 +1,12 @@
 """`check logs` and the last lines of an import: what comes out of files, and what commands take."""
 
+import subprocess
+import sys
+
 import pytest
 from log_writers import dive
 
-from helpers import ROOT
+from helpers import ROOT, shared_data
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.vehicles.vehicle import load_vehicle
@@ -67,3 +70,26 @@ def test_a_folder_of_logs_is_checked_and_written_down(tmp_path, capsys):
     with pytest.raises(SystemExit) as end:
         main(["check", "logs", str(tmp_path / "none")])
     assert end.value.code == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("reversed", "output-reversed (SERVO3_REVERSED of thruster 3)"),
+        ("frame_vectored", "4 stretches, 263 s, bluerov2 |"),
+        ("frame_bluerov1", "refused: FRAME_CONFIG 0"),
+        ("lost_lock", "velocity-held (01_MANUAL, 92.5 to 132.3 s, u,v)"),
+        ("no_voltage", "no-voltage (BATTERY_STATUS, SYS_STATUS)"),
+        ("unknown_voltage", "4 stretches, 263 s, bluerov2_heavy | – |"),
+        ("second_port", "3 stretches, 266 s, bluerov2_heavy | – |"),
+        ("copter", "refused: HEARTBEAT: the log is not ArduSub's: it is a quadrotor"),
+    ],
+)
+def test_a_log_with_one_thing_wrong_says_so(tmp_path, name, said):
+    """Copies of a dive of a real autopilot, changed as users have reported it."""
+    mutate = shared_data("data", "mutations", "mutate.py")
+    subprocess.run([sys.executable, str(mutate), str(tmp_path / "logs"), name], check=True)
+    page = tmp_path / "page.md"
+    main(["check", "logs", str(tmp_path / "logs"), "--docs", str(page)])
+    assert said in page.read_text(encoding="utf-8")

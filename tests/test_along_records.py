@@ -4,12 +4,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from resting import at_rest
 
 from spinndrift.models.effects import KINDS, Extended
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.diagnosis.filter.along_records import (
     AlongRecords,
-    Records,
     scan,
     settle,
     substeps,
@@ -31,12 +31,7 @@ def commanded():
     """Records of a vehicle at rest, and commands before and after."""
     n = VEHICLE.thrusters().inverse.shape[0]
     u = 10 * np.random.default_rng(0).standard_normal((PAST + STEPS, n, RUNS))
-    X = np.zeros((STEPS + 1, 7, RUNS))
-    X[:, 0], X[:, 6] = 1.0, -5.0
-    step = np.full((PAST + STEPS, 1), DT)
-    arrays = (X, np.zeros((STEPS + 1, 6, RUNS)), u[PAST:], np.ones((STEPS, RUNS)), step[PAST:],
-              u[:PAST], step[:PAST])  # fmt: skip
-    return Records(*(jnp.asarray(a) for a in arrays))
+    return at_rest(u, PAST, DT)
 
 
 @eqx.filter_jit

@@ -14,7 +14,7 @@ from spinndrift.models.recordings.csv import read_csv
 from spinndrift.models.sensors import Imu
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.systems.logs.load import load_data
-from spinndrift.training.diagnosis.filter.noise import OVER
+from spinndrift.training.diagnosis.data.reckoned import OVER
 from spinndrift.training.diagnosis.pipeline import Diagnoser, diagnose
 from spinndrift.training.diagnosis.selection.kinematic import borne_out, drifts
 from spinndrift.training.diagnosis.selection.state import Selection

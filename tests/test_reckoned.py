@@ -1,17 +1,16 @@
 """Positions that follow the recorded velocities: found in data, and the same for every model."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from resting import at_rest
 
 from spinndrift.models.effects import KINDS, Extended
 from spinndrift.models.recordings.resample import rotations
 from spinndrift.models.vehicles.vehicle import load_vehicle
-from spinndrift.training.diagnosis.data.reckoned import reckoned_axes
+from spinndrift.training.diagnosis.data.reckoned import dead_reckoned_axes
 from spinndrift.training.diagnosis.filter.along_records import (
     AlongRecords,
-    Records,
     scan,
     substeps,
 )
@@ -46,13 +45,7 @@ def commanded():
     n = VEHICLE.thrusters().inverse.shape[0]
     rng = np.random.default_rng(1)
     u = np.repeat(8 * rng.standard_normal((-(-(PAST + STEPS) // 20), n, RUNS)), 20, axis=0)
-    u = u[: PAST + STEPS]
-    X = np.zeros((STEPS + 1, 7, RUNS))
-    X[:, 0], X[:, 6] = 1.0, -5.0
-    step = np.full((PAST + STEPS, 1), DT)
-    arrays = (X, np.zeros((STEPS + 1, 6, RUNS)), u[PAST:], np.ones((STEPS, RUNS)), step[PAST:],
-              u[:PAST], step[:PAST])  # fmt: skip
-    return Records(*(jnp.asarray(a) for a in arrays))
+    return at_rest(u[: PAST + STEPS], PAST, DT)
 
 
 def integrated(X, V):
@@ -114,4 +107,4 @@ def test_it_is_found_whether_positions_follow_velocities(
     commanded, effects, reckoned, noise, axes, found
 ):
     model = MODEL.with_effects(effects)
-    assert reckoned_axes(*recorded(model, commanded, reckoned, noise, axes)) == found
+    assert dead_reckoned_axes(*recorded(model, commanded, reckoned, noise, axes)) == found

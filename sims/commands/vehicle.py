@@ -134,7 +134,7 @@ class Vehicle:
         listed = ", ".join(f"{k} {v:g}" for k, v in wanted.items())
         self._say(f"its parameters for this vehicle: {listed}")
         if self.out is not None:
-            self._say(f"give them by --defaults {write_parameters(wanted, self.out)}")
+            self._say(f"start ArduSub with --defaults {write_parameters(wanted, self.out)}")
         backend.run(stop, self.duration)
         self._say(backend.summary())
         return backend.truth

@@ -21,8 +21,6 @@ from ...models.recordings.resample import integral, linear, rotations, slerp
 from ..mavlink import codec
 from .signals import Series, Signals
 
-_HELD = 3
-"""Equal samples from which a value stands still; two are equal by rounding."""
 _PERIODS = 3.0
 """Periods of a stream beyond the wanted times that are looked at."""
 
@@ -77,15 +75,13 @@ def _along(
 
 
 def _held(x: Float[np.ndarray, "c n"]) -> Bool[np.ndarray, "c m"]:
-    """Whether each of the m = n - 1 steps between samples is one of a value that stands still."""
+    """Whether each of the m = n - 1 steps lies between two of three equal samples or more.
+
+    Two are equal by rounding too.
+    """
     same = np.diff(x, axis=1) == 0
-    long = np.ones_like(same[:, : max(same.shape[1] - _HELD + 2, 0)])
-    for k in range(_HELD - 1):
-        long &= same[:, k : k + long.shape[1]]
-    found = np.zeros_like(same)
-    for k in range(_HELD - 1):
-        found[:, k : k + long.shape[1]] |= long
-    return found
+    around = np.pad(same, ((0, 0), (1, 1)))
+    return same & (around[:, :-2] | around[:, 2:])
 
 
 def near(series: Series, t: Float[np.ndarray, " n"]) -> Series:

@@ -378,9 +378,9 @@ def _diagnose(
     again = Diagnoser(recording, vehicle, base, replace(config, refit="all"), progress).run()
     progress(1.0, "done")
     second = again.diagnosis
-    models = again.asserted, found.asserted
-    parts = names_of_horizons(models[0], config.horizon, again.data.dt), config.seed
-    preferred = not second.left and better_in_part(*models, *parts)
-    if not (preferred or clearly_better(*models, config.seed)):
+    models, seed = (again.asserted, found.asserted), config.seed
+    horizons = names_of_horizons(models[0], config.horizon, again.data.dt)
+    unopposed = not second.left and better_in_part(*models, horizons, seed)
+    if not (unopposed or clearly_better(*models, seed)):
         return found
     return replace(again, diagnosis=replace(second, seconds=first.seconds + second.seconds))

@@ -17,7 +17,7 @@ from ....models.se3 import AXES, TWIST, XYZ
 from ....models.vehicles.vehicle import Vehicle
 from .lost import known_errors, with_lost_zero
 from .readings import sensors_of_latent
-from .reckoned import reckoned_axes
+from .reckoned import dead_reckoned_axes
 
 SEGMENT = 256
 """Longest piece (samples) that a run is cut into; pieces are filtered side by side."""
@@ -281,7 +281,7 @@ def make_data(
         command=recording.thrust_from,
         has_voltage="voltage" in data and bool(np.isfinite(data["voltage"].to_numpy()).any()),
         unmeasured=unmeasured,
-        reckoned=reckoned_axes(arrays["X"], arrays["V"], arrays["step"], weight),
+        reckoned=dead_reckoned_axes(arrays["X"], arrays["V"], arrays["step"], weight),
         started=_started(recording, kept, run),
         labels=run_labels(recording, kept),
         zones=zones,

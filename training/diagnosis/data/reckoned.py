@@ -11,23 +11,27 @@ from jaxtyping import Float
 
 from ....models.recordings.resample import rotations
 
-_OVER = 4.0  # s, over which drifts are measured
-_INDEPENDENT, _ROUNDED = -0.15, 1e-4
-"""Correlation of neighbouring differences between position and velocity below which the position
-has independent errors (−0.5 for them alone), and their size (m), below which it may be rounding."""
+INDEPENDENT = -0.15
+"""Correlation of neighbouring kinematic errors below which a pose has independent errors (−0.5 for
+them alone)."""
+OVER = 4.0
+"""Time (s) over which slip of poses against twists is measured: an estimator's errors last for
+seconds."""
+_ROUNDED = 1e-4
+"""Size (m) of independent errors below which they may be rounding."""
 _FOLLOWS, _EXPLAINED = 0.1, 0.5
 """Drift of a position that follows the velocity, as a share of the way at most, and the share of it
 that errors of DVL and heading may explain."""
 
 
-def reckoned_axes(
+def dead_reckoned_axes(
     X: Float[np.ndarray, "M 7 R"],
     V: Float[np.ndarray, "M 6 R"],
     step: Float[np.ndarray, "N R"],
     weight: Float[np.ndarray, "N R"],
 ) -> tuple[int, ...]:
     """Axes of W (0 to 2) along which the position is an integral of the recorded velocity."""
-    length = max(1, round(_OVER * weight.sum() / max(float((step * weight).sum()), 1e-9)))
+    length = max(1, round(OVER * weight.sum() / max(float((step * weight).sum()), 1e-9)))
     square, product = np.zeros(3), np.zeros(3)
     drifts, patterns, ways = [], [], []
     for r in range(X.shape[2]):
@@ -39,7 +43,7 @@ def reckoned_axes(
         drifts.append(_sums(off, ends))
         patterns.append(_sums(rates, ends))
         ways.append(np.diff(X[ends, 4:, r], axis=0))
-    alone = (product < _INDEPENDENT * square) & (square > _ROUNDED**2 * weight.sum())
+    alone = (product < INDEPENDENT * square) & (square > _ROUNDED**2 * weight.sum())
     axes = np.flatnonzero(~alone)
     if not len(axes):
         return ()

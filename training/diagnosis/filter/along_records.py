@@ -87,14 +87,14 @@ class Step(NamedTuple):
 class State(NamedTuple):
     """State of a model: actuators, pose, twist, its history, random states of effects.
 
-    `astray` is what a dead-reckoned position has beyond the true one (m, in W).
+    `position_error` is that of a dead-reckoned position (m, in W).
     """
 
     memory: Memory
     X: Float[Array, "7 *b"]
     V: Float[Array, "6 *b"]
     recent: Recent
-    astray: Float[Array, "3 *b"]
+    position_error: Float[Array, "3 *b"]
     random: Random = ()
 
 
@@ -154,9 +154,9 @@ class AlongRecords(eqx.Module):
         X_true, V_true = self.model.infer(X, V, state.recent)
         fresh = X_true, V_true, X[4:] - X_true[4:]
         if when is not None:
-            old = state.X, state.V, state.astray
+            old = state.X, state.V, state.position_error
             fresh = tuple(jnp.where(when, a, b) for a, b in zip(fresh, old, strict=True))
-        return state._replace(X=fresh[0], V=fresh[1], astray=fresh[2])
+        return state._replace(X=fresh[0], V=fresh[1], position_error=fresh[2])
 
     def step(self, state: State, given: Step, push: Float[Array, "6 *b"] | None = None) -> State:
         """After a recorded step, under a wrench `push` in addition."""
@@ -168,17 +168,17 @@ class AlongRecords(eqx.Module):
         end = state._replace(memory=memory, X=X, V=V, recent=recent)
         if not self.reckoned:
             return end
-        gained = given.length / 2 * (self._misread(state) + self._misread(end))
-        return end._replace(astray=state.astray + gained)
+        gained = given.length / 2 * (self._velocity_error(state) + self._velocity_error(end))
+        return end._replace(position_error=state.position_error + gained)
 
     def observe(self, state: State) -> tuple[Float[Array, "7 *b"], Float[Array, "6 *b"]]:
         """Pose and twist as they are recorded, without noise."""
         X, V = self.model.observe(state.X, state.V, state.recent)
         if not self.reckoned:
             return X, V
-        return with_position(X, state.X[4:] + state.astray, self.reckoned), V
+        return with_position(X, state.X[4:] + state.position_error, self.reckoned), V
 
-    def _misread(self, state: State) -> Float[Array, "3 *b"]:
+    def _velocity_error(self, state: State) -> Float[Array, "3 *b"]:
         """Recorded velocity in W by the recorded attitude, less the true one (m/s)."""
         X, V = self.model.observe(state.X, state.V, state.recent)
         return se3.rotate(X, V[:3]) - se3.rotate(state.X, state.V[:3])

@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Bool, Float
 
+from ..data.reckoned import INDEPENDENT, OVER
 from .likely_noise import likely_beside_lost, most_likely
 from .transition import Transition
 
@@ -27,11 +28,6 @@ _SMOOTH, _SMOOTH_OF_ALL, _NEAR, _ALIKE = 4, 8, 3.0, 0.1
 `_SMOOTH_OF_ALL` of pose and twist have errors within `_NEAR` times `FLOOR`, if neighbouring
 one-step errors of these axes correlate by more than `_ALIKE`. Those of exact states, and of states
 with dominant white noise, do not."""
-_INDEPENDENT = -0.15
-"""Correlation of neighbouring kinematic errors below which a pose has independent errors (−0.5 for
-them alone), and does not slip."""
-OVER = 4.0
-"""Time (s) over which slip is measured: an estimator's errors last for seconds."""
 _DRIFTS = 3e-4
 """Slip of an attitude (rad/√s) above which the poses are an estimator's. Exact states have a tenth
 of it, by the integration of their rates; the angle random walk of a gyro is 1e-4 at most."""
@@ -256,7 +252,7 @@ def slip_of(
     """
     k = (error[:, :6] - dt / 2 * error[:, 6:]) * weight[:, None]
     square = np.maximum((k**2).sum(axis=(0, 2)), 1e-300)
-    independent = (k[1:] * k[:-1]).sum(axis=(0, 2)) < _INDEPENDENT * square
+    independent = (k[1:] * k[:-1]).sum(axis=(0, 2)) < INDEPENDENT * square
     length = max(1, min(round(OVER / dt), len(k)))
     whole = len(k) // length * length
     sums = k[:whole].reshape(-1, length, *k.shape[1:]).sum(axis=1)

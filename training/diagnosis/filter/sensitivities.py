@@ -104,7 +104,7 @@ def _shown(
     dt: Array,
     reckoned: tuple[int, ...],
 ) -> Float[Array, "12 L R"]:
-    """Differences of what instruments show after a step before which the records are alike."""
+    """Differences between lanes in what is recorded after a step from the same record."""
     X, V = model.observe(*ends, _wide(recent))
     if reckoned:
         X = with_position(X, dt / 2 * se3.rotate(X, V[:3]), reckoned)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from ....models.effects.attitude import GyroBias
 from ....models.sensors import Imu
 from ..data.arrays import Data
-from ..filter.noise import OVER
+from ..data.reckoned import OVER
 from .state import Fits, Selection
 
 _ACCOUNTED = 0.5

@@ -1,5 +1,7 @@
 """Fossen's model of a submerged vehicle: constant coefficients under the Euler–Poincaré drift."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -86,6 +88,24 @@ class FossenDynamics(Dynamics):
         self.diffusion = jnp.asarray(b, dtype)
         self.weight = jnp.asarray(weight, dtype)
         self.buoyancy = jnp.asarray(buoyancy, dtype)
+
+    def with_constants(self, **changed: Any) -> "FossenDynamics":
+        """The same model with some of the constructor's arguments replaced."""
+        rigid = np.asarray(self.rigid_inertia, float)
+        own = {
+            "rigid_inertia": rigid,
+            "added_mass": np.asarray(self.mass.matrix(), float) - rigid,
+            "linear_drag": np.asarray(self.linear_drag.matrix(), float),
+            "quadratic_drag": np.asarray(self.quadratic_drag.matrix(), float),
+            "weight": float(self.weight),
+            "buoyancy": float(self.buoyancy),
+            "p_BoBcm_B": np.asarray(self.p_BoBcm_B, float),
+            "p_BoCb_B": np.asarray(self.p_BoCb_B, float),
+            "displaced_mass": float(self.displaced_mass),
+            "diffusion": np.asarray(self.diffusion, float),
+            "dtype": self.rigid_inertia.dtype,
+        }
+        return FossenDynamics(**(own | changed))
 
     def coefficients(self, V_WB_B: Float[Array, "6 *#batch"]) -> Coefficients:
         return Coefficients(self.mass, self.linear_drag, self.quadratic_drag, self.diffusion)

@@ -14,6 +14,7 @@ from ..training.data.provenance import recording_fingerprint
 from ..training.diagnosis import pipeline
 from ..training.diagnosis.findings.result import Diagnosis
 from ..training.diagnosis.findings.stored import read_diagnosis
+from ..training.smoothing.complete import not_completed_by
 from .diagnosis_folder import DIAGNOSIS, write_diagnosis
 from .learning import Start, split_recording
 
@@ -67,9 +68,9 @@ def diagnosed(
         about = {"source": str(source), "dt": recording.dt, "diagnosed": key}
         named = recording.vehicle or vehicle.name
         write_diagnosis(out, finding, part, source.name, {"vehicle": named, **about})
-    why = _why_not(diagnosis, recording)
-    start = None if why else Start(Start.read(out / _MODEL)[0].model, name="extended")
-    return Diagnosed(diagnosis, start, why, kept)
+    start = Start(Start.read(out / _MODEL)[0].model, name="extended")
+    why = _why_not(diagnosis, recording, start)
+    return Diagnosed(diagnosis, None if why else start, why, kept)
 
 
 def _stored(out: Path, key: str) -> Diagnosis | None:
@@ -81,13 +82,13 @@ def _stored(out: Path, key: str) -> Diagnosis | None:
         return None
 
 
-def _why_not(diagnosis: Diagnosis, recording: Recording) -> str:
+def _why_not(diagnosis: Diagnosis, recording: Recording, start: Start) -> str:
     """Why nothing is learned on top of the extended model; empty if it is."""
     if diagnosis.verdict == "adequate":
         return "The diagnosis finds the preset adequate, so it is itself what training starts from."
     if diagnosis.verdict not in _CLAIMS:
         return "The diagnosis can name nothing that makes the preset right."
-    if recording.missing:
+    if recording.missing and (why := not_completed_by(start.model)):
         lacking = ", ".join(name for names in recording.missing.values() for name in names)
-        return f"A model with effects is not trained on recordings that lack channels ({lacking})."
+        return f"The recording lacks {lacking}. The extended model can't infer them: {why}."
     return ""

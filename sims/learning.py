@@ -21,20 +21,20 @@ from ..models.spinn import Spinn
 from ..models.vehicles.places import named_in
 from ..models.vehicles.vehicle import Vehicle
 from ..training.config import TrainingConfig, WindowConfig
-from ..training.data.windows import Normalisation, Windows, make_windows
+from ..training.data.windows import Windows, make_windows, windowing
 from ..training.evaluation.evaluate import Evaluation, evaluate
 from ..training.fitting.calibrate import calibrated
 from ..training.fitting.fit import TrainingResult, fit
 from ..training.fitting.hidden_start import HiddenStart
 from ..training.fitting.run_folder import TRAINING
 from ..training.fitting.start import begun_with, estimate_diffusion, starting_model, with_diffusion
-from ..training.smoothing.complete import Completed
+from ..training.smoothing.complete import Completed, not_completed_by
 from ..training.smoothing.fitted import Told, completed_as_it_is
+from ..training.smoothing.levels import Levels
 
 FINE_SUBSTEPS = 5
 """Steps per sample for models without a trained step of their own, such as presets."""
 _VALIDATION = 0.15
-_REMEMBERED = 10.0  # s of commands and motion before a window, at most
 Progress = Callable[[float, str], None]
 _DRIFT = 0.2  # approximate share of the time for the initial fit of the drift alone
 
@@ -88,13 +88,6 @@ class Start:
         if named := metadata.get("vehicle"):
             metadata = {**metadata, "vehicle": named_in(named, path.parent)}
         return cls(model, int(metadata.get("substeps", FINE_SUBSTEPS))), metadata
-
-
-def windowing(model: Dynamics | None, normalise: Normalisation) -> dict[str, Any]:
-    """Arguments of `make_windows` for a model; effects depend on world pose and thrusters."""
-    if not isinstance(model, Extended):
-        return {"normalise": normalise}
-    return {"normalise": "none", "remembered": min(model.memory_duration, _REMEMBERED)}
 
 
 def split_parts(
@@ -182,23 +175,20 @@ def prepared(
     """Preset and learned model with their substeps, and the windows on which each is judged.
 
     Raises:
-        UserError: no run is as long as a window, or a model with effects lacks channels.
+        UserError: no run is as long as a window, or the model can't complete the recording.
     """
     models: dict[str, tuple[Dynamics, int]] = {
         "preset": (vehicle.dynamics(), FINE_SUBSTEPS),
         "learned": (start.model, start.substeps),
     }
-    if recording.missing and isinstance(start.model, Extended):
-        raise UserError(
-            "model: one with effects is judged on recordings with all channels; give one without"
-        )
+    if recording.missing and (why := not_completed_by(start.model)):
+        raise UserError(f"model: {why}")
     shared, windows = None, {}
     for name, (model, substeps) in models.items():
         completed = None
         if recording.missing:
             completed = completed_as_it_is(recording, vehicle, model)
-            if isinstance(model, FossenDynamics) and not bool(jnp.any(model.diffusion > 0)):
-                model = with_diffusion(model, completed.levels.diffusion)
+            model = _with_levels(model, completed.levels)
         if shared is None or completed is not None:
             shared = make_windows(
                 recording,
@@ -213,6 +203,16 @@ def prepared(
     return models, windows
 
 
+def _with_levels(model: Dynamics, levels: Levels) -> Dynamics:
+    """The model with these levels of noise as its b, if it is a Fossen model without one."""
+    return with_diffusion(model, levels.diffusion) if _without_noise(model) else model
+
+
+def _without_noise(model: Dynamics) -> bool:
+    own = core(model)
+    return isinstance(own, FossenDynamics) and not bool(jnp.any(own.diffusion > 0))
+
+
 def judged(model: Dynamics, windows: Windows) -> Dynamics:
     """The model prepared for evaluation on windows: in their precision, at their step, with a b.
 
@@ -222,8 +222,7 @@ def judged(model: Dynamics, windows: Windows) -> Dynamics:
     model = cast(model, dtype)
     if isinstance(model, Extended):
         model = model.for_steps_of(windows.dt)
-    own = core(model)
-    if not isinstance(own, FossenDynamics) or bool(jnp.any(own.diffusion > 0)):
+    if not _without_noise(model):
         return model
     return with_diffusion(model, estimate_diffusion(model, windows))
 
@@ -248,24 +247,24 @@ def learn(
     `preset.spinn`. With `resume` a run with a checkpoint resumes from `start.spinn` and checkpoint.
 
     Raises:
-        UserError: the data don't suffice; the sentence says what is missing. Or `out` holds files
-            that this package did not write.
+        UserError: the data don't suffice, or `out` holds files that this package did not write.
     """
     given = None if start is None else start.model
     config = begun_with(config, given)
-    hidden, fitted = None, None
+    hidden = None
     if recording.missing:
         progress(0.0, "estimating what was not recorded")
         hidden = HiddenStart.of(recording, vehicle, config, given)
-        fitted = hidden.fitted.model
+        given = hidden.model
+        start = Start(given, name="fitted") if hidden.told else start
     parts = split_parts(recording, vehicle, config.windows, given, hidden and hidden.completed)
     claim(out, TRAINING)
     kept = out / "start.spinn"
     if resume and kept.exists() and (out / "checkpoint.npz").exists():
         model, _ = load_model(kept)
     else:
-        own = _drift_first(progress), given, parts.validation, fitted
-        model = starting_model(config, vehicle, parts.learn, *own)
+        rest = _drift_first(progress), given, parts.validation, hidden is not None
+        model = starting_model(config, vehicle, parts.learn, *rest)
         save_model(kept, model)
     preset = judged(vehicle.dynamics() if hidden is None else hidden.preset, parts.learn)
     metadata = _metadata(recording, vehicle, config)
@@ -299,7 +298,8 @@ def _learned(
 ) -> Learned:
     """The models, calibrated, and evaluated on the held-out windows."""
     if start is not None:  # between the preset and what was learned
-        own = {start.name: (judged(start.model, parts.learn), start.substeps)}
+        model = start.model if hidden is None else _with_levels(start.model, hidden.levels)
+        own = {start.name: (judged(model, parts.learn), start.substeps)}
         models = {"preset": models["preset"], **own, "learned": models["learned"]}
     models = _calibrated(models, parts, hidden)
     if _is_better(start, models, parts.validation):
@@ -307,7 +307,7 @@ def _learned(
         result = replace(result, best_step=0)
     model, substeps = models["learned"]
     evaluation, parts = _held_out(models, parts, hidden)
-    told = () if hidden is None else hidden.fitted.told
+    told = () if hidden is None else hidden.told
     result = replace(result, model=model)
     return Learned(model, models["preset"][0], parts, result, evaluation, substeps, told)
 

@@ -9,10 +9,12 @@ import pytest
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects.drag import LinearDrag
 from spinndrift.models.effects.extended import Extended
+from spinndrift.models.effects.unknown import Unknown
 from spinndrift.models.recordings.store import Recording, Trajectory
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims import demo_diagnosis
-from spinndrift.sims.demo_diagnosis import diagnosed
+from spinndrift.sims.demo_diagnosis import _why_not, diagnosed
+from spinndrift.sims.learning import Start
 from spinndrift.sims.reports import diagnosis_report
 from spinndrift.sims.reports.pages import Page
 from spinndrift.training.config import WindowConfig
@@ -121,11 +123,23 @@ def test_refused_data_leave_no_diagnosis_of_others_behind(tmp_path, stand_in):
     assert not (tmp_path / "diagnosis" / "diagnosis.json").exists()
 
 
-def test_a_model_with_effects_needs_all_channels(tmp_path, stand_in):
-    stand_in(told())
-    recording = recorded()
+def without_surge(recording):
     V = recording.dataset["V_WB_B"].copy()
     V[..., 0] = np.nan
-    found = run(tmp_path, Recording(recording.dataset.assign(V_WB_B=V)))
-    assert found.start is None
-    assert "lack channels (u)" in found.why
+    return Recording(recording.dataset.assign(V_WB_B=V))
+
+
+def test_training_goes_on_from_an_extended_model_without_all_channels(tmp_path, stand_in):
+    stand_in(told())
+    found = run(tmp_path, without_surge(recorded()))
+    assert found.start is not None
+    assert found.why == ""
+
+
+def test_an_extended_model_that_remembers_the_motion_needs_all_channels():
+    vehicle = load_vehicle("bluerov2_heavy")
+    memory = Unknown.neutral(kind="memory", acts_on="yaw", numbers=(1.0, 0.5, 5.0))
+    model = Extended.create(vehicle.dynamics(), (memory,), vehicle.thrusters())
+    why = _why_not(told(), without_surge(recorded()), Start(model))
+    assert "lacks u" in why
+    assert "remembers the motion" in why

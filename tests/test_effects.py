@@ -12,13 +12,14 @@ from helpers import ROOT
 from spinndrift.models import disturbances, se3
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects import KINDS, Extended, Library
+from spinndrift.models.effects.base import Effect
 from spinndrift.models.effects.deterministic_step import advance
 from spinndrift.models.effects.drag import COUPLINGS
 from spinndrift.models.effects.following import FOLLOWERS, ramped, taken_up
 from spinndrift.models.effects.library import COEFFICIENTS
 from spinndrift.models.effects.page import effects_page
 from spinndrift.models.effects.recent import Recent
-from spinndrift.models.effects.thrust import REFERENCE
+from spinndrift.models.effects.thrust import REFERENCE, ThrustCurve
 from spinndrift.models.effects.unknown import Unknown
 from spinndrift.models.files.checkpoint import load_model, save_model
 from spinndrift.models.integrate import rollout
@@ -657,3 +658,25 @@ def test_the_page_of_effects_is_that_of_their_classes():
     page = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
     assert page == effects_page(), "write docs/effects.md anew from effects_page()"
     assert all(f"| `{name}` |" in page for name in KINDS)
+
+
+def test_effects_that_are_constants_of_a_fossen_model_move_it_alike_in_its_constants():
+    vehicle = load_vehicle("bluerov2_heavy")
+    rng = np.random.default_rng(0)
+    kinds = [
+        c for c in (KINDS | COEFFICIENTS).values() if c.in_constants is not Effect.in_constants
+    ]
+    assert {c.name for c in kinds} >= {"added_mass", "linear_drag", "quadratic_drag"}
+    effects = []
+    for cls in [*kinds, ThrustCurve]:
+        effect = cls.neutral(thrusters=8)
+        sizes = np.resize([p.probes[0] for p in cls.parameters], effect.values.shape)
+        values = jnp.asarray(abs(sizes) * rng.uniform(0.5, 2, sizes.shape))
+        effects.append(dataclasses.replace(effect, values=values))
+    model = Extended.create(vehicle.dynamics(), tuple(effects), vehicle.thrusters())
+    other = model.with_constants_in_base()
+    assert [e.name for e in other.effects] == ["thrust_curve"]
+    X = se3.exp(jnp.asarray(rng.normal(0, 0.5, 6)))
+    V, level = jnp.asarray(rng.normal(0, 0.5, 6)), jnp.asarray(rng.normal(0, 10, 8))
+    own, found = (m.drift(m.inertia(), X, V, level, jnp.ones(1)) for m in (model, other))
+    np.testing.assert_allclose(found, own, rtol=1e-9)

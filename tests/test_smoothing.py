@@ -8,6 +8,10 @@ import pytest
 
 from spinndrift.models import se3
 from spinndrift.models.config.errors import UserError
+from spinndrift.models.effects.extended import Extended
+from spinndrift.models.effects.load import Payload
+from spinndrift.models.effects.thrust import ThrustCurve
+from spinndrift.models.effects.water import CurrentSteady
 from spinndrift.models.recordings.build import Trajectory
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.vehicles.vehicle import load_vehicle
@@ -16,7 +20,6 @@ from spinndrift.training.data.windows import make_windows
 from spinndrift.training.evaluation.evaluate import evaluate
 from spinndrift.training.losses.base import Batch
 from spinndrift.training.smoothing.complete import complete
-from spinndrift.training.smoothing.fitted import with_scales
 from spinndrift.training.smoothing.levels import Belief
 from spinndrift.training.smoothing.states import Scaled
 
@@ -113,14 +116,45 @@ def test_what_was_recorded_is_kept():
         np.testing.assert_array_equal(kept, before)
 
 
-def test_scales_of_the_smoother_are_those_of_the_fitted_model():
+def with_effects(model):
+    """The model with a payload, a current and a thrust curve of its own."""
+    effects = (
+        Payload.of(mass=1.0, weight=4.0, moment_x=0.3, moment_y=0.1, height=0.2),
+        CurrentSteady.of(east=0.2, north=-0.1),
+        ThrustCurve.of(exponent=0.2, gain=-0.1),
+    )
+    return Extended.create(model, effects, load_vehicle("bluerov2_heavy").thrusters())
+
+
+@pytest.mark.parametrize("made", [lambda model: model, with_effects])
+def test_scales_of_the_smoother_are_those_of_a_model_with_other_constants(made):
     model = load_vehicle("bluerov2_heavy").dynamics()
     rng = np.random.default_rng(0)
     scales = rng.normal(0, 0.3, 22)
+    mass, linear, quadratic = np.exp(scales[:18].reshape(3, 6))
+    M, D, Df = (np.diag(np.asarray(o.matrix())) for o in model.coefficients(jnp.zeros(6))[:3])
+    lift = scales[18] * 0.01 * 9.80665 * float(model.displaced_mass)
+    buoyancy = float(model.buoyancy) + lift
+    weighed = np.asarray(model.p_BoBcm_B * model.weight)
+    lever = np.asarray(model.p_BoCb_B * model.buoyancy) - weighed
+    lever = lever + scales[19:] * np.linalg.norm(lever[1:])
+    other = model.with_constants(
+        added_mass=np.diag(mass * M) - np.asarray(model.rigid_inertia),
+        linear_drag=np.diag(linear * D),
+        quadratic_drag=np.diag(quadratic * Df),
+        buoyancy=buoyancy,
+        p_BoCb_B=(lever + weighed) / buoyancy,
+    )
     X = se3.exp(jnp.asarray(rng.normal(0, 0.5, 6)))
-    V, F = jnp.asarray(rng.normal(0, 0.5, 6)), jnp.asarray(rng.normal(0, 10, 6))
-    expected = with_scales(model, scales, np.ones(6)).acceleration(X, V, F)
-    found = Scaled.of(model).acceleration(X, V, F, jnp.asarray(scales))
+    V, level = jnp.asarray(rng.normal(0, 0.5, 6)), jnp.asarray(rng.normal(0, 10, 8))
+    own, other = made(model), made(other)
+    drive = level[:6]
+    if isinstance(own, Extended):
+        drive = jnp.append(level, 1.0)
+        expected = other.drift(other.inertia(), X, V, level, jnp.ones(1))
+    else:
+        expected = other.acceleration(X, V, drive)
+    found = Scaled.of(own).acceleration(X, V, drive, jnp.asarray(scales))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 

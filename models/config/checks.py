@@ -5,7 +5,7 @@ import sys
 from dataclasses import dataclass
 from typing import Annotated, Any, get_args, get_origin
 
-import jax
+import jax.numpy as jnp
 
 from .errors import FieldError, UserError
 
@@ -92,7 +92,7 @@ def require_double(who: str, before: str) -> None:
     Raises:
         ValueError: if JAX runs in single precision.
     """
-    if not jax.config.read("jax_enable_x64"):
+    if jnp.zeros(()).dtype != jnp.float64:
         raise ValueError(
             f"{who} in double precision: call "
             f'jax.config.update("jax_enable_x64", True) before {before}'

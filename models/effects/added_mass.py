@@ -47,6 +47,12 @@ class AddedMass(Effect):
         eye = jnp.eye(6, dtype=self.values.dtype)
         return eye.reshape((6, 6) + (1,) * (self.values.ndim - 1)) * self.values[None]
 
+    def in_constants(self, base: FossenDynamics, plant: Plant) -> FossenDynamics:
+        del plant
+        added = np.asarray(base.mass.matrix() - base.rigid_inertia, float)
+        change = np.diag(np.asarray(self.values, float))
+        return base.with_constants(added_mass=added + change)
+
 
 class AddedMassCoupling(Effect):
     """Off-diagonal added mass M_ij = M_ji (kg·m), or `munk`: (1 + κ) times the Munk moment.

@@ -11,9 +11,8 @@ has, register it in `library`, and override the hooks of a simulation where it a
     → `together` (wrench of all thrusters) → `wrench` + `inertia` + `flow` (body and water)
     → `diffusion`, `advance` (noise laws) → `measure` (sensors; `unmeasure` is its inverse)
 
-Arrays are component first as in `models.se3`. `values` may carry batch axes of their own that
-broadcast against the state's (one column per hypothesis), so that one compiled program runs every
-hypothesis. A parameter of zero means absent; `neutral` values change nothing.
+Arrays are component first as in `models.se3`. `values` may have batch axes that broadcast against
+the state's (a column per hypothesis): one compiled program runs all. Neutral values change nothing.
 """
 
 import dataclasses
@@ -29,6 +28,7 @@ from jaxtyping import Array, Float
 
 from ..config.errors import UserError
 from ..networks import expand
+from ..rigid_body import FossenDynamics
 from ..thrusters import MOST
 from .recent import Recent
 from .traits import Traits
@@ -267,6 +267,10 @@ class Effect(eqx.Module, Traits):
     def flow(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "3 *#batch"]:
         """Velocity of the water in W (m/s), steady and uniform around the vehicle."""
         return jnp.zeros_like(X_WB[4:])
+
+    def in_constants(self, base: FossenDynamics, plant: Plant) -> FossenDynamics | None:
+        """`base` with this effect in its constants; None if it is more than that."""
+        return None
 
     # ------------------------------------------------------------------------- noise laws
 

@@ -3,11 +3,13 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..dynamics import Dynamics
 from ..rigid_body import FossenDynamics
 from ..se3 import AXES
+from ..spd import Operator
 from .base import Effect, Parameter, Plant, axes_only
 
 COUPLINGS = (
@@ -35,6 +37,10 @@ def _believed(base: Dynamics, axis: str) -> tuple[float, float]:
     return float(base.linear_drag.dense[i, i]), float(base.quadratic_drag.dense[i, i])
 
 
+def _added(drag: Operator, change: Array) -> Float[np.ndarray, "6 6"]:
+    return np.asarray(drag.matrix(), float) + np.diag(np.asarray(change, float))
+
+
 class LinearDrag(Effect):
     """F_i = -Δd_i ξ_i on one axis (N·s/m, N·m·s)."""
 
@@ -59,6 +65,10 @@ class LinearDrag(Effect):
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
     ) -> Float[Array, "6 *#batch"]:
         return -self.column(V_CB_B) * V_CB_B
+
+    def in_constants(self, base: FossenDynamics, plant: Plant) -> FossenDynamics:
+        del plant
+        return base.with_constants(linear_drag=_added(base.linear_drag, self.values))
 
 
 class QuadraticDrag(Effect):
@@ -85,6 +95,10 @@ class QuadraticDrag(Effect):
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
     ) -> Float[Array, "6 *#batch"]:
         return -self.column(V_CB_B) * jnp.abs(V_CB_B) * V_CB_B
+
+    def in_constants(self, base: FossenDynamics, plant: Plant) -> FossenDynamics:
+        del plant
+        return base.with_constants(quadratic_drag=_added(base.quadratic_drag, self.values))
 
 
 class DragAsymmetry(Effect):

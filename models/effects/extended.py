@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from .. import se3
 from ..dynamics import Dynamics, Memory
+from ..rigid_body import FossenDynamics
 from ..thrusters import Thrusters
 from .base import Effect
 from .deterministic_step import advance
@@ -58,6 +59,21 @@ class Extended(EffectsOnMotion):
     def with_base(self, base: Dynamics) -> "Extended":
         """The same effects and thrusters on another base."""
         return dataclasses.replace(self, base=base)
+
+    def with_constants_in_base(self) -> "Extended":
+        """The same motion by a Fossen base with other constants and by the effects that are more.
+
+        Effects that refer to the base's mass or drag (the Munk moment, proximity) refer to the
+        changed ones then.
+        """
+        base, rest = self.base, []
+        if not isinstance(base, FossenDynamics):
+            return self
+        for effect in self.effects:
+            found = effect.in_constants(base, self.plant)
+            base = base if found is None else found
+            rest += [effect] if found is None else []
+        return self.with_base(base).with_effects(tuple(rest))
 
     def trainable(self) -> "Extended":
         """The same tree with True at the base's trainable leaves; effects are not trained."""

@@ -3,6 +3,7 @@
 from typing import ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .. import se3
@@ -44,6 +45,13 @@ class NetBuoyancy(Effect):
         at_Bo, at_Cb = (self.part(i, V_CB_B)[None] * up for i in range(2))
         r = plant.p_BoCb_B.reshape(3, *(1,) * (at_Cb.ndim - 1))
         return force_only(at_Bo + at_Cb) + _hung(r, at_Cb)
+
+    def in_constants(self, base: FossenDynamics, plant: Plant) -> FossenDynamics:
+        at_Bo, at_Cb = np.asarray(self.values, float)
+        moment = np.asarray(base.p_BoCb_B, float) * float(base.buoyancy)
+        moment = moment + np.asarray(plant.p_BoCb_B, float) * at_Cb
+        buoyancy = float(base.buoyancy) + at_Bo + at_Cb
+        return base.with_constants(buoyancy=buoyancy, p_BoCb_B=moment / buoyancy)
 
 
 class CentreOfGravity(Effect):
@@ -89,6 +97,10 @@ class CentreOfBuoyancy(Effect):
         self, X_WB: Float[Array, "7 *#batch"], V_CB_B: Float[Array, "6 *#batch"], plant: Plant
     ) -> Float[Array, "6 *#batch"]:
         return _hung(self.column(V_CB_B), plant.weight * up_in_body(X_WB))
+
+    def in_constants(self, base: FossenDynamics, plant: Plant) -> FossenDynamics:
+        shift = np.asarray(self.values, float) * float(plant.weight) / float(base.buoyancy)
+        return base.with_constants(p_BoCb_B=np.asarray(base.p_BoCb_B, float) + shift)
 
 
 class Payload(Effect):

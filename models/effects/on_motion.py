@@ -80,14 +80,14 @@ class EffectsOnMotion(Dynamics):
             level = self.thrust(jnp.tensordot(self.inverse, F_Bo_B, 1), V_WB_B)
             F_Bo_B = self.allocate(level)
         F_Bo_B = self.together(F_Bo_B)
-        V_own, turning = self._through_water(X_WB, V_WB_B)
+        V_own, turning = self.through_water(X_WB, V_WB_B)
         own = None if coefficients is None else coefficients._replace(mass=self._base_mass(V_own))
         mass, wrench = self.base.balance(X_WB, V_own, F_Bo_B, flow, own)
         V_CB = V_own
         if flow is not None:
             v_c = se3.rotate_inverse(X_WB, flow.v_WC_W)
             V_CB = V_own - jnp.concatenate([v_c, jnp.zeros_like(v_c)])
-        extra = self._extra_inertia()
+        extra = self.extra_inertia()
         wrench = wrench + self.extra_wrench(X_WB, V_CB, extra)
         mass = self._mass(mass, extra)
         if turning is not None:
@@ -109,7 +109,8 @@ class EffectsOnMotion(Dynamics):
     def _any(self, hook: str) -> bool:
         return any(effect.acts(hook) for effect in self.effects)
 
-    def _extra_inertia(self) -> Array | None:
+    def extra_inertia(self) -> Float[Array, "6 6 *batch"] | None:
+        """What effects add to the mass matrix (kg, kg·m, kg·m²); None without such effects."""
         if not self._any("inertia"):
             return None
         plant = self.plant
@@ -120,7 +121,7 @@ class EffectsOnMotion(Dynamics):
         return self.base.mass_and_diffusion(V)[0]
 
     def _mass(self, mass: Spd, extra: Array | None = None) -> Spd:
-        extra = self._extra_inertia() if extra is None else extra
+        extra = self.extra_inertia() if extra is None else extra
         return mass if extra is None else ConstantSpd(mass.matrix() + extra)
 
     def scaled_diffusion(
@@ -142,7 +143,7 @@ class EffectsOnMotion(Dynamics):
         mass = self._base_mass(jnp.zeros(6, self.positions.dtype))
         if not isinstance(mass, ConstantSpd):
             raise ValueError("effects with batches of values need a base of constant mass")
-        extra = self._extra_inertia()
+        extra = self.extra_inertia()
         if extra is None:
             return Inertia(mass.dense, mass.inverse)
         M, _ = se3.align(mass.dense, extra)
@@ -164,7 +165,9 @@ class EffectsOnMotion(Dynamics):
                 F_Bo_B = effect.together(F_Bo_B)
         return F_Bo_B
 
-    def _through_water(self, X: Array, V: Array) -> tuple[Array, Array | None]:
+    def through_water(
+        self, X: Float[Array, "7 *#batch"], V: Float[Array, "6 *#batch"]
+    ) -> tuple[Float[Array, "6 *#batch"], Float[Array, "6 *#batch"] | None]:
         """Velocity relative to the effects' steady flow, and that flow's rate in B as B rotates.
 
         For a uniform steady flow the equations hold unchanged in the relative velocity (Fossen
@@ -218,11 +221,11 @@ class EffectsOnMotion(Dynamics):
         push: Float[Array, "6 *#batch"] | None = None,
     ) -> Float[Array, "6 *#batch"]:
         """dV/dt under thruster forces (memory effects applied) and a random wrench `push`."""
-        V_r, turning = self._through_water(X_WB, V_WB_B)
+        V_r, turning = self.through_water(X_WB, V_WB_B)
         F = self.push(level, X_WB, V_WB_B, voltage)
         F = F if push is None else F + push
         _, wrench = self.base.balance(X_WB, V_r, F)
-        wrench = wrench + self.extra_wrench(X_WB, V_r, self._extra_inertia())
+        wrench = wrench + self.extra_wrench(X_WB, V_r, self.extra_inertia())
         acceleration = times(inertia.inverse, wrench)
         return acceleration if turning is None else acceleration + turning
 
@@ -234,5 +237,5 @@ class EffectsOnMotion(Dynamics):
         voltage: Float[Array, "1 *#batch"] | None = None,
     ) -> Float[Array, "6 *#batch"]:
         """The thrusters' wrench on the body, from forces with memory effects applied."""
-        V_r, _ = self._through_water(X_WB, V_WB_B)
+        V_r, _ = self.through_water(X_WB, V_WB_B)
         return self.together(self.allocate(self.thrust(level, V_r, voltage)))

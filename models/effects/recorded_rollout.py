@@ -86,6 +86,19 @@ def simulate_recorded(
     return jax.lax.scan(jax.checkpoint(advance), start, xs)[1]
 
 
+def actuated(
+    model: Extended, commands: Commands, dt: float, substeps: int
+) -> Float[Array, "T n *batch S"]:
+    """Thruster forces (N) with lag and delay: means over the substeps of each step of `dt` s.
+
+    `model` must come from `for_steps_of(dt)`.
+    """
+    commands = jax.tree.map(jnp.asarray, commands)
+    memory = _after(model, model.remember(commands.before[0]), commands, dt)
+    level = jnp.asarray(commands.level)
+    return jax.lax.scan(lambda m, u: model.actuate(m, u, dt, substeps), memory, level)[1]
+
+
 def _after(model: Extended, memory: Any, commands: Commands, dt: float) -> Any:
     """Memories after the steps before the window."""
     if not memory:

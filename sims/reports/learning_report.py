@@ -67,7 +67,8 @@ def add_training(page: Page, learned: Learned) -> Page:
     rows = coefficient_rows(core(learned.preset), core(learned.model))
     told = scale_words(rows)
     if isinstance(learned.model, Extended):
-        told = "Of the SPINN alone, whose reference is the preset: the diagnosed effects act on it."
+        acting = ", ".join(dict.fromkeys(e.name for e in learned.model.effects)) or "none"
+        told = f"Of the model without its effects ({acting}), which act beside it."
     page.table(
         rows,
         ("axis", "M preset", "M learned", "D preset", "D learned", "D^f preset", "D^f learned",
@@ -91,11 +92,12 @@ def _add_told(page: Page, learned: Learned) -> None:
             for t in learned.told
         ],
         ("coefficient", "known from", "change", "deviation before", "deviation given the data"),
-        "Coefficients of a constant model, with velocities and positions that were not recorded "
-        "integrated out. Of masses and drags the logarithm is shown (0.1 is about 10 %), of the "
-        "net buoyancy percent of the displacement, of the righting lever the relative change. "
-        "Where the data have less information than the preset, the preset stays. A common scale "
-        "of mass, drag and thrust is the preset's in any case.",
+        "Coefficients fitted together before training, with velocities and positions that were "
+        "not recorded inferred; deviations are given the thrust. Of masses and drags the "
+        "logarithm is shown (0.1 is about 10 %), of the net buoyancy percent of the displacement, "
+        "of the righting lever the relative change. Where the data have less information than the "
+        "preset, the preset stays. Motion does not tell a common scale of mass, drag and thrust: "
+        "it is that of the rigid body's mass.",
     )
 
 

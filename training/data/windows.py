@@ -14,11 +14,14 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial.transform import Rotation
 
 from ...models.config.errors import UserError
+from ...models.dynamics import Dynamics
+from ...models.effects.extended import Extended
 from ...models.effects.recorded_rollout import Commands
 from ...models.recordings.store import Recording
 from ..smoothing.complete import Completed
 
 Normalisation = Literal["heading", "identity", "none"]
+_REMEMBERED = 10.0  # s of commands and motion before a window, at most
 
 
 class Hidden(NamedTuple):
@@ -237,6 +240,13 @@ def make_windows(
         commands=None if remembered is None else commanded(remembered),
         hidden=hidden,
     )
+
+
+def windowing(model: Dynamics | None, normalise: Normalisation) -> dict[str, Any]:
+    """Arguments of `make_windows` for a model; effects depend on world pose and thrusters."""
+    if not isinstance(model, Extended):
+        return {"normalise": normalise}
+    return {"normalise": "none", "remembered": min(model.memory_duration, _REMEMBERED)}
 
 
 def _labels(recording: Recording, places: Sequence[tuple[int, int, int]]) -> dict[str, np.ndarray]:

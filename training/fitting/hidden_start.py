@@ -1,36 +1,50 @@
 """The start of training on a recording that lacks channels of the state."""
 
+import logging
 from dataclasses import dataclass
 
 from ...models.config.errors import UserError
 from ...models.dynamics import Dynamics
-from ...models.effects.extended import Extended
+from ...models.effects.extended import Extended, core
+from ...models.integrate import cast
 from ...models.recordings.store import Recording
 from ...models.rigid_body import FossenDynamics
 from ...models.spinn import Spinn
 from ...models.vehicles.vehicle import Vehicle
 from ..config import TrainingConfig
-from ..data.windows import Windows, make_windows
-from ..smoothing.complete import Completed, complete
-from ..smoothing.fitted import Fitted, completed_as_it_is, fit_hidden
+from ..data.windows import Windows, make_windows, windowing
+from ..diagnosis.coefficients import fit_coefficients
+from ..smoothing.complete import Completed, complete, not_completed_by
+from ..smoothing.fitted import Told, completed_as_it_is, told_by
+from ..smoothing.levels import Belief, Levels
+from .start import with_diffusion
+
+_log = logging.getLogger(__name__)
+_ROUNDS = 4
+"""Gauss-Newton steps where levels of noise are known already."""
 
 
 @dataclass(frozen=True)
 class HiddenStart:
-    """Constants fitted with the hidden states integrated out, and completions of all parts.
+    """A model that states are inferred with, and completions of all parts.
 
     Attributes:
-        vehicle: whose preset is the start.
+        vehicle: whose preset the learned model is compared with.
         config: settings of training.
         last: what is held out.
-        fitted: the fitted model.
+        model: the preset (or a given Fossen model) with all coefficients fitted, or the given model
+            with effects or SPINN; with the noise that the data have under it.
+        levels: of that noise.
+        told: what the data tell of each coefficient, if they were fitted.
         preset: the preset with the diffusion that the data have under it.
     """
 
     vehicle: Vehicle
     config: TrainingConfig
     last: Recording
-    fitted: Fitted
+    model: Dynamics
+    levels: Levels
+    told: tuple[Told, ...]
     preset: FossenDynamics
 
     @classmethod
@@ -48,24 +62,31 @@ class HiddenStart:
                 f"recording: {lacking} was not recorded, and this method needs pose and twist; "
                 "choose one on the group (fdm-geodesic+mse), or record with a DVL"
             )
-        if isinstance(given, Extended | Spinn):
-            raise UserError(
-                f"recording: {lacking} was not recorded, and training then starts from a preset "
-                "or a Fossen model; leave out --model, or record with a DVL"
-            )
+        if given is not None and (why := not_completed_by(given)):
+            raise UserError(f"recording: {lacking} was not recorded. --model: {why}")
         w = config.windows
         rest, last = recording.split(w.held_out, w.by, w.gap_s)
-        reference = vehicle.dynamics() if given is None else given
-        assert isinstance(reference, FossenDynamics)
-        as_it_is = completed_as_it_is(rest, vehicle, vehicle.dynamics())
-        preset = vehicle.dynamics(as_it_is.levels.diffusion)
-        return cls(vehicle, config, last, fit_hidden(rest, vehicle, reference), preset)
+        noise = completed_as_it_is(rest, vehicle, vehicle.dynamics()).levels
+        preset = vehicle.dynamics(noise.diffusion)
+        if given is None or isinstance(given, FossenDynamics):
+            model, fitted = _fitted(rest, vehicle, given), True
+        else:
+            model, fitted = given, False
+        levels = completed_as_it_is(rest, vehicle, model).levels
+        told = told_by(rest, vehicle, model, vehicle.dynamics(), levels) if fitted else ()
+        if not isinstance(core(model), Spinn):
+            model = with_diffusion(model, levels.diffusion)
+        return cls(vehicle, config, last, model, levels, told, preset)
 
     def completed(self, part: Recording) -> Completed:
-        """A part completed with the fitted model."""
-        f = self.fitted
+        """A part completed with the model."""
         return complete(
-            part, self.vehicle, f.model, belief=f.belief, levels=f.levels, rounds=_ROUNDS
+            part,
+            self.vehicle,
+            self.model,
+            belief=Belief.exact(),
+            levels=self.levels,
+            rounds=_ROUNDS,
         )
 
     def held_out(self, model: Dynamics) -> Windows:
@@ -76,10 +97,16 @@ class HiddenStart:
             self.vehicle,
             length_s=w.length_s,
             stride_s=w.length_s,
-            normalise=w.normalise,
             completed=completed_as_it_is(self.last, self.vehicle, model),
+            **windowing(self.model, w.normalise),
         )
 
 
-_ROUNDS = 4
-"""Gauss-Newton steps where coefficients and levels of noise are known already."""
+def _fitted(recording: Recording, vehicle: Vehicle, base: Dynamics | None) -> Extended:
+    """`base`, or the preset, with all coefficients fitted; without enough data as it is."""
+    own = vehicle.dynamics() if base is None else base
+    try:
+        return cast(fit_coefficients(recording, vehicle, own), own.rigid_inertia.dtype)
+    except UserError as error:
+        _log.warning(f"coefficients stay as they were: {error}")
+    return Extended.create(own, (), vehicle.thrusters())

@@ -118,15 +118,15 @@ def starting_model(
     progress: Progress | None = None,
     given: Dynamics | None = None,
     validation: Windows | None = None,
-    fitted_to_hidden: FossenDynamics | None = None,
+    inferred: bool = False,
 ) -> Dynamics:
     """A SPINN at the vehicle's preset, its drift fitted to short pieces, b to the residuals.
 
     A `given` Fossen model replaces the preset. Its effects are kept, with a SPINN as their base;
     the windows then need commands (`make_windows`). A learned model is returned as it is. A given
     model may already be as good as the data allow: the fit of the drift is kept only if it predicts
-    `validation` windows better. A model `fitted_to_hidden` states (`training.smoothing`) is neither
-    fitted again, nor is its b: the windows do not have all of the state.
+    `validation` windows better. If the windows have states `inferred` with the given model
+    (`HiddenStart`), neither it nor its b is fitted again.
 
     A function of its arguments alone, so that a resumed run starts from the same bits.
     """
@@ -135,8 +135,6 @@ def starting_model(
         given = given.for_steps_of(windows.dt)
     given = None if given is None else cast(given, dtype)
     reference = vehicle.dynamics(dtype=dtype) if given is None else core(given)
-    if fitted_to_hidden is not None:
-        reference = cast(fitted_to_hidden, dtype)
     if given is not None and isinstance(reference, Spinn):
         return given
     if not isinstance(reference, FossenDynamics):
@@ -146,11 +144,13 @@ def starting_model(
     spinn = pretrain(spinn, reference, config.pretrain, pretrain_key)[0]
     if given is not None and config.model.coordinates == "group" and config.pretrain.steps:
         spinn = fit_potential(spinn, reference, config.pretrain, pretrain_key)
-    if fitted_to_hidden is not None:
-        b = np.asarray(fitted_to_hidden.diffusion, float)
-        return with_diffusion(spinn, b) if config.model.stochastic else spinn
-    substeps = config.objective.substeps
     effects = given if isinstance(given, Extended) else None
+    if inferred:
+        assert given is not None
+        model = spinn if effects is None else effects.with_base(spinn)
+        b = diffusion_scale(given)
+        return with_diffusion(model, b) if config.model.stochastic else model
+    substeps = config.objective.substeps
     # effects may have memory, which a fit to one-step innovations does not model
     fitted = None if effects else fit_innovations(config.drift, spinn, windows, substeps)
     spinn = spinn if fitted is None else fitted.apply(spinn)

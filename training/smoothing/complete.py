@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from ...models.config.errors import UserError
 from ...models.dynamics import Dynamics
+from ...models.effects.extended import Extended
 from ...models.integrate import cast
 from ...models.recordings.resample import rotations
 from ...models.recordings.store import Recording
@@ -99,13 +100,15 @@ def complete(
         recording: with attitude; what it has of positions, twist, `vertical_velocity`,
             `pressure_depth` and `imu_specific_force` is used.
         vehicle: as in `Recording.wrench`.
-        model: a Fossen model or a SPINN.
+        model: a Fossen model or a SPINN, or either with effects. Laws of the disturbance among
+            these are left out, as the levels of noise tell it, and so are errors of instruments.
         belief: how well the model and the accelerometer are known; by default as a preset is.
         levels: of all noise to start from; with `rounds` 1 to stay at.
         rounds: Gauss-Newton steps, between which levels are estimated.
 
     Raises:
-        UserError: the samples have times of their own, or the commands need a vehicle.
+        UserError: the samples have times of their own, the commands need a vehicle, or an effect
+            of the model remembers the motion.
 
     Example:
         >>> vehicle = load_vehicle("bluerov2_heavy")
@@ -117,8 +120,22 @@ def complete(
         raise UserError(
             "recording: its samples stand at times of their own; read the CSV files with resampling"
         )
+    if why := not_completed_by(model):
+        raise UserError(f"model: {why}")
     with jax.enable_x64(True):
         return _Completion.of(recording, vehicle, model, belief, levels).go(rounds)
+
+
+def not_completed_by(model: Dynamics) -> str:
+    """Why a model can't complete recordings, a clause; empty if it can."""
+    effects = model.effects if isinstance(model, Extended) else ()
+    remembering = sorted({e.name for e in effects if e.acts("feel")})
+    if not remembering:
+        return ""
+    return (
+        f"its effect {', '.join(remembering)} remembers the motion, which needs pose and twist "
+        "recorded; leave it out"
+    )
 
 
 @dataclass
@@ -146,14 +163,15 @@ class _Completion:
         belief: Belief | None,
         levels: Levels | None,
     ) -> "_Completion":
-        model = cast(model, jnp.float64)
-        track, places, X, V, observed = track_of(recording, vehicle)
+        model, dt = cast(model, jnp.float64), recording.dt
+        model = model.for_steps_of(dt) if isinstance(model, Extended) else model
+        substeps = max(1, math.ceil(dt / _STEP - 1e-6))
+        track, places, X, V, observed = track_of(recording, vehicle, model, substeps)
         if levels is None:
             unit = np.diag(np.asarray(model.coefficients(jnp.zeros(6)).mass.matrix()))
             levels = Levels(0.3 * unit, 0.05 * unit, _FIRST)
         belief = Belief.of_preset() if belief is None else belief
         scaled = Scaled.of(model)
-        substeps = max(1, math.ceil(recording.dt / _STEP - 1e-6))
         return cls(recording, scaled, belief, levels, substeps, track, places, X, V, observed)
 
     def go(self, rounds: int) -> Completed:

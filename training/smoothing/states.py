@@ -18,7 +18,9 @@ from jaxtyping import Array, Bool, Float
 
 from ...models import se3
 from ...models.dynamics import Dynamics
+from ...models.effects.extended import Extended, core
 from ...models.rigid_body import GRAVITY
+from ...models.spd import Spd
 
 POSE, TWIST = slice(0, 6), slice(6, 12)
 BIAS, LEVER, PUSH, SCALES = slice(12, 15), slice(15, 18), slice(18, 24), slice(24, 46)
@@ -55,14 +57,16 @@ class Track(NamedTuple):
     """Runs side by side, padded to one length.
 
     Attributes:
-        F: wrench from n to n + 1; the last one acts on.
+        F: what drives the model in the substeps (S of them, or one for all) from n to n + 1: the
+            wrench, or with effects the thrusters' forces and the relative voltage; the last one
+            acts on.
         seen: measured values, poses' rotations as quaternions apart.
         q: measured attitudes.
         known: which of them were measured.
         lasts: whether sample n + 1 exists.
     """
 
-    F: Float[Array, "R N 6"]
+    F: Float[Array, "R N S k"]
     seen: Float[Array, "R N 16"]
     q: Float[Array, "R N 4"]
     known: Bool[Array, "R N 16"]
@@ -87,22 +91,30 @@ class Scaled(NamedTuple):
         return cls(model, jnp.maximum(moment, 0.01 * weight), weight)
 
     def acceleration(
-        self, X: Float[Array, "7"], V: Float[Array, "6"], F: Float[Array, "6"], scales: Array
+        self, X: Float[Array, "7"], V: Float[Array, "6"], F: Float[Array, " k"], scales: Array
     ) -> Float[Array, "6"]:
         """The drift of the twist."""
-        c = self.model.coefficients(V)
+        V_r, turning, extra, pushed = V, None, None, F
+        if isinstance(self.model, Extended):
+            V_r, turning = self.model.through_water(X, V)
+            extra = self.model.extra_inertia()
+            pushed = self.model.push(F[:-1], X, V, F[-1:])
+            pushed = pushed + self.model.extra_wrench(X, V_r, extra)
+        c = core(self.model).coefficients(V_r)
         m, d, f = (jnp.exp(scales[part] / 2) for part in (MASS, LINEAR, QUADRATIC))
         up_B = se3.rotate_inverse(X, jnp.asarray([0.0, 0.0, 1.0], V.dtype))
-        wrench = se3.coad_apply(V, m * c.mass.matvec(m * V)) + F
-        wrench = wrench - d * c.linear_drag.matvec(d * V)
-        wrench = wrench - f * c.quadratic_drag.matvec(f * jnp.abs(V) * V)
+        wrench = se3.coad_apply(V_r, m * c.mass.matvec(m * V_r)) + pushed
+        wrench = wrench - d * c.linear_drag.matvec(d * V_r)
+        wrench = wrench - f * c.quadratic_drag.matvec(f * jnp.abs(V_r) * V_r)
         wrench = wrench + self.model.potential_wrench(X)
         force = self.weight * scales[BUOYANCY] * up_B
         moment = se3.cross(self.righting * scales[RIGHTING], up_B)
-        return c.mass.solve((wrench + jnp.concatenate([force, moment])) / m) / m
+        wrench = wrench + jnp.concatenate([force, moment])
+        a = _solved(c.mass, m, extra, wrench)
+        return a if turning is None else a + turning
 
     def advance(
-        self, state: State, F: Float[Array, "6"], dt: Any, substeps: int
+        self, state: State, F: Float[Array, "S k"], dt: Any, substeps: int
     ) -> tuple[Float[Array, "7"], Float[Array, "6"]]:
         """Pose and twist a step of `dt` (s) later, without noise, by the midpoint rule.
 
@@ -110,14 +122,14 @@ class Scaled(NamedTuple):
         """
         X, V, h = state.X, state.V, dt / substeps
 
-        def step(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        def step(carry: tuple[Array, Array], F: Array) -> tuple[tuple[Array, Array], None]:
             X, V = carry
             middle = V + h / 2 * self._pushed(X, V, F, state)
             halfway = self.model.displace(X, V * (h / 2))
             after = self.model.displace(X, middle * h)
             return (after, V + h * self._pushed(halfway, middle, F, state)), None
 
-        return jax.lax.scan(step, (X, V), None, length=substeps)[0]
+        return jax.lax.scan(step, (X, V), jnp.broadcast_to(F, (substeps, F.shape[1])))[0]
 
     def _pushed(self, X: Array, V: Array, F: Array, state: State) -> Array:
         """The drift of the twist under a wrench and the push.
@@ -127,8 +139,8 @@ class Scaled(NamedTuple):
         own = self.model.mass_and_diffusion(V)[0].solve(_other(state, PUSH))
         return self.acceleration(X, V, F, _other(state, SCALES)) + own
 
-    def measured(self, state: State, F: Float[Array, "6"]) -> Float[Array, "13"]:
-        """Position, twist, climb and specific force of a state under a wrench."""
+    def measured(self, state: State, F: Float[Array, " k"]) -> Float[Array, "13"]:
+        """Position, twist, climb and specific force of a state."""
         X, V = state.X, state.V
         a = self._pushed(X, V, F, state)
         omega, r = V[3:], _other(state, LEVER)
@@ -137,6 +149,13 @@ class Scaled(NamedTuple):
         f = f + se3.rotate_inverse(X, jnp.asarray([0.0, 0.0, GRAVITY], V.dtype))
         climb = se3.rotate(X, V[:3])[2:]
         return jnp.concatenate([X[4:], V, climb, f])
+
+
+def _solved(mass: Spd, m: Array, extra: Array | None, wrench: Array) -> Array:
+    """The acceleration of a wrench under a scaled mass and an extra one."""
+    if extra is None:
+        return mass.solve(wrench / m) / m
+    return jnp.linalg.solve(mass.matrix() * jnp.outer(m, m) + extra, wrench)
 
 
 def _other(state: State, part: slice) -> Array:
@@ -189,7 +208,8 @@ def linearised(model: Scaled, reference: State, track: Track, dt: Any, substeps:
 
     after = jax.tree.map(lambda a: jnp.concatenate([a[:, 1:], a[:, -1:]], axis=1), reference)
     # at a sample the wrench changes: what an instrument of finite bandwidth shows is between
-    here = (track.F + jnp.concatenate([track.F[:, :1], track.F[:, :-1]], axis=1)) / 2
+    first, last = track.F[:, :, 0], track.F[:, :, -1]
+    here = (first + jnp.concatenate([first[:, :1], last[:, :-1]], axis=1)) / 2
     given = (reference, after, track.F, here, track.seen, track.q)
     A, c, H, y = jax.vmap(jax.vmap(one))(*given)
     lasts, known = track.lasts[..., None], track.known

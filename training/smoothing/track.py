@@ -2,21 +2,26 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
+from ...models.dynamics import Dynamics
+from ...models.effects.extended import Extended
+from ...models.effects.recorded_rollout import Commands, actuated
 from ...models.recordings.store import Recording
 from .states import Track
 
 
 def track_of(
-    recording: Recording, vehicle: Any
+    recording: Recording, vehicle: Any, model: Dynamics, substeps: int
 ) -> tuple[Track, list[tuple[int, int]], np.ndarray, np.ndarray, np.ndarray]:
     """Measurements of all runs, where they stand, and what of pose and twist was recorded."""
     data, lengths = recording.dataset, recording.lengths
     places = [(int(j), int(k)) for j, k in np.argwhere(lengths > 0)]
     N = _padded(int(lengths.max()))
-    wrench = recording.wrench(vehicle).to_numpy()
+    driving = _driving(recording, vehicle, model, substeps)
 
     def of(name: str, size: int) -> np.ndarray:
         """A variable, each run's last sample repeated; NaN where there is none."""
@@ -40,13 +45,29 @@ def track_of(
     known[..., 8] &= ~derived
     seen = np.where(known, seen, 0.0)
     lasts = np.concatenate([inside[:, 1:], np.zeros((len(places), 1), bool)], axis=1)
-    F = np.stack([wrench[j, k, np.minimum(np.arange(N), lengths[j, k] - 1)] for j, k in places])
+    F = np.stack([driving[j, k, np.minimum(np.arange(N), lengths[j, k] - 1)] for j, k in places])
     own = np.all(np.isfinite(np.concatenate([X[..., 4:], V], axis=-1)), axis=1)
     own[:, 5] &= ~derived.any(axis=1)
     observed = np.repeat(own[:, None], N, axis=1)
     filled = np.nan_to_num(X), np.nan_to_num(V)
     track = Track(*map(jnp.asarray, (np.nan_to_num(F), seen, X[..., :4], known, lasts)))
     return track, places, *filled, observed
+
+
+def _driving(
+    recording: Recording, vehicle: Any, model: Dynamics, substeps: int
+) -> Float[np.ndarray, "J K N S k"]:
+    """What drives the model (`Track.F`)."""
+    if not isinstance(model, Extended):
+        return recording.wrench(vehicle).to_numpy()[:, :, :, None]
+    level, voltage = recording.thrust(vehicle)
+    u, volts = np.moveaxis(level, (2, 3), (0, 1)), np.moveaxis(voltage, 2, 0)[:, None]
+    before, V = u[:1], np.zeros((1, 6, *u.shape[2:]))
+    commands = Commands(u, volts, before, V)
+    felt = eqx.filter_jit(actuated)(model, commands, recording.dt, substeps)
+    felt = np.moveaxis(np.asarray(felt), (0, 1, 4), (2, 4, 3))
+    relative = np.broadcast_to(voltage[..., None, None], (*felt.shape[:4], 1))
+    return np.concatenate([felt, relative], axis=-1)
 
 
 def _padded(samples: int) -> int:

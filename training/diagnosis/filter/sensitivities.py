@@ -1,6 +1,7 @@
 """Sensitivities of the whitened innovations to effects: probes passed through the same filter."""
 
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import Any
@@ -32,6 +33,12 @@ AHEAD = 4
 def _threads() -> ThreadPoolExecutor:
     """Threads for compiled calls: one call uses one core."""
     return ThreadPoolExecutor(AHEAD, thread_name_prefix="sensitivities")
+
+
+def _in_double(run: Callable[..., Any], *given: Any) -> Any:
+    """The call in double precision, which may be enabled in the calling thread alone."""
+    with jax.enable_x64(True):
+        return run(*given)
 
 
 @eqx.filter_jit
@@ -181,7 +188,7 @@ def whitened_sensitivities(
             effects = _of_family(library.filled(by_lane), believed, instruments)
             arguments = predictions, records, filters, instead, size + 1, instruments
             more = changes_of(library, by_lane), data.reckoned
-            call = _threads().submit(run, model, effects, *arguments, *more)
+            call = _threads().submit(_in_double, run, model, effects, *arguments, *more)
             running.append((some, call))
             if len(running) > AHEAD:
                 collect()

@@ -1,0 +1,71 @@
+"""Learning where u, v, x and y were not recorded: from a grey-box fit, by states inferred."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_smoothing import simulated
+
+from spinndrift.models.config.errors import UserError
+from spinndrift.models.effects.extended import Extended, core
+from spinndrift.models.effects.unknown import Unknown
+from spinndrift.models.rigid_body import FossenDynamics
+from spinndrift.models.spinn import Spinn
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.sims.learning import Start, compare, learn, prepared
+from spinndrift.training.config import TrainingConfig, WindowConfig
+from spinndrift.training.fitting.hidden_start import HiddenStart
+from spinndrift.training.fitting.start import diffusion_scale
+
+VEHICLE = load_vehicle("bluerov2_heavy")
+QUICK = TrainingConfig(
+    steps=2,
+    batch=4,
+    validate_every=1,
+    windows=WindowConfig(length_s=1.0, stride_s=0.5, gap_s=0.1),
+)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return simulated(VEHICLE, duration=24.0)[0]
+
+
+@pytest.fixture(scope="module")
+def wrong():
+    """Quadratic drag is 2.5 times the truth's."""
+    drag = tuple(2.5 * d for d in VEHICLE.quadratic_damping)
+    return replace(VEHICLE, name="wrong", quadratic_damping=drag)
+
+
+def test_coefficients_are_fitted_and_the_report_says_what_the_data_tell(recording, wrong):
+    found = HiddenStart.of(recording, wrong, QUICK, None)
+    assert isinstance(found.model, Extended)
+    told = {t.name: t for t in found.told}
+    yaw = told["quadratic drag, yaw"]
+    assert yaw.learned
+    # motion tells drag relative to inertia; the axis of inertia is that of the rigid body
+    assert yaw.change - told["mass, yaw"].change == pytest.approx(-np.log(2.5), abs=0.15)
+    assert not told["linear drag, yaw"].learned
+    assert diffusion_scale(found.model).min() > 0
+
+
+@pytest.mark.slow
+def test_a_learned_model_forecasts_better_and_is_judged_again_from_its_file(
+    recording, wrong, tmp_path
+):
+    learned = learn(recording, wrong, QUICK, tmp_path / "run")
+    assert isinstance(core(learned.model), Spinn | FossenDynamics)
+    errors = learned.evaluation.overall()
+    assert set(errors) == {"preset", "fitted", "learned"}
+    assert errors["learned"]["energy_velocity"] < 0.5 * errors["preset"]["energy_velocity"]
+    begun, _ = Start.read(tmp_path / "run" / "model.spinn")
+    again = compare(*prepared(recording, wrong, begun, 1.0)).overall()
+    assert again["learned"]["rmse_angular_velocity"] < again["preset"]["rmse_angular_velocity"]
+
+
+def test_a_model_that_remembers_the_motion_is_refused_in_words(recording):
+    memory = Unknown.neutral(kind="memory", acts_on="yaw", numbers=(1.0, 0.5, 5.0))
+    model = Extended.create(VEHICLE.dynamics(), (memory,), VEHICLE.thrusters())
+    with pytest.raises(UserError, match="unknown remembers the motion"):
+        HiddenStart.of(recording, VEHICLE, QUICK, model)

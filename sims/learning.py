@@ -325,13 +325,13 @@ def _calibrated(
 ) -> dict[str, tuple[Dynamics, int]]:
     """The models with bands that hold on the training and validation windows.
 
-    Without some channels, windows start from what the learned model knew, so that only its own
-    bands are calibrated.
+    Without some channels, windows start from what the model knew that training began with, so that
+    only the bands of it and of the learned model are calibrated.
     """
     if parts.validation is None:
         return models
     sets = parts.learn, parts.validation
-    own = models if hidden is None else ("learned",)
+    own = models if hidden is None else set(models) - {"preset"}
     return {
         name: (calibrated(model, sets, substeps) if name in own else model, substeps)
         for name, (model, substeps) in models.items()

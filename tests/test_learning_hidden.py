@@ -9,6 +9,7 @@ from test_smoothing import simulated
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects.extended import Extended, core
 from spinndrift.models.effects.unknown import Unknown
+from spinndrift.models.recordings.store import Recording
 from spinndrift.models.rigid_body import FossenDynamics
 from spinndrift.models.spinn import Spinn
 from spinndrift.models.vehicles.vehicle import load_vehicle
@@ -18,6 +19,7 @@ from spinndrift.training.fitting.hidden_start import HiddenStart
 from spinndrift.training.fitting.start import diffusion_scale
 
 VEHICLE = load_vehicle("bluerov2_heavy")
+HIGHER = 0.06
 QUICK = TrainingConfig(
     steps=2,
     batch=4,
@@ -33,13 +35,19 @@ def recording():
 
 @pytest.fixture(scope="module")
 def wrong():
-    """Quadratic drag is 2.5 times the truth's."""
+    """Quadratic drag is 2.5 times the truth's, and thrusters are `HIGHER` than the true ones."""
     drag = tuple(2.5 * d for d in VEHICLE.quadratic_damping)
-    return replace(VEHICLE, name="wrong", quadratic_damping=drag)
+    mounts = tuple(
+        replace(m, position=(*m.position[:2], m.position[2] + HIGHER))
+        for m in VEHICLE.propulsion.mounts
+    )
+    propulsion = replace(VEHICLE.propulsion, mounts=mounts)
+    return replace(VEHICLE, name="wrong", quadratic_damping=drag, propulsion=propulsion)
 
 
 def test_coefficients_are_fitted_and_the_report_says_what_the_data_tell(recording, wrong):
-    found = HiddenStart.of(recording, wrong, QUICK, None)
+    without_force = Recording(recording.dataset.drop_vars("imu_specific_force"))
+    found = HiddenStart.of(without_force, wrong, QUICK, None)
     assert isinstance(found.model, Extended)
     told = {t.name: t for t in found.told}
     yaw = told["quadratic drag, yaw"]
@@ -48,6 +56,11 @@ def test_coefficients_are_fitted_and_the_report_says_what_the_data_tell(recordin
     assert yaw.change - told["mass, yaw"].change == pytest.approx(-np.log(2.5), abs=0.15)
     assert not told["linear drag, yaw"].learned
     assert diffusion_scale(found.model).min() > 0
+    # thrust along axes whose velocity nobody knows is commanded, and turns axes that are measured
+    (lever,) = (e for e in found.model.effects if e.name == "thrust_lever")
+    pitch, roll = (lever.index(place, "lever") for place in ("pitch_from_surge", "roll_from_sway"))
+    found_there = np.asarray(lever.values)[[pitch, roll]]
+    np.testing.assert_allclose(found_there, [-HIGHER, HIGHER], atol=HIGHER / 3)
 
 
 @pytest.mark.slow

@@ -41,7 +41,7 @@ class ChangeSearch(Search):
         return [
             h
             for h in self.baseline.hypotheses
-            if not asks_for_commands(h, self.quiet) and not acts_unseen(h[1], problem.data.unseen)
+            if not asks_for_commands(h, self.quiet) and not acts_unseen(*h, problem.data.unseen)
         ]
 
     def propose(self, state: Selection) -> Selection:

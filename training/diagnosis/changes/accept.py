@@ -137,7 +137,7 @@ def _candidates(problem: DiagnosisProblem, search: Search) -> list[Hypothesis]:
         lasting = cls.random or cls.timing or cls.absorber or cls.refit_only or name == Unknown.name
         remembers = any(cls.acts(hook) for hook in ("inertia", "actuate", "feel"))
         curved = any(is_curved(library, i) for i in library.at(name, where))
-        unseen = acts_unseen(where, problem.data.unseen)
+        unseen = acts_unseen(name, where, problem.data.unseen)
         if not (lasting or remembers or curved or unseen) and not asks_for_commands(
             (name, where), search.quiet
         ):

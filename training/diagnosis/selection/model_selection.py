@@ -40,9 +40,13 @@ class Choice:
         return replace(self, ties=tuple(h for h in self.ties if h[0] not in taken))
 
 
-def acts_unseen(where: str, unseen: Sequence[str]) -> bool:
-    """Whether a place is an axis, or couples one, of which no instrument tells."""
-    return any(axis in unseen for axis in where.split("_from_"))
+def acts_unseen(name: str, where: str, unseen: Sequence[str]) -> bool:
+    """Whether a cause acts on an axis, or by motion along one, of which no instrument tells.
+
+    The thrust along every axis is known from the commands.
+    """
+    axes = where.split("_from_")
+    return any(axis in unseen for axis in (axes[:1] if kind(name).family == "actuation" else axes))
 
 
 def admissible(library: Library, theta: Float[np.ndarray, " p"], fit: Fit) -> bool:

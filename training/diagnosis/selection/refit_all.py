@@ -71,7 +71,7 @@ def coefficients(problem: DiagnosisProblem) -> list[Coefficient]:
         prior = cls.refit_prior(base, entry.where) or (p.refit or p.spread, p.low)
         if not is_coefficient(entry, "all") or entry.cause in replaced or not prior[0]:
             continue
-        if acts_unseen(entry.where, problem.data.unseen):
+        if acts_unseen(entry.cause, entry.where, problem.data.unseen):
             continue
         if cls.refit_needs <= problem.data.offers:
             start = problem.believed[i]

@@ -56,7 +56,7 @@ def refitted(problem: DiagnosisProblem, refit: Refit) -> list[int]:
     return [
         i
         for i, e in enumerate(problem.library.entries)
-        if is_coefficient(e, refit) and not acts_unseen(e.where, problem.data.unseen)
+        if is_coefficient(e, refit) and not acts_unseen(e.cause, e.where, problem.data.unseen)
     ]
 
 
@@ -96,7 +96,7 @@ class Search:
             for h in problem.library.hypotheses(single=False)
             if h[0] not in free
             and not asks_for_commands(h, self.quiet)
-            and not acts_unseen(h[1], problem.data.unseen)
+            and not acts_unseen(*h, problem.data.unseen)
         ]
 
     def run(

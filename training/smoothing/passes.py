@@ -13,6 +13,14 @@ from .linear import Smoothed, smooth
 from .states import SCALES, SIZE, TWIST, Linear, Scaled, State, Track, linearised, moved
 
 
+_SEQUENTIAL = {
+    "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
+    "xla_cpu_multi_thread_eigen": False,
+}
+"""Kernels one after the other in the calling thread. They are small; and with a pool of threads XLA
+waits for ever in the program of a model with effects (jaxlib 0.10, two cores)."""
+
+
 class Pass(eqx.Module):
     """What one Gauss-Newton step of some runs returns: errors of its reference, and sums.
 
@@ -35,7 +43,7 @@ class Pass(eqx.Module):
     fit: Float[Array, ""]
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=_SEQUENTIAL)
 def smooth_runs(
     model: Scaled,
     reference: State,
@@ -98,7 +106,7 @@ def _difference(a: State, b: State) -> Array:
     return jnp.concatenate([se3.local(a.X, b.X), b.V - a.V, b.others - a.others])
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=_SEQUENTIAL)
 def imposed(
     model: Scaled, X: Array, V: Array, known: Array, F: Array, dt: Array, substeps: int
 ) -> tuple[Array, Array]:

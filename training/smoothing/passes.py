@@ -12,7 +12,6 @@ from ...models import se3
 from .linear import Smoothed, smooth
 from .states import SCALES, SIZE, TWIST, Linear, Scaled, State, Track, linearised, moved
 
-
 _SEQUENTIAL = {
     "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
     "xla_cpu_multi_thread_eigen": False,

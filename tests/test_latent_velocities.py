@@ -19,6 +19,7 @@ from spinndrift.training.diagnosis.filter.problem import DiagnosisProblem
 from spinndrift.training.diagnosis.filter.transition import Latent, Transition
 from spinndrift.training.diagnosis.findings.reported import residual
 from spinndrift.training.diagnosis.pipeline import DiagnoseConfig, Diagnoser
+from spinndrift.training.diagnosis.selection.model_selection import acts_unseen
 from spinndrift.training.diagnosis.selection.refit_all import one_step, with_coefficients
 from spinndrift.training.diagnosis.selection.state import Selection
 
@@ -155,6 +156,15 @@ def test_nothing_is_named_without_u_and_v_where_nothing_is_hidden(tmp_path):
         assert ("no instrument tells" in told) == (given is recording)
         causes = {e.cause for e in problem.library.entries}
         assert not causes & {"dvl_scale", "dvl_lever_arm", "current_steady", "tether"}
+
+
+def test_thrust_is_known_on_axes_whose_velocity_nobody_has_measured():
+    unseen = ["surge", "sway"]
+    assert acts_unseen("axis_thrust", "surge", unseen)
+    assert acts_unseen("quadratic_drag", "sway", unseen)
+    assert acts_unseen("drag_coupling", "pitch_from_surge", unseen)
+    assert not acts_unseen("drag_coupling", "pitch_from_heave", unseen)
+    assert not acts_unseen("thrust_lever", "pitch_from_surge", unseen)
 
 
 def test_far_from_the_belief_sensitivities_are_those_of_the_simulation(tmp_path):

@@ -2,24 +2,30 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_smoothing import simulated
+from test_smoothing import B, simulated
 
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.effects.extended import Extended, core
+from spinndrift.models.effects.thrust import ThrustCurve
 from spinndrift.models.effects.unknown import Unknown
+from spinndrift.models.integrate import cast
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.rigid_body import FossenDynamics
 from spinndrift.models.spinn import Spinn
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.learning import Start, compare, learn, prepared
 from spinndrift.training.config import TrainingConfig, WindowConfig
+from spinndrift.training.fitting import hidden_start
 from spinndrift.training.fitting.hidden_start import HiddenStart
 from spinndrift.training.fitting.start import diffusion_scale
+from spinndrift.training.losses.specific_force import ForceError
 
 VEHICLE = load_vehicle("bluerov2_heavy")
 HIGHER = 0.06
+NO_CURVE = ThrustCurve.of(exponent=0.0, gain=0.0)
 QUICK = TrainingConfig(
     steps=2,
     batch=4,
@@ -45,6 +51,30 @@ def wrong():
     return replace(VEHICLE, name="wrong", quadratic_damping=drag, propulsion=propulsion)
 
 
+def test_states_are_inferred_and_noise_is_estimated_with_the_fitted_model(
+    recording, wrong, monkeypatch
+):
+    """A stand-in for the fit returns the truth: a thrust curve beside other constants."""
+    truth = Extended.create(VEHICLE.dynamics(), (NO_CURVE,), VEHICLE.thrusters())
+    monkeypatch.setattr(hidden_start, "fit_coefficients", lambda *given: truth)
+    found = HiddenStart.of(recording, wrong, QUICK, None)
+    told = {t.name: t for t in found.told}
+    yaw = told["quadratic drag, yaw"]
+    assert yaw.learned
+    assert yaw.change == pytest.approx(-np.log(2.5), abs=0.01)
+    assert not told["linear drag, yaw"].learned
+    np.testing.assert_allclose(diffusion_scale(found.model)[3:], B / 10, rtol=0.5)
+    assert (diffusion_scale(found.preset) > diffusion_scale(found.model))[5]
+    windows = found.held_out(found.model)
+    assert windows.commands is not None
+    assert windows.hidden is not None
+    # the specific force of thruster forces through effects is that of their wrench
+    models = cast(found.model, jnp.float32), VEHICLE.dynamics(dtype=jnp.float32)
+    units = [force.unit for m in models if (force := ForceError.build(m, windows, 1))]
+    np.testing.assert_allclose(*units, rtol=0.02)
+
+
+@pytest.mark.slow
 def test_coefficients_are_fitted_and_the_report_says_what_the_data_tell(recording, wrong):
     without_force = Recording(recording.dataset.drop_vars("imu_specific_force"))
     found = HiddenStart.of(without_force, wrong, QUICK, None)

@@ -42,7 +42,7 @@ class Pass(eqx.Module):
     fit: Float[Array, ""]
 
 
-@eqx.filter_jit(compiler_options=_SEQUENTIAL)
+@eqx.filter_jit(compiler_options=_SEQUENTIAL)  # pyright: ignore[reportCallIssue]
 def smooth_runs(
     model: Scaled,
     reference: State,
@@ -105,7 +105,7 @@ def _difference(a: State, b: State) -> Array:
     return jnp.concatenate([se3.local(a.X, b.X), b.V - a.V, b.others - a.others])
 
 
-@eqx.filter_jit(compiler_options=_SEQUENTIAL)
+@eqx.filter_jit(compiler_options=_SEQUENTIAL)  # pyright: ignore[reportCallIssue]
 def imposed(
     model: Scaled, X: Array, V: Array, known: Array, F: Array, dt: Array, substeps: int
 ) -> tuple[Array, Array]:

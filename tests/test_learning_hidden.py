@@ -65,10 +65,15 @@ def test_states_are_inferred_and_noise_is_estimated_with_the_fitted_model(
     assert not told["linear drag, yaw"].learned
     np.testing.assert_allclose(diffusion_scale(found.model)[3:], B / 10, rtol=0.5)
     assert (diffusion_scale(found.preset) > diffusion_scale(found.model))[5]
+
+
+@pytest.mark.slow
+def test_the_specific_force_of_thruster_forces_is_that_of_their_wrench(recording):
+    truth = Extended.create(VEHICLE.dynamics(), (NO_CURVE,), VEHICLE.thrusters())
+    found = HiddenStart.of(recording, VEHICLE, QUICK, truth)
     windows = found.held_out(found.model)
     assert windows.commands is not None
     assert windows.hidden is not None
-    # the specific force of thruster forces through effects is that of their wrench
     models = cast(found.model, jnp.float32), VEHICLE.dynamics(dtype=jnp.float32)
     units = [force.unit for m in models if (force := ForceError.build(m, windows, 1))]
     np.testing.assert_allclose(*units, rtol=0.02)

@@ -88,15 +88,21 @@ def _add_told(page: Page, learned: Learned) -> None:
     """Which coefficients the data determine, where some channels were not recorded."""
     page.table(
         [
-            (t.name, "the data" if t.learned else "the preset", t.change, t.before, t.after)
+            (t.name, "yes" if t.learned else "hardly", t.change, t.before, t.after)
             for t in learned.told
         ],
-        ("coefficient", "known from", "change", "deviation before", "deviation given the data"),
+        (
+            "coefficient",
+            "told by the data",
+            "change",
+            "deviation before",
+            "deviation given the data",
+        ),
         "Coefficients fitted together before training, with velocities and positions that were "
         "not recorded inferred; deviations are given the thrust. Of masses and drags the "
         "logarithm is shown (0.1 is about 10 %), of the net buoyancy percent of the displacement, "
-        "of the righting lever the relative change. Where the data have less information than the "
-        "preset, the preset stays. Motion does not tell a common scale of mass, drag and thrust: "
+        "of the righting lever the relative change. Where the data hardly tell a coefficient, its "
+        "change means little. Motion does not tell a common scale of mass, drag and thrust: "
         "it is that of the rigid body's mass.",
     )
 

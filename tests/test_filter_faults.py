@@ -54,13 +54,18 @@ class Told(NamedTuple):
         return self.health[:, begin // EVERY :, HEALTH.index(name)].min(axis=1)
 
 
-def twist(t: Array, phase: Array) -> Array:
+def twist(t: Array, phase: Array, lively: Array) -> Array:
     size = jnp.array([0.4, 0.3, 0.2, 0.15, 0.12, 0.25])
-    return size * jnp.sin(jnp.array([0.62, 0.46, 0.8, 2.2, 1.8, 0.34]) * t + phase)
+    swim = size * jnp.sin(jnp.array([0.62, 0.46, 0.8, 2.2, 1.8, 0.34]) * t + phase)
+    size = lively * jnp.array([0.4, 0.35, 0.3, 0.3, 0.25, 0.5])
+    return swim + size * jnp.sin(jnp.array([3.9, 4.3, 4.6, 3.1, 3.7, 2.9]) * t + 2 * phase + 1)
 
 
-def dive(key: Array) -> Dives:
-    """A motion with phases of its own and the readings along it."""
+def dive(key: Array, lively: Array) -> Dives:
+    """A motion with phases of its own and the readings along it.
+
+    A `lively` one, of 1, has accelerations of up to 2 m/s² and 1.5 rad/s².
+    """
     h, sensors = FILTER.period, (FILTER.imu, *FILTER.aids)
     every = [round(FILTER.imu.rate / sensor.rate) for sensor in sensors]
     motion, start, noises = jax.random.split(key, 3)
@@ -75,8 +80,8 @@ def dive(key: Array) -> Dives:
     def sample(carry: tuple, n: Array) -> tuple[tuple, Dives]:
         X, V, states = carry
         t = n.astype(X.dtype) * h
-        now = twist(t, phase)
-        X = jnp.where(n > 0, se3.retract(X, twist(t - h / 2, phase) * h), X)
+        now = twist(t, phase, lively)
+        X = jnp.where(n > 0, se3.retract(X, twist(t - h / 2, phase, lively) * h), X)
         A = jnp.where(n > 0, (now - V) / h, 0)
         w = jax.random.normal(jax.random.fold_in(noises, n), (sum(sizes),))
         parts = jnp.split(w, np.cumsum(sizes)[:-1])
@@ -93,7 +98,7 @@ def dive(key: Array) -> Dives:
         readings = Readings(imu, (jnp.concatenate([dvl[:4], dvl[6:]]), *marked))
         return (X, now, states), Dives(readings, X, now)
 
-    begin = (X0, twist(jnp.zeros(()), phase), states)
+    begin = (X0, twist(jnp.zeros(()), phase, lively), states)
     return jax.lax.scan(sample, begin, jnp.arange(END + 1))[1]
 
 
@@ -127,14 +132,15 @@ def compiled() -> Callable:
 
 
 @cache
-def dives() -> Dives:
+def dives(lively: float = 0.0) -> Dives:
     keys = jax.random.split(jax.random.key(0), SEEDS)
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(dive))(keys))
+    flown = jax.vmap(dive, in_axes=(0, None))(keys, jnp.asarray(lively))
+    return jax.tree.map(np.asarray, flown)
 
 
-def spoiled(spoil: Callable[[Readings], None]) -> Told:
+def spoiled(spoil: Callable[[Readings], None], lively: float = 0.0) -> Told:
     """What the filter tells of readings that were spoiled in place."""
-    found = dives()
+    found = dives(lively)
     readings = jax.tree.map(np.array, found.readings)
     spoil(readings)
     keys = jax.random.split(jax.random.key(1), SEEDS)
@@ -232,6 +238,26 @@ BESIDE = [fault for fault, sensor in NAMED.items() if sensor != "dvl"]
 @cache
 def told(fault: Callable[[Readings], None] | None = None) -> Told:
     return spoiled(fault or (lambda readings: None))
+
+
+@pytest.mark.parametrize("gaps", [(), (20,), (15, 15, 15)], ids=["none", "one", "three"])
+def test_a_gap_in_the_samples_of_a_lively_motion_is_made_up_for(gaps):
+    """What a link that hangs for some tenths of a second leaves out, once or each second.
+
+    What the vehicle did in a gap is unknown, not known to have been nothing, and a step across one
+    is no jolt of the IMU.
+    """
+
+    def hang(readings: Readings) -> None:
+        for n, gap in enumerate(gaps):
+            readings.imu[:, BEGIN + 100 * n : BEGIN + 100 * n + gap] = np.nan
+
+    found = spoiled(hang, lively=1.0)
+    for later in (300, 600, END - BEGIN):
+        at = (BEGIN + later) // EVERY - 1
+        now = {"error": found.error[:, at], "covariance": found.covariance[:, at]}
+        assert np.all(within_three_sigma(now).sum(axis=0) >= 8)
+        assert np.linalg.norm(found.error[:, at, 6:9], axis=1).max() < 0.1
 
 
 def by_name(faults: Iterable[Callable]) -> pytest.MarkDecorator:

@@ -164,3 +164,16 @@ def test_the_rate_between_samples_is_as_uncertain_as_is_said(integrating):
     steps = start.bends.at[3:, 3:].set(bends @ bends.T / bends.shape[1])
     claimed = start._replace(bends=steps).rate_covariance(integrating)
     np.testing.assert_allclose(np.diag(claimed), (error**2).mean(axis=1), rtol=0.05)
+
+
+def test_after_a_gap_another_motion_is_no_jolt():
+    """A step of the same size without a gap is one; nothing is known of what a gap hides."""
+    jolted, hidden = noisy(), noisy()
+    jolted[120:, [0, 4]] += 1.5, 0.4
+    hidden[100:120] = np.nan
+    hidden[120:, [0, 4]] += 1.5, 0.4
+    assert np.abs(taken(jnp.asarray(jolted))[0].jolts).max() > 0.3
+    memory, found = taken(jnp.asarray(hidden))
+    np.testing.assert_array_equal(memory.jolts, 0)
+    out = left_out(np.asarray(found))
+    np.testing.assert_array_equal(np.flatnonzero(out.any(axis=1)), np.arange(100, 120))

@@ -178,10 +178,9 @@ def take(
     sample = jnp.where(within, sample, 0)
 
     X_BS = imu.mount(dtype)
-    rate = se3.rotate(X_BS, sample[3:])
+    force, rate = se3.rotate(X_BS, sample[:3]), se3.rotate(X_BS, sample[3:])
     fading = memory.rates[-1] * jnp.exp(-(memory.missing[1] + T) / _FADES)
     rate = jnp.where(good[1], rate, fading)
-    force = se3.rotate(X_BS, sample[:3])
     if any(imu.position):
         force = _at_origin(force, X_BS[4:], rate, (rate - memory.rates[-1]) * imu.rate)
 
@@ -189,17 +188,18 @@ def take(
     step = jnp.concatenate([force, rate]) - memory.foreseen
     rare = _ODD * jnp.sqrt(jnp.diag(memory.steps) + jnp.asarray(imu.noise_std, dtype) ** 2)
     bound = rare + jnp.asarray((2.0,) * 3 + (0.5,) * 3, dtype)
-    judged = jnp.repeat(good, 3) & (memory.count > FEW)
+    # after a gap nothing is known of what the motion was before
+    gap = (memory.missing > 0) & (memory.odd <= 0)
+    judged = jnp.repeat(good & ~gap, 3) & (memory.count > FEW)
     far = (jnp.abs(step) > bound) & judged
     odd = jnp.where(far.any(), memory.odd + 1, 0.0).astype(dtype)
     refused = jnp.stack([far[:3].any(), far[3:].any()]) & (odd <= _ODD_RUN)
     spike = (odd < 1) & (memory.odd > 0) & (memory.odd <= _ODD_RUN)  # the odd samples ended
-    squares = jnp.sum(step.reshape(2, 3) ** 2, axis=1)
     believed = good & ~refused
 
     missing = jnp.where(believed, 0.0, memory.missing + T)
     held = 2 * T * jnp.minimum(missing, _KEPT_UP)
-    doubted = jnp.where(refused, squares * T**2, 0.0)
+    doubted = jnp.where(refused, jnp.sum(step.reshape(2, 3) ** 2, axis=1) * T**2, 0.0)
     left_open = jnp.where(believed, 0.0, jnp.stack([held, doubted])).T.reshape(-1)
     rate = jnp.where(believed[1], rate, fading)
     force = jnp.where(believed[0], force, 0.0)

@@ -195,13 +195,13 @@ def _verdicts(rows: Sequence[Row]) -> Table:
     lines = []
     for kind in _kinds(chosen):
         own = [r for r in chosen if r["data"] == kind]
-        nulls = _of(own, "null")
-        hidden = [r for r in own if r["kind"] != "null"]
+        right = [r for r in own if not r["hidden"] and r["kind"] != "wrong"]
+        off = [r for r in own if r not in right]
         lines.append(
             (
                 kind,
-                share(sum(r["verdict"] == "adequate" for r in nulls), len(nulls)),
-                share(sum(r["verdict"] != "adequate" for r in hidden), len(hidden)),
+                share(sum(r["verdict"] == "adequate" for r in right), len(right)),
+                share(sum(r["verdict"] != "adequate" for r in off), len(off)),
                 share(sum(r["verdict_right"] for r in own), len(own)),
             )
         )

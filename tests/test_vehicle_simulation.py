@@ -1,5 +1,7 @@
 """The served vehicle with its plant: it goes where it is told, in each way of telling."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -137,6 +139,38 @@ def test_telemetry_is_near_the_truth(pilot: Pilot):
     gradient = codec.pascal_per_metre(density=1025.0)
     depth = codec.depth_from_pressure(pressure.press_abs, gradient=gradient)  # pyright: ignore
     assert abs(depth + X[6]) < 0.1  # an instant's motion, and the sensor's place
+
+
+def test_gyroscopes_are_late_by_their_low_pass_and_attitude_is_not(pilot: Pilot):
+    """As measured on ArduSub: 11 to 12 ms at 20 Hz, by what its import takes off."""
+    assert pilot.simulation.vehicle.parameters["INS_GYRO_FILTER"] == 20
+    assert pilot.command(511, 27, 10_000) == 0
+    assert pilot.command(511, 31, 10_000) == 0
+    true, shown, told = [], [], []
+    for k in range(400):
+        pilot.run(0.01, manual(yaw=0.4 * np.sin(0.05 * k)))
+        X, V = pilot.simulation.plant.truth()
+        yaw = 2 * np.arctan2(X[3], X[0])
+        boot = pilot.simulation.vehicle.boot_us * 1e-6 - pilot.simulation.time
+        true.append([boot + pilot.simulation.plant.time, V[5], yaw])
+        sample: Any = pilot.heard["RAW_IMU"]
+        rate = codec.imu_angular_rate(sample.xgyro, sample.ygyro, sample.zgyro)[2]
+        shown.append([sample.time_usec * 1e-6, rate])
+        q: Any = pilot.heard["ATTITUDE_QUATERNION"]
+        w, _, _, z = codec.attitude(q.q1, q.q2, q.q3, q.q4)
+        told.append([q.time_boot_ms * 1e-3, 2 * np.arctan2(z, w)])
+    time, rate, yaw = np.array(true).T
+    yaw = np.unwrap(yaw)
+
+    def late(at: np.ndarray, values: np.ndarray, known: np.ndarray) -> float:
+        """d of values that are those of the known a time d before, but for a constant."""
+        slope = np.interp(at, time, np.gradient(known, time))
+        apart = np.interp(at, time, known) - values
+        return np.linalg.lstsq(np.column_stack([slope, np.ones(400)]), apart, rcond=None)[0][0]
+
+    (at, values), (when, heading) = np.array(shown).T, np.array(told).T
+    assert late(at, values, rate) == pytest.approx(codec.filter_delay(20.0), abs=0.002)
+    assert late(when, np.unwrap(heading), yaw) == pytest.approx(0.0, abs=0.003)
 
 
 def test_depth_is_held(pilot: Pilot):

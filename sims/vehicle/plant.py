@@ -1,17 +1,22 @@
 """The simulated station under an autopilot: what it senses, and a DVL's readings."""
 
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from ...models.frames import frd_to_flu
 from ...models.se3 import from_position_rpy
 from ...systems.mavlink import codec
 from ...systems.station.config import StationConfig
 from ...systems.station.simulated import make_driven_station
+from .autopilot.low_pass import LowPass
 from .autopilot.navigation import Motion, rotated
+from .autopilot.parameters import Parameters
 from .physics import Physics
 
 
@@ -43,7 +48,10 @@ class Plant(Physics):
         Raises:
             UserError: a part of the configuration names what can't be read.
         """
-        super().__init__(config, make_driven_station)
+        # an autopilot reads its IMU so often that its samples are instantaneous
+        imu = replace(config.sensing.imu, integrating=False)
+        sensing = replace(config.sensing, imu=imu)
+        super().__init__(replace(config, sensing=sensing), make_driven_station)
         dvl = config.sensing.dvl
         rpy = jnp.array((0.0, 0.0, 0.0) if dvl is None else dvl.rpy)
         self._q_BD = np.array(from_position_rpy(jnp.zeros(3), rpy)[:4])
@@ -52,6 +60,14 @@ class Plant(Physics):
         """Go back to the start, with the same random numbers."""
         super().restart()
         self._dvl_time = 0.0
+        self._low_passes: dict[str, LowPass] = {}
+        self._told, self._off = np.zeros(13), (Rotation.identity(), np.zeros(9))
+        self._before: deque[tuple[np.ndarray, np.ndarray]] = deque([self.truth()] * 2, maxlen=2)
+
+    def step(self, outputs: Sequence[int]) -> None:
+        """Advance one period with the pulse widths (µs) of the first outputs, one a thruster."""
+        self._before.append(self.truth())
+        super().step(outputs)
 
     def parameters(self) -> dict[str, float]:
         """Parameters of an autopilot that knows this vehicle: frame, directions, DVL's place."""
@@ -62,14 +78,17 @@ class Plant(Physics):
             values |= dict(zip(("VISO_POS_X", "VISO_POS_Y", "VISO_POS_Z"), place, strict=True))
         return values
 
-    def motion(self, specific_gravity: float = 1.0, leak: bool = False) -> Motion:
-        """What the autopilot knows: the filter's estimates and the last readings.
+    def motion(self, parameters: Parameters, leak: bool = False) -> Motion:
+        """What the autopilot knows after a step: the filter's estimates and the last readings.
 
-        Its depth is that of an autopilot which takes the water's specific gravity for
-        `specific_gravity`.
+        By its `parameters` the autopilot has low-passes on inertial samples (INS_GYRO_FILTER,
+        INS_ACCEL_FILTER) and takes the water for one of BARO_SPEC_GRAV.
         """
-        X, V, imu = (self._value(name) for name in ("X_WB", "V_WB_B", "imu"))
-        own = codec.pascal_per_metre(specific_gravity)
+        X, V = self._estimate()
+        imu = self._inertial()
+        gyro = self._low_passed("INS_GYRO_FILTER", parameters, imu[3:])
+        force = self._low_passed("INS_ACCEL_FILTER", parameters, imu[:3])
+        own = codec.pascal_per_metre(parameters["BARO_SPEC_GRAV"])
         gradient = codec.pascal_per_metre(density=self.vehicle.water_density)
         climb = rotated(X[:4], V[:3])[2]
         gauge = self.config.sensing.depth is not None
@@ -77,8 +96,8 @@ class Plant(Physics):
         volts, amps = self.battery()
         return Motion(
             q_WB=X[:4],
-            omega_B=imu[3:],
-            f_B=imu[:3],
+            omega_B=gyro,
+            f_B=force,
             height=float(X[6] * gradient / own),
             climb=float(climb * gradient / own),
             pressure=float((depth[0] if depth[1] else -X[6]) * gradient),
@@ -86,6 +105,44 @@ class Plant(Physics):
             current=amps,
             leak=leak,
         )
+
+    def _estimate(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6"]]:
+        """Pose and twist as the filter tells them, at the present time.
+
+        An autopilot's filter runs with its loop and this one more seldom: its error is that of its
+        last estimate, which appears one step after its time.
+        """
+        told = np.concatenate([self._value("X_WB"), self._value("V_WB_B")])
+        if not np.array_equal(told, self._told):
+            X, V = self._before[-1]
+            wrong = _turn(X).inv() * Rotation.from_quat(told[:4], scalar_first=True)
+            self._told, self._off = told, (wrong, told[4:] - np.concatenate([X[4:], V]))
+        (X, V), (wrong, off) = self.truth(), self._off
+        q = (_turn(X) * wrong).as_quat(canonical=True, scalar_first=True)
+        return np.concatenate([q, X[4:] + off[:3]]), V + off[3:]
+
+    def _inertial(self) -> Float[np.ndarray, "6"]:
+        """Specific force and rate at the present time: the sample, of a step ago, with the true
+        change since then.
+        """
+        states = [*self._before, self.truth()]
+        v_W = [_turn(X).apply(V[:3]) for X, V in states]
+        accelerations = np.diff(v_W, axis=0) / self.config.period + [0, 0, codec.G]
+        forces = [
+            _turn(X).inv().apply(a) for (X, _), a in zip(states[1:], accelerations, strict=True)
+        ]
+        turned = states[-1][1][3:] - states[-2][1][3:]
+        return self._value("imu") + np.concatenate([forces[1] - forces[0], turned])
+
+    def _low_passed(
+        self, name: str, parameters: Parameters, sample: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "3"]:
+        """A triad's sample behind the low-pass of a parameter; a new cutoff begins anew."""
+        cutoff = parameters[name]
+        known = self._low_passes.get(name)
+        if known is None or known.cutoff != cutoff:
+            known = self._low_passes[name] = LowPass(cutoff, 1 / self.config.period)
+        return known(sample)
 
     def dvl(self) -> DvlReading | None:
         """The DVL's reading if it is new and valid."""
@@ -100,3 +157,7 @@ class Plant(Physics):
             return None
         v_B = rotated(self._q_BD, reading[:3])
         return DvlReading(time, min(dt, 1.0), v_B, float(reading[5]), float(reading[4]))
+
+
+def _turn(X_WB: Float[np.ndarray, "7"]) -> Rotation:
+    return Rotation.from_quat(X_WB[:4], scalar_first=True)

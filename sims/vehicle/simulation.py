@@ -1,5 +1,7 @@
 """A simulated vehicle with its plant and its ports, in virtual time."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..scenarios.scenario import Scenario
@@ -60,7 +62,8 @@ class Simulation:
                 self.truth.sample(self.plant.time)
             self.plant.step(self.vehicle.autopilot.outputs.us)
             self._motion = self._known()
-        self.vehicle.step(self.time, self._motion)
+        age = max(0.0, self.time - self.plant.time)
+        self.vehicle.step(self.time, replace(self._motion, age=age))
         reading = self.plant.dvl() if self.settings.dvl else None
         if reading is not None:
             self._tell_dvl(reading)
@@ -86,7 +89,7 @@ class Simulation:
     def _known(self):
         leak = self.settings.leak
         wet = leak is not None and self.time >= leak
-        return self.plant.motion(self.vehicle.parameters["BARO_SPEC_GRAV"], wet)
+        return self.plant.motion(self.vehicle.parameters, wet)
 
     def _tell_dvl(self, reading: DvlReading) -> None:
         at = round(self.vehicle.boot_us - 1e6 * (self.time - reading.time))

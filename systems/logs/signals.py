@@ -136,9 +136,9 @@ def event_spans(t: np.ndarray, labels: Sequence[str], first: float, last: float)
 def undelayed(one: Series, known: Mapping[str, float], parameter: str) -> tuple[Series, list[str]]:
     """Subtract the delay of the autopilot's low-pass from the times of an inertial signal."""
     cutoff = known.get(parameter, 0.0)
-    if not 1.0 <= cutoff <= 500.0:
-        return one, []
     delay = filter_delay(cutoff)
+    if not delay:
+        return one, []
     return replace(one, t=one.t - delay), [
         f"{one.source}: times moved back by {1e3 * delay:.0f} ms, the delay of {parameter} "
         f"{cutoff:g} Hz."

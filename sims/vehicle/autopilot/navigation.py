@@ -37,6 +37,7 @@ class Motion:
         voltage: of the battery under load (V).
         current: of the battery (A).
         leak: whether the hull's leak sensor is wet.
+        age: time since then (s), as the physics has larger steps than the autopilot.
     """
 
     q_WB: Float[np.ndarray, "4"] = field(default_factory=_rest)
@@ -48,6 +49,7 @@ class Motion:
     voltage: float = 16.0
     current: float = 0.0
     leak: bool = False
+    age: float = 0.0
 
 
 def rotated(q_WB: Float[np.ndarray, "4"], v_B: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:

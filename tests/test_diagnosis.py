@@ -49,6 +49,8 @@ from spinndrift.training.diagnosis.selection.search import Search
 from spinndrift.training.diagnosis.selection.state import Selection
 from spinndrift.training.diagnosis.validation.claims import LEFT, clearly_better, vetoes
 
+pytestmark = pytest.mark.whole
+
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(runs=2, seconds=6.0)
 

@@ -19,6 +19,8 @@ from spinndrift.systems.estimation.config import EkfConfig
 from spinndrift.systems.estimation.delayed import DelayedFilter
 from spinndrift.systems.estimation.state import FilterState, Readings
 
+pytestmark = pytest.mark.whole
+
 SEEDS, STEPS = 40, 600
 RNG = np.random.default_rng(0)
 AIDS = (Dvl(), DepthSensor(), Compass())

@@ -23,6 +23,8 @@ from spinndrift.training.diagnosis.selection.model_selection import acts_unseen
 from spinndrift.training.diagnosis.selection.refit_all import one_step, with_coefficients
 from spinndrift.training.diagnosis.selection.state import Selection
 
+pytestmark = pytest.mark.whole
+
 VEHICLE = load_vehicle("bluerov2_heavy")
 PLAN = Plan(scenarios=6, runs=2, seconds=8.0)
 FELT = 0.03  # m/s², noise of the accelerometer

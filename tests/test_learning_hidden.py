@@ -33,6 +33,8 @@ QUICK = TrainingConfig(
     windows=WindowConfig(length_s=1.0, stride_s=0.5, gap_s=0.1),
 )
 
+pytestmark = pytest.mark.whole
+
 
 @pytest.fixture(scope="module")
 def recording():

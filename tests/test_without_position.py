@@ -20,6 +20,8 @@ from spinndrift.sims.scenarios.criteria import FollowPath, Outcome
 from spinndrift.sims.scenarios.scenario import load_scenario, overridden
 from spinndrift.systems.controllers.without_position import WithoutPosition
 
+pytestmark = pytest.mark.whole
+
 NO_DVL = "station: {sensing: {dvl: null}}\n"
 NONE = "station: {sensing: {dvl: none}}"
 LINK = 'vehicle_link: !Mavlink {connection: "tcp:127.0.0.1:1"}\n'

@@ -119,7 +119,7 @@ def test_a_compass_that_turns_between_two_runs_is_found_from_there_on(tmp_path):
 @pytest.mark.parametrize(
     "effects",
     [
-        pytest.param((), id="nothing"),
+        pytest.param((), id="nothing", marks=pytest.mark.slow),
         pytest.param((ThrusterGain(3, 0.7),), id="constant", marks=pytest.mark.slow),
     ],
 )

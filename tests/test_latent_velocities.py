@@ -169,6 +169,7 @@ def test_thrust_is_known_on_axes_whose_velocity_nobody_has_measured():
     assert not acts_unseen("thrust_lever", "pitch_from_surge", unseen)
 
 
+@pytest.mark.slow
 def test_far_from_the_belief_sensitivities_are_those_of_the_simulation(tmp_path):
     """A latent velocity carries an error on through all later steps, as the model at hand lets it:
     here with another mass, without its Munk moment, and with twice the drag of the belief."""

@@ -53,6 +53,7 @@ def wrong():
     return replace(VEHICLE, name="wrong", quadratic_damping=drag, propulsion=propulsion)
 
 
+@pytest.mark.slow
 def test_states_are_inferred_and_noise_is_estimated_with_the_fitted_model(
     recording, wrong, monkeypatch
 ):

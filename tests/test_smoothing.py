@@ -93,6 +93,7 @@ def test_hidden_velocities_under_the_true_model_have_the_claimed_errors():
     np.testing.assert_allclose(found.levels.white[3:], B / 10, rtol=0.25)
 
 
+@pytest.mark.slow
 def test_hidden_velocities_under_a_wrong_model_are_not_claimed_to_be_exact():
     """Drag and mass are 1.5 times the truth's."""
     true = load_vehicle("bluerov2_heavy")

@@ -24,6 +24,13 @@ def test_a_slow_motion_is_late_by_the_filters_delay(cutoff: float):
     np.testing.assert_allclose(y[:, 2], 1.0, rtol=1e-9)
 
 
+def test_what_is_not_finite_is_not_remembered():
+    low_pass = LowPass(20.0, RATE)
+    low_pass(np.ones(3))
+    assert np.isnan(low_pass(np.array([1.0, np.nan, 1.0]))).any()
+    np.testing.assert_allclose(low_pass(np.full(3, 2.0)), 2.0)
+
+
 def test_noise_is_taken_off_and_a_cutoff_of_zero_is_no_filter():
     x = np.random.default_rng(0).standard_normal((4000, 3))
     np.testing.assert_array_equal(filtered(LowPass(0.0, RATE), x), x)

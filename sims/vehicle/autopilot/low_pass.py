@@ -26,8 +26,14 @@ class LowPass:
         self._state: np.ndarray | None = None
 
     def __call__(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """The filtered sample that follows; the first is taken as having lasted."""
+        """The filtered sample that follows; the first is taken as having lasted.
+
+        One that is not finite goes through and is forgotten, as ArduPilot begins anew after it.
+        """
         if self._coefficients is None:
+            return x
+        if not np.isfinite(x).all():
+            self._state = None
             return x
         b, a = self._coefficients
         if self._state is None:

@@ -6,16 +6,14 @@ from dataclasses import replace
 from math import ceil
 
 import numpy as np
-from jaxtyping import Float
 
 from ...models.config.errors import UserError
-from ...systems.mavlink import codec
 from ...systems.mavlink.transport import Connection, Datagrams
 from ...systems.station.config import StationConfig
 from ..scenarios.scenario import Scenario
 from .autopilot.navigation import rotated
 from .json_protocol import Frames, Servos, servos, state_line
-from .physics import Physics
+from .physics import Physics, mean_specific_force
 from .truth import TruthLog
 
 ADDRESS = "udpin:127.0.0.1:9002"
@@ -81,7 +79,6 @@ class JsonBackend:
         self._peer: tuple | None = None
         self._booted = 0.0
         self._us = self.physics.driving(())
-        self._v_W = self._velocity()
         self._line = b""
 
     def run(self, stop: threading.Event, duration: float | None = None) -> None:
@@ -139,19 +136,13 @@ class JsonBackend:
         self._us = physics.driving(packet.us)
         if self._record:
             self.truth.sample(physics.time)
+        before = physics.truth()
         physics.step(packet.us)
-        X, V = physics.truth()
-        v_W = self._velocity()
-        # the mean over the period, so that its integral is the change of velocity
-        rate_W = (v_W - self._v_W) / physics.config.period + [0.0, 0.0, codec.G]
-        f_B = rotated(X[:4] * [1, -1, -1, -1], rate_W)
-        self._v_W = v_W
+        X, V = after = physics.truth()
+        f_B = mean_specific_force(before, after, physics.config.period)
+        v_W = rotated(X[:4], V[:3])
         timestamp = physics.time - self._booted
         self._line = state_line(timestamp, X, v_W, V[3:], f_B, physics.battery())
-
-    def _velocity(self) -> Float[np.ndarray, "3"]:
-        X, V = self.physics.truth()
-        return rotated(X[:4], V[:3])
 
     def _seen(self) -> dict[str, np.ndarray]:
         return {"pwm": self._us, "voltage": np.array([self.physics.battery()[0]])}

@@ -9,12 +9,28 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram
 
 from ...systems.closed_loop import seeded
+from ...systems.mavlink import codec
 from ...systems.station.config import StationConfig
 from ...systems.station.simulated import make_driven_plant
 from .autopilot.mixer import NEUTRAL, frame_for
+from .autopilot.navigation import rotated
 
 _LOWEST, _HIGHEST = 1000, 2000  # µs: at and beyond these a speed controller stops
 _WARM_UP = 0.45  # s: every event of the diagram has occurred
+
+
+State = tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6"]]
+"""Pose X_WB and twist V_WB_B."""
+
+
+def mean_specific_force(before: State, after: State, period: float) -> Float[np.ndarray, "3"]:
+    """Specific force (m/s²) whose integral over a period (s) is the change of velocity.
+
+    In body axes at the period's end.
+    """
+    v_W, v_W_after = (rotated(X[:4], V[:3]) for X, V in (before, after))
+    rate_W = (v_W_after - v_W) / period + [0.0, 0.0, codec.G]
+    return rotated(after[0][:4] * [1, -1, -1, -1], rate_W)
 
 
 class Physics:
@@ -75,7 +91,7 @@ class Physics:
         self._steps += 1
         self._simulator.AdvanceTo(self.time)
 
-    def truth(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6"]]:
+    def truth(self) -> State:
         """Pose X_WB and twist V_WB_B."""
         return self._value("X_WB_cheat"), self._value("V_WB_B_cheat")
 

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +18,7 @@ from ...systems.station.simulated import make_driven_station
 from .autopilot.low_pass import LowPass
 from .autopilot.navigation import Motion, rotated
 from .autopilot.parameters import Parameters
-from .physics import Physics
+from .physics import Physics, State, mean_specific_force
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Plant(Physics):
         self._dvl_time = 0.0
         self._low_passes: dict[str, LowPass] = {}
         self._told, self._off = np.zeros(13), (Rotation.identity(), np.zeros(9))
-        self._before: deque[tuple[np.ndarray, np.ndarray]] = deque([self.truth()] * 2, maxlen=2)
+        self._before: deque[State] = deque([self.truth()] * 2, maxlen=2)
 
     def step(self, outputs: Sequence[int]) -> None:
         """Advance one period with the pulse widths (µs) of the first outputs, one a thruster."""
@@ -106,11 +107,11 @@ class Plant(Physics):
             leak=leak,
         )
 
-    def _estimate(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6"]]:
-        """Pose and twist as the filter tells them, at the present time.
+    def _estimate(self) -> State:
+        """The truth with the error of the filter's last estimate.
 
-        An autopilot's filter runs with its loop and this one more seldom: its error is that of its
-        last estimate, which appears one step after its time.
+        An autopilot estimates in each of its loops, the station's filter less often: between two
+        estimates its error is held. An estimate appears one step after its time.
         """
         told = np.concatenate([self._value("X_WB"), self._value("V_WB_B")])
         if not np.array_equal(told, self._told):
@@ -122,22 +123,18 @@ class Plant(Physics):
         return np.concatenate([q, X[4:] + off[:3]]), V + off[3:]
 
     def _inertial(self) -> Float[np.ndarray, "6"]:
-        """Specific force and rate at the present time: the sample, of a step ago, with the true
-        change since then.
+        """Specific force and angular rate now: the IMU's sample, which is one step old, plus the
+        true change since then.
         """
         states = [*self._before, self.truth()]
-        v_W = [_turn(X).apply(V[:3]) for X, V in states]
-        accelerations = np.diff(v_W, axis=0) / self.config.period + [0, 0, codec.G]
-        forces = [
-            _turn(X).inv().apply(a) for (X, _), a in zip(states[1:], accelerations, strict=True)
-        ]
+        forces = [mean_specific_force(*two, self.config.period) for two in pairwise(states)]
         turned = states[-1][1][3:] - states[-2][1][3:]
         return self._value("imu") + np.concatenate([forces[1] - forces[0], turned])
 
     def _low_passed(
         self, name: str, parameters: Parameters, sample: Float[np.ndarray, "3"]
     ) -> Float[np.ndarray, "3"]:
-        """A triad's sample behind the low-pass of a parameter; a new cutoff begins anew."""
+        """A sample after the low-pass of a parameter (Hz); a new cutoff restarts the filter."""
         cutoff = parameters[name]
         known = self._low_passes.get(name)
         if known is None or known.cutoff != cutoff:

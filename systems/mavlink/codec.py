@@ -127,8 +127,8 @@ def imu_fields(
 def filter_delay(cutoff_hz: float) -> float:
     """Delay (s) of the autopilot's low-pass on gyro or accelerometer (INS_GYRO_FILTER, in Hz).
 
-    A Butterworth filter of second order has the group delay √2/ω_c at low frequency. Beyond 1 to
-    500 Hz there is no filter: 0.
+    A Butterworth filter of second order has the group delay √2/ω_c at low frequency. A
+    cutoff outside 1 to 500 Hz is taken as no filter, with a delay of 0.
     """
     if not 1.0 <= cutoff_hz <= 500.0:
         return 0.0

@@ -26,9 +26,9 @@ class LowPass:
         self._state: np.ndarray | None = None
 
     def __call__(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """The filtered sample that follows; the first is taken as having lasted.
+        """Filter the next sample. The filter starts in the steady state of its first sample.
 
-        One that is not finite goes through and is forgotten, as ArduPilot begins anew after it.
+        A sample that is not finite is returned as it is and resets the filter, as in ArduPilot.
         """
         if self._coefficients is None:
             return x

@@ -37,7 +37,7 @@ class Motion:
         voltage: of the battery under load (V).
         current: of the battery (A).
         leak: whether the hull's leak sensor is wet.
-        age: time since then (s), as the physics has larger steps than the autopilot.
+        age: time since this instant (s): the physics has larger steps than the autopilot.
     """
 
     q_WB: Float[np.ndarray, "4"] = field(default_factory=_rest)

@@ -59,13 +59,13 @@ def _ms(s: State) -> int:
     return s.boot_us // 1000 % 2**32
 
 
-def _moved_us(s: State) -> int:
-    """Boot clock (µs) at the time of the motion, some milliseconds ago."""
+def _motion_us(s: State) -> int:
+    """Boot clock (µs) at the time of `motion`, at most one step of the physics ago."""
     return max(0, s.boot_us - round(1e6 * s.motion.age))
 
 
-def _moved_ms(s: State) -> int:
-    return _moved_us(s) // 1000 % 2**32
+def _motion_ms(s: State) -> int:
+    return _motion_us(s) // 1000 % 2**32
 
 
 def heartbeat(s: State) -> Message:
@@ -106,11 +106,11 @@ def _imu_fields(s: State) -> list[int]:
 
 
 def _raw_imu(s: State) -> Message:
-    return _built(mavlink.MAVLink_raw_imu_message, _moved_us(s), *_imu_fields(s), 0, _AIR_CDEG)
+    return _built(mavlink.MAVLink_raw_imu_message, _motion_us(s), *_imu_fields(s), 0, _AIR_CDEG)
 
 
 def _scaled_imu(kind: Callable[..., Message]) -> Callable[[State], Message]:
-    return lambda s: kind(_moved_ms(s), *_imu_fields(s), _AIR_CDEG)
+    return lambda s: kind(_motion_ms(s), *_imu_fields(s), _AIR_CDEG)
 
 
 def _scaled_imu3(s: State) -> Message:
@@ -142,14 +142,14 @@ def _rates(s: State) -> list[float]:
 
 
 def _attitude(s: State) -> Message:
-    return mavlink.MAVLink_attitude_message(_moved_ms(s), *_euler(s), *_rates(s))
+    return mavlink.MAVLink_attitude_message(_motion_ms(s), *_euler(s), *_rates(s))
 
 
 def _attitude_quaternion(s: State) -> Message:
     q = [float(v) for v in codec.quaternion_to_frd_ned(s.motion.q_WB)]
     if q[0] < 0:
         q = [-v for v in q]
-    return _built(mavlink.MAVLink_attitude_quaternion_message, _moved_ms(s), *q, *_rates(s))
+    return _built(mavlink.MAVLink_attitude_quaternion_message, _motion_ms(s), *q, *_rates(s))
 
 
 def _north_east(s: State) -> tuple[float, float, float, float]:

@@ -240,7 +240,7 @@ def told(fault: Callable[[Readings], None] | None = None) -> Told:
     return spoiled(fault or (lambda readings: None))
 
 
-@pytest.mark.parametrize("gaps", [(20,), (15, 15, 15)], ids=["one", "three"])
+@pytest.mark.parametrize("gaps", [(), (20,), (15, 15, 15)], ids=["none", "one", "three"])
 def test_a_gap_in_the_samples_of_a_lively_motion_is_made_up_for(gaps):
     """What a link that hangs for some tenths of a second leaves out, once or each second.
 

@@ -157,6 +157,41 @@ def test_measurement_jacobians_agree_with_finite_differences():
     np.testing.assert_allclose(H, jnp.stack(columns, axis=1), atol=1e-8)
 
 
+def test_readings_of_a_while_ago_are_those_of_their_latency():
+    """Of what was true τ before its time the innovation is zero, and H its derivative in τ."""
+    x, rate, late = navigation(0.3), jnp.array([0.2, -0.1, 0.3]), jnp.array([0.02, 0.03, 0.01])
+    acceleration, omega = jnp.array([0.5, -0.4, 0.3]), rate - x.gyro_bias
+    dvl, depth, compass = AIDS
+    slow, rest = x.sensors[: len(AIDS)], jnp.zeros(2 * VALUES)
+    before = [
+        (
+            se3.compose(x.X_WB, se3.exp(-tau * jnp.concatenate([x.v_B, omega]))),
+            jnp.concatenate([x.v_B - tau * acceleration, omega]),
+        )
+        for tau in late
+    ]
+    values = [
+        -dvl.innovation(*before[0], slow[:1], jnp.zeros(3)).residual,
+        depth.expected(before[1][0]) + slow[1],
+        compass.expected(before[2][0]) + slow[2],
+    ]
+
+    @jax.jit
+    def innovations(assumed: Array) -> list[measurement.Innovation]:
+        given = x._replace(sensors=jnp.concatenate([slow, assumed, rest]))
+        noise = jnp.zeros((3, 3))
+        return measurement.innovations(AIDS, given, rate, noise, values, acceleration, 0.0)
+
+    h = 1e-5
+    found, none = innovations(late), innovations(0 * late)
+    less, more = innovations(late - h), innovations(late + h)
+    for i, tau in enumerate(late):
+        np.testing.assert_allclose(found[i].residual, 0, atol=tau**2)
+        assert np.abs(none[i].residual).max() > 10 * np.abs(found[i].residual).max()
+        slope = (less[i].residual - more[i].residual) / (2 * h)
+        np.testing.assert_allclose(found[i].H[:, es.INERTIAL + len(AIDS) + i], slope, rtol=1e-6)
+
+
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 6])
 def test_small_inverse(size):
     A = RNG.standard_normal((size, size))

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from spinndrift.models import se3
 from spinndrift.models.sensors import Imu
+from spinndrift.systems.estimation.error_state import Navigation, apply, sample_increment
 from spinndrift.systems.estimation.inertial import FEW, LEFT_OPEN, Motion, Samples, take
 
 IMU = Imu()
@@ -177,3 +179,39 @@ def test_after_a_gap_another_motion_is_no_jolt():
     np.testing.assert_array_equal(memory.jolts, 0)
     out = left_out(np.asarray(found))
     np.testing.assert_array_equal(np.flatnonzero(out.any(axis=1)), np.arange(100, 120))
+
+
+def test_instantaneous_samples_are_integrated_to_second_order():
+    """A vehicle that turns back and forth at a constant velocity in W: v_W stays."""
+
+    def moved(rate: float) -> float:
+        imu = Imu(rate=rate, integrating=False)
+        t = jnp.arange(2 * rate + 1) / rate
+        size, w = jnp.array([0.3, 0.4, 0.5])[:, None], jnp.array([3.0, 4.0, 5.0])[:, None]
+        axis = jnp.array([2.0, 3.0, 6.0]) / 7
+        angle = jnp.sum(size * jnp.sin(w * t[None]), 0)
+        omega = jnp.sum(size * w * jnp.cos(w * t[None]), 0)
+        X = se3.exp(jnp.concatenate([jnp.zeros((3, t.size)), jnp.outer(axis, angle)]))
+        force = se3.rotate_inverse(X, jnp.array([0.0, 0.0, imu.gravity])[:, None])
+        samples = jnp.concatenate([force, jnp.outer(axis, omega)]).T
+
+        def over(memory, given):
+            return take(imu, memory, *given)
+
+        numbers = jnp.arange(t.size, dtype=t.dtype)
+        start = Samples.start(samples[0, 3:])
+        _, found = jax.lax.scan(over, start, (samples, numbers))
+        zero = jnp.zeros(3)
+        x = Navigation(se3.identity(), jnp.array([0.3, -0.2, 0.1]), zero, zero, zero[:0])
+
+        def step(x, row):
+            increment = sample_increment(row[1:4], row[4:7], row[0] / rate)
+            return apply(x, increment, imu.gravity), None
+
+        x, _ = jax.lax.scan(step, x, found)
+        v_W = se3.rotate(x.X_WB, x.v_B)
+        return float(jnp.linalg.norm(v_W - jnp.array([0.3, -0.2, 0.1])))
+
+    coarse, fine = moved(50.0), moved(100.0)
+    assert coarse < 0.01
+    assert coarse / fine == pytest.approx(4, rel=0.15)

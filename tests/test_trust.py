@@ -287,6 +287,25 @@ def test_a_change_becomes_an_offset_as_uncertain_as_it_is_large():
     assert not trust.suspect(jnp.asarray(14.0), 3.0).any()
 
 
+def test_a_sensor_is_trusted_again_once_its_offset_is_known_to_be_small():
+    trust, x, P = opened(Trust.start(AIDS, DTYPE), [0.3, 0, 0, 0.5, 0.7], 10.0)
+    trust = trust._replace(passed=jnp.full(3, 20.0))
+
+    def settled(offset: float, std: float, walk: float = 0.0) -> Trust:
+        at = x._replace(sensors=x.sensors.at[OFFSETS[0] - es.INERTIAL].set(offset))
+        known = P.at[OFFSETS[0], OFFSETS[0]].set(std**2)
+        moving = trust._replace(walk=trust.walk.at[0].set(walk))
+        none = Update(at, known, jnp.zeros(3), ALL, jnp.zeros((ERRORS, VALUES)))
+        return changes.settled(AIDS, moving, none, 3)[0]
+
+    noise, rate = AIDS[0].noise_std[0], AIDS[0].rate
+    assert trust.changed[0] == 1
+    assert settled(noise, noise).changed[0] == 0
+    assert settled(0, 10 * noise).changed[0] == 1  # not known
+    assert settled(5 * noise, noise).changed[0] == 1  # not small
+    assert settled(0, noise, walk=2 * noise**2 * rate).changed[0] == 1  # not for long
+
+
 def test_a_second_change_in_the_same_direction_is_a_drift_of_sensor_or_imu():
     trust, _, _ = opened(Trust.start(AIDS, DTYPE), [0, 0, 0, 0, 0.1], 10.0, COMPASS)
     trust, x, P = opened(trust, [0, 0, 0, 0, 0.1], 12.0, COMPASS)

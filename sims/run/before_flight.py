@@ -11,6 +11,7 @@ import numpy as np
 from ...models.config.errors import UserError
 from ...models.sensors import Dvl
 from ...systems.mavlink import telemetry
+from ...systems.mavlink.codec import filter_delay
 from ...systems.mavlink.config import Mavlink
 from ...systems.mavlink.driver import Driver
 from ...systems.mavlink.interface import RESOLUTION, unread
@@ -21,6 +22,11 @@ from .way import check_free, check_positioned, find_passage, no_safe_plan
 
 _RATES = (200.0, 100.0, 50.0, 40.0, 20.0)  # Hz that the filter may have; their ticks fit the loop's
 _FEW = 5  # values
+_NEARLY_ALL = 0.98  # share of the inertial samples that come in time
+_LATENCY = 0.05
+"""Deviation (s) of the other sensors' latencies: an autopilot averages a pressure sensor over up to
+0.1 s and sends the mean once more that long."""
+_EKF3_PERIOD = 0.012  # s: EKF_TARGET_DT of ArduPilot's EKF3
 _NEVER = 1e6
 _PATIENCE = 30.0  # s for what passes by itself after the vehicle's start
 _PASSING = {"attitude", "inertial sensors", "depth sensor", "link", *telemetry.IMUS}
@@ -91,11 +97,13 @@ def _aged(age: float) -> str:
 
 
 def as_granted(scenario: Scenario, driver: Driver, say: Tell = lambda text: None) -> Scenario:
-    """The scenario with the rate of inertial samples that the vehicle granted, and its noises.
+    """The scenario with rate and latency of the vehicle's inertial samples, and its noises.
 
-    The filter's rate is the highest it may have up to that, at least 20 Hz; the samples are
-    instantaneous. Noises that are larger at rest than configured are those of the filter. Without
-    a sensor of horizontal motion the fence, which needs a position, is off.
+    The filter's rate is the highest it may have up to that granted, at least 20 Hz; the samples are
+    instantaneous, and late by what nearly all of them are. Noises that are larger at rest than
+    configured are those of the filter, and biases drift as the autopilot's own filter assumes. When
+    an autopilot's other readings were true is known to about a tenth of a second. Without a sensor
+    of horizontal motion the fence, which needs a position, is off.
     """
     rates = driver.link.statistics().rates
     granted = max((rates.get(name, 0.0) for name in telemetry.IMUS), default=0.0)
@@ -120,10 +128,18 @@ def as_granted(scenario: Scenario, driver: Driver, say: Tell = lambda text: None
         imu,
         accelerometer_density=max(imu.accelerometer_density, noise.get("force", 0.0)),
         gyroscope_density=max(imu.gyroscope_density, noise.get("rate", 0.0)),
+        accelerometer_walk=max(imu.accelerometer_walk, _walk(driver, "EK3_ABIAS_P_NSE")),
+        gyroscope_walk=max(imu.gyroscope_walk, _walk(driver, "EK3_GBIAS_P_NSE")),
     )
     late = [each.latencies[1] for each in sensing.sensors.values() if each.late]
-    horizon = max([sensing.ekf.horizon, *(t + 2.5 / rate for t in late)])
-    ekf, link = replace(sensing.ekf, horizon=horizon), scenario.vehicle_link
+    ekf = replace(
+        sensing.ekf,
+        horizon=max([sensing.ekf.horizon, *(t + 2.5 / rate for t in late)]),
+        imu_latency=_imu_latency(driver, scenario, 1 / rate, noise.get("delay", 0.0)),
+        latency_std=max(sensing.ekf.latency_std, _LATENCY),
+        timing_std=max(sensing.ekf.timing_std, 1 / rate / math.sqrt(3)),  # a sample to either side
+    )
+    link = scenario.vehicle_link
     if not scenario.positioned and link is not None:
         say(
             "no sensor of horizontal motion: the vehicle does not know where it is; depth and "
@@ -135,19 +151,44 @@ def as_granted(scenario: Scenario, driver: Driver, say: Tell = lambda text: None
     return replace(scenario, station=replace(scenario.station, sensing=sensing))
 
 
+def _walk(driver: Driver, name: str) -> float:
+    """Random walk of a bias (its unit/√s) that the autopilot's EKF3 assumes by a parameter.
+
+    A bias changes by white noise of the parameter times the filter's period in each of its steps.
+    """
+    return driver.parameters.get(name, 0.0) * math.sqrt(_EKF3_PERIOD)
+
+
+def _imu_latency(driver: Driver, scenario: Scenario, period: float, delay: float) -> float:
+    """Time (s) after which inertial samples around it have come, for a `delay` of their messages.
+
+    Those of a period are on either side, and the autopilot's low-passes delay them. It is at most
+    what the other sensors' readings can wait.
+    """
+    names = ("INS_ACCEL_FILTER", "INS_GYRO_FILTER")
+    filtered = max(filter_delay(driver.parameters.get(name, 0.0)) for name in names)
+    sensors = scenario.station.sensing.sensors.values()
+    aids = [each for each in sensors if each.observes is not None]
+    waits = [1 / each.rate + each.latencies[0] - period for each in aids]
+    return max(0.0, min([delay + period + filtered, *waits]))
+
+
 def resting_noise(driver: Driver, scenario: Scenario, seconds: float = 2.0) -> dict[str, float]:
     """Noise of a vehicle at rest: std of `depth` (m), densities of `force` and `rate`.
 
-    From differences of successive values, which slow motion hardly changes.
+    From differences of successive values, which slow motion hardly changes. And the `delay` (s)
+    that few messages with inertial samples exceed.
     """
-    sensor, times = scenario.station.sensing.depth, []
+    sensor, times, delays = scenario.station.sensing.depth, [], []
     values: dict[str, list] = {"depth": [], "imu": []}
 
     def read(found: Received) -> None:
         name = found.message.get_type()
         if name == telemetry.IMUS[0]:
+            sample = telemetry.inertial(driver.link, found)
             times.append(found.arrival)
-            values["imu"].append(telemetry.inertial(driver.link, found).value)
+            delays.append(found.arrival - sample.taken)
+            values["imu"].append(sample.value)
         elif name.startswith("SCALED_PRESSURE") and sensor is not None:
             depth = telemetry.depth(driver.link, driver.parameters, sensor.assumed_density)
             if depth is not None and [float(depth.value[0])] != values["depth"][-1:]:
@@ -162,5 +203,6 @@ def resting_noise(driver: Driver, scenario: Scenario, seconds: float = 2.0) -> d
         steps: Any = np.diff(np.array(values["imu"], float), axis=0)
         std = steps.std(axis=0) / math.sqrt(2)
         scale = math.sqrt(2 * (times[-1] - times[0]) / (len(times) - 1))
+        found["delay"] = float(np.quantile(delays, _NEARLY_ALL))
         found |= {"force": float(std[:3].max() * scale), "rate": float(std[3:].max() * scale)}
     return found

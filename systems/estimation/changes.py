@@ -19,8 +19,9 @@ then something has changed (Willsky and Jones 1976), and what may have changed i
   drift, of the sensor or less likely of the IMU, and the offset is a random walk that follows the
   correlation of the innovations.
 
-An offset that returns to zero after a clear one is zero again. No doubt ends by the clock: what
-covers a fault shrinks by information alone.
+An offset that returns to zero after a clear one is zero again; a sensor whose offset is known to be
+within its noise is trusted. No doubt ends by the clock: what covers a fault shrinks by
+information alone.
 """
 
 from collections.abc import Sequence
@@ -37,7 +38,7 @@ from .error_state import ACCEL_BIAS, GYRO_BIAS, INERTIAL, Navigation, moved, ret
 from .inertial import Samples
 from .measurement import Seen, Update, small_inverse
 from .readings import each_value, noises, offset_places, parts, sizes
-from .trust import FEW_READINGS, Trust, alike
+from .trust import FEW_READINGS, Trust, alike, trusted
 
 _FALSE_ALARM = 1e-6  # probability that a consistent filter's pull is found to be too large
 _BY_CHANCE = 1e-3  # that it is taken back where a sensor has changed
@@ -285,13 +286,31 @@ def settled(
         return moved_to._replace(sensors=sensors), after
 
     x, P = jax.lax.cond(values.any(), condition, lambda: (x, P))
+    as_before = _as_before(aids, trust, P, x) & (trust.passed >= patience)
     trust = trust._replace(
-        changed=jnp.where(right, 0, trust.changed),
+        changed=jnp.where(right | as_before, 0, trust.changed),
         before=jnp.where(back, 0, trust.before),
         shift=jnp.where(back, 0, trust.shift),
         walk=jnp.where(back, 0, trust.walk),
     )
     return trust, x, P
+
+
+def _as_before(
+    aids: Sequence[Sensor], trust: Trust, P: Float[Array, "e e"], x: Navigation
+) -> Bool[Array, "n"]:
+    """Sensors whose offsets are known to be within their noise and do not move.
+
+    Another cause explained their readings, or taking back what they had shifted.
+    """
+    still = ~_moving(aids, trust)
+    return trusted(aids, P, x) & jnp.stack([still[part].all() for part in parts(aids)])
+
+
+def _moving(aids: Sequence[Sensor], trust: Trust) -> Bool[Array, "m"]:
+    """Values whose offsets walk by more than their noise between two readings."""
+    periods = each_value(jnp.asarray([1 / each.rate for each in aids], trust.walk.dtype), aids)
+    return trust.walk * periods > noises(aids, trust.walk.dtype) ** 2
 
 
 def _returned(
@@ -307,11 +326,8 @@ def _returned(
     """
     of_offsets, of_drifts = offset_places(aids, P.shape[0])
     at, variance = x.sensors[of_offsets - INERTIAL], jnp.diag(P)[of_offsets]
-    rates = jnp.asarray([each.rate for each in aids], at.dtype)
-    period, noise = each_value(1 / rates, aids), noises(aids, at.dtype)
     drift, spread = x.sensors[of_drifts - INERTIAL], jnp.diag(P)[of_drifts]
-    moves = trust.walk * period > noise**2
-    moves |= drift**2 > _NEAR**2 * spread
+    moves = _moving(aids, trust) | (drift**2 > _NEAR**2 * spread)
     near = (at**2 <= _NEAR**2 * variance) & ~moves
     was = trust.before**2 > _RETURNED**2 * variance
     open_ = variance > 0

@@ -19,6 +19,11 @@ class EkfConfig:
             consistent filter has 3 (`spinndrift check estimator --only calm`, and
             `tests/test_filtering.py` without a DVL).
         horizon: longest latency of a reading (s).
+        imu_latency: time by which the IMU's samples are late (s), as those of a link that buffers
+            them; readings of the other sensors wait as long.
+        latency_std: standard deviation of a constant by which the times of validity of each other
+            sensor's readings are too late (s), which is then estimated; 0: they are right.
+        timing_std: standard deviation of each of those times around that constant (s).
         gate: probability that a good reading passes the chi-square gate.
         patience: number of consecutive rejections after which something must have changed: the
             sensor, whose offset is then a state, or the filter, whose covariance then grows by
@@ -34,6 +39,9 @@ class EkfConfig:
     velocity_std: Vector3 = (0.02, 0.02, 0.02)
     imu_factor: float = 1.2
     horizon: float = 0.24
+    imu_latency: float = 0.0
+    latency_std: float = 0.0
+    timing_std: float = 0.0
     gate: float = 0.999
     patience: int = 3
     output_rate: float = 20.0
@@ -46,6 +54,8 @@ class EkfConfig:
         check_numbers(self)
         for field in ("position_std", "attitude_std", "velocity_std"):
             require(min(getattr(self, field)) >= 0, self, field, "give zero or more")
+        for field in ("imu_latency", "latency_std", "timing_std"):
+            require(getattr(self, field) >= 0, self, field, "give zero or more")
         above_zero = ("imu_factor", "horizon", "output_rate", "silence")
         for field in (*above_zero, "lost_velocity", "lost_attitude"):
             require(getattr(self, field) > 0, self, field, "give a number above zero")

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ...models import se3
 from . import changes, error_state, inertial, jolts, measurement, recovery
 from .error_state import Navigation
 from .inertial import Motion, Samples
@@ -42,13 +43,14 @@ class DelayedFilter(Layout):
             Samples.start(V_WB_B[3:]),
             Motion.start(V_WB_B.dtype),
             Shown.start(self.aids, V_WB_B.dtype),
-            Trust.start(self.aids, V_WB_B.dtype),
+            Trust.start(self.aids, V_WB_B.dtype, self.errors),
         )
 
     def step(self, state: FilterState, readings: Readings, k: Float[Array, ""]) -> FilterState:
         """Take in sample number k (of time k · period) and advance the horizon by one slot.
 
-        Sample 0 is at the initial time and causes no prediction; before it, k is negative. The
+        Sample 0 is at the initial time and causes no prediction; before it, k is negative. Times
+        here are those at which samples come; the state is that of `imu_latency` before. The
         nominal state is predicted with every sample; the covariance is predicted with the mean of
         the samples, before a reading is fused and at least every 0.1 s.
         """
@@ -84,7 +86,8 @@ class DelayedFilter(Layout):
 
         def place(old: Array, reading: Array, i: int) -> Array:
             """The columns with [1, value] in the slot of a usable reading's time."""
-            here = (number == jnp.round(reading[-1] / h)) & usable[i]
+            at = reading[-1] + self.config.imu_latency
+            here = (number == jnp.round(at / h)) & usable[i]
             row = jnp.concatenate([jnp.ones(1, dtype), reading[:-2]])
             return jnp.where(here[:, None], row[None], old)
 
@@ -211,7 +214,8 @@ class DelayedFilter(Layout):
             ),
         )
         x, P = changes.taken_back(x, P, change)
-        off = measurement.off(self.aids, x, self._rate(slot), self._values(slot))
+        given = (x, self._rate(slot), self._values(slot), self._acceleration(state, x, slot))
+        off = measurement.off(self.aids, *given)
         trust, x, P = changes.opened(self.aids, trust, x, P, change, off, seen)
         return trust, x, P, doubted & ~change.jolt
 
@@ -251,7 +255,20 @@ class DelayedFilter(Layout):
         between = state.samples.rate_covariance(self.imu.integrating)
         turning = slot[self.rate_column + 3 + inertial.LEFT_OPEN // 2] > 0  # without a rate
         between = between + jnp.where(turning, state.motion.usual[1], 0) * jnp.eye(3)
-        return measurement.innovations(self.aids, x, self._rate(slot), between, self._values(slot))
+        given = (self.aids, x, self._rate(slot), between, self._values(slot))
+        acceleration = self._acceleration(state, x, slot)
+        return measurement.innovations(*given, acceleration, self.config.timing_std)
+
+    def _acceleration(
+        self, state: FilterState, x: Navigation, slot: Float[Array, "row"]
+    ) -> Float[Array, "3"] | None:
+        """Derivative of v_B at a slot (m/s²); none if the readings' times are exact."""
+        if not self.config.latency_std and not self.config.timing_std:
+            return None
+        force, omega = slot[1:4] - x.accel_bias, self._rate(slot) - x.gyro_bias
+        now = force - error_state.held_force(x, omega, self.imu.gravity)
+        missing = slot[self.rate_column + 3] > 0
+        return jnp.where(missing, state.motion.recent[:3], now)
 
     def covariance(self, state: FilterState) -> Float[Array, "e e"]:
         """P at the horizon, of δ (`systems.estimation.error_state`)."""
@@ -325,10 +342,16 @@ class DelayedFilter(Layout):
         _, P = self._covariance(state, now, state.since + jnp.sum(waiting, axis=0))
         foreseen = state.samples.foreseen - jnp.concatenate([x.accel_bias, x.gyro_bias])
         rate = foreseen[3:]
-        beyond = error_state.sample_increment(foreseen[:3], rate, ahead * ring[-1, 0])
+        # gravity turns in body axes, from the middle of those forces to the end
+        up_B = error_state.held_force(now, jnp.zeros_like(rate), self.imu.gravity)
+        since = ahead + (inertial.FEW - 1) / 2 * self.period
+        force = foreseen[:3] - since * se3.cross(rate, up_B)
+        beyond = error_state.sample_increment(force, rate, ahead * ring[-1, 0])
         now = error_state.apply(now, beyond, self.imu.gravity)
         P = error_state.in_body_axes(now, P)
-        P = P + error_state.foreseen_covariance(state.samples.steps, now.v_B, ahead, self.errors)
+        # over several samples the error of a force or rate that is held grows with the time
+        steps = state.samples.steps * jnp.maximum(1, ahead / self.period)
+        P = P + error_state.foreseen_covariance(steps, now.v_B, ahead, self.errors)
         doubtful = (state.trust.noise_factor > 1).any()
         P = jnp.where(doubtful, _APPROXIMATE, 1) * P
         return now.X_WB, jnp.concatenate([now.v_B, rate]), (P + P.T) / 2

@@ -42,9 +42,9 @@ class _Flat:
         return flat, *self.show(flat, jnp.zeros((), w.dtype))
 
     def show(self, flat: Array, t: Array) -> tuple[Array, ...]:
-        """The outputs at time `t`: the newest sample is one period old."""
+        """The outputs at time `t`: the newest sample is one period old when it comes."""
         core, state = self.core, self.unravel(flat)
-        X, V, P = core.present(state, jnp.minimum(t, core.period))
+        X, V, P = core.present(state, jnp.minimum(t, core.period + core.config.imu_latency))
         k = jnp.round(t / core.period) - 1
         P_shown = P[: core.shown, : core.shown].reshape(-1)
         return X, V, P_shown, core.status(state, k), core.health(state, P, k)

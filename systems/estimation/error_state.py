@@ -31,6 +31,7 @@ from jaxtyping import Array, Float
 
 from ...models import se3
 from ...models.sensors import Imu, Sensor
+from .readings import sizes
 
 INERTIAL = 15
 """Components of δ without those of sensors besides the IMU."""
@@ -267,7 +268,7 @@ def transition(
     G, H = T * skew(g_B), -(T * T / 2) * skew(force)
     C_v = -(1 - m) * (skew(A @ before.v_B) + G) @ J
     C_p = -H @ J
-    rho = decays(aids, T)
+    rho = decays(aids, before.sensors.size, T)
     rows = [
         jnp.concatenate(
             [A, H @ A - T * A @ skew(before.v_B), T * A, T * C_p, -(T * T / 2) * eye], 1
@@ -279,8 +280,8 @@ def transition(
         jnp.concatenate([zero, zero, zero, eye, zero], 1),
         jnp.concatenate([zero, zero, zero, zero, eye], 1),
     ]
-    values = (rho.size - len(aids)) // 2
-    drifting = jnp.diag(rho) + T * jnp.eye(rho.size, k=values).at[: len(aids)].set(0)
+    values = sum(sizes(aids))
+    drifting = jnp.diag(rho) + T * jnp.eye(rho.size, k=values).at[: -2 * values].set(0)
     F = jax.scipy.linalg.block_diag(jnp.concatenate(rows), drifting)
     rest = jnp.zeros((6 + rho.size, 3), force.dtype)
     N_g = jnp.concatenate([C_p, -J, C_v, rest])
@@ -362,13 +363,14 @@ def passed(
     aids: Sequence[Sensor], sensors: Float[Array, "s"], time: Float[Array, ""]
 ) -> Float[Array, "s"]:
     """The sensors' errors after a time (s): slow ones decay, offsets drift."""
-    n, m = len(aids), (sensors.size - len(aids)) // 2
-    drifts = jnp.concatenate([jnp.zeros(n, sensors.dtype), sensors[n + m :], jnp.zeros(m)])
-    return decays(aids, time) * sensors + time * drifts
+    m = sum(sizes(aids))
+    still = jnp.zeros(sensors.size - 2 * m, sensors.dtype)
+    drifts = jnp.concatenate([still, sensors[still.size + m :], jnp.zeros(m)])
+    return decays(aids, sensors.size, time) * sensors + time * drifts
 
 
-def decays(aids: Sequence[Sensor], time: Float[Array, ""]) -> Float[Array, "s"]:
-    """Factors on the sensors' slow errors, offsets and drifts over a time (s)."""
+def decays(aids: Sequence[Sensor], size: int, time: Float[Array, ""]) -> Float[Array, "s"]:
+    """Factors on the sensors' `size` errors over a time (s): slow ones decay, others last."""
     lasting = [each.slow_error[1] for each in aids]
-    lasting += [math.inf] * (2 * sum(each.value_size for each in aids))
+    lasting += [math.inf] * (size - len(aids))
     return jnp.exp(-time / jnp.asarray(lasting, time.dtype))

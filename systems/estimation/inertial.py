@@ -203,7 +203,7 @@ def take(
     left_open = jnp.where(believed, 0.0, jnp.stack([held, doubted])).T.reshape(-1)
     rate = jnp.where(believed[1], rate, fading)
     force = jnp.where(believed[0], force, 0.0)
-    mean = rate if imu.integrating else (rate + memory.rates[-1]) / 2
+    mean_force, mean = _means(imu, memory, force, rate, believed[0])
 
     after = _learn(imu, memory, step, bound, force, rate, believed)
     after = after._replace(
@@ -215,8 +215,28 @@ def take(
         count=memory.count + 1,
     )
     after = _jolted(after, step, (jnp.abs(step) > rare) & judged, refused, T)
-    row = jnp.concatenate([(number >= 1).astype(dtype)[None], force, mean, left_open])
+    row = jnp.concatenate([(number >= 1).astype(dtype)[None], mean_force, mean, left_open])
     return jax.tree.map(lambda new, old: jnp.where(number >= 0, new, old), after, memory), row
+
+
+def _means(
+    imu: Imu,
+    memory: Samples,
+    force: Float[Array, "3"],
+    rate: Float[Array, "3"],
+    believed: Bool[Array, ""],
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Mean force, in the axes at the interval's end, and mean rate since the sample before.
+
+    Those of instantaneous samples are by the trapezoidal rule, where both forces are known.
+    """
+    if imu.integrating:
+        return force, rate
+    mean = (rate + memory.rates[-1]) / 2
+    turn = se3.exp(jnp.concatenate([jnp.zeros_like(mean), mean / imu.rate]))
+    before = se3.rotate_inverse(turn, memory.forces[-1])
+    both = believed & (memory.missing[0] <= 0) & (memory.count > 0)
+    return jnp.where(both, (force + before) / 2, force), mean
 
 
 def _jolted(

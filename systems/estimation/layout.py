@@ -44,6 +44,19 @@ class Layout(eqx.Module):
                 f"give at least the {type(sensor).__name__}'s latest latency and two samples, "
                 f"{longest:.3g} s",
             )
+            replaced = 1 / sensor.rate + sensor.latencies[0]
+            require(
+                self.config.imu_latency <= max(0.0, replaced - self.period) + 1e-9,
+                self.config,
+                "imu_latency",
+                f"give at most {replaced - self.period:.3g} s: the {type(sensor).__name__}'s next "
+                "reading may come by then",
+            )
+
+    def _shown_for(self, sensor: Sensor) -> float:
+        """Shortest time for which a reading is there after the samples of its time (s)."""
+        earliest, latest = sensor.latencies
+        return 1 / sensor.rate + earliest - max(latest, self.config.imu_latency)
 
     @property
     def period(self) -> float:
@@ -73,11 +86,18 @@ class Layout(eqx.Module):
     @property
     def errors(self) -> int:
         """Number of components of the error state."""
-        return error_state.INERTIAL + len(self.aids) + 2 * sum(sizes(self.aids))
+        return error_state.INERTIAL + self._lasting + 2 * sum(sizes(self.aids))
+
+    @property
+    def _lasting(self) -> int:
+        """Number of the sensors' slow errors and latencies."""
+        return len(self.aids) * (2 if self.config.latency_std > 0 else 1)
 
     @property
     def shown(self) -> int:
-        """Number of those components whose covariance is shown: all but offsets and drifts."""
+        """Number of those components whose covariance is shown: all but latencies, offsets and
+        drifts.
+        """
         return error_state.INERTIAL + len(self.aids)
 
     @property
@@ -87,8 +107,7 @@ class Layout(eqx.Module):
 
     def samples_at_once(self, most: int) -> int:
         """Largest divisor of `most` so that `take_in` of so many samples misses no reading."""
-        gaps = [(1 / each.rate, each.latencies) for each in self.aids]
-        shortest = min(period - (latest - earliest) for period, (earliest, latest) in gaps)
+        shortest = min(self._shown_for(each) for each in self.aids)
         fit = [
             n for n in range(1, most + 1) if most % n == 0 and n * self.period <= shortest + 1e-9
         ]
@@ -109,6 +128,7 @@ class Layout(eqx.Module):
         c = self.config
         slow = (each.slow_error[0] for each in self.aids)
         biases = (self.imu.gyroscope_bias,) * 3 + (self.imu.accelerometer_bias,) * 3
+        late = (c.latency_std,) * (self._lasting - len(self.aids))
         none = (0.0,) * (2 * sum(sizes(self.aids)))
-        stds = (*c.position_std, *c.attitude_std, *c.velocity_std, *biases, *slow, *none)
+        stds = (*c.position_std, *c.attitude_std, *c.velocity_std, *biases, *slow, *late, *none)
         return jnp.asarray(stds, jnp.result_type(float))

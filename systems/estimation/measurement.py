@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ...models import se3
 from ...models.sensors import Sensor
+from ...models.sensors.base import Innovation as Predicted
 from .error_state import (
     GYRO_BIAS,
     INERTIAL,
@@ -21,7 +22,7 @@ from .error_state import (
     moved,
     retract,
 )
-from .readings import offsets
+from .readings import offsets, sizes
 
 
 class Innovation(NamedTuple):
@@ -38,14 +39,21 @@ def innovations(
     rate: Float[Array, "3"],
     rate_covariance: Float[Array, "3 3"],
     values: Sequence[Float[Array, "_"]],
+    acceleration: Float[Array, "3"] | None = None,
+    timing_std: float = 0.0,
 ) -> list[Innovation]:
     """The innovations of all sensors' readings; `rate` is the gyroscope's, with its bias.
 
-    `rate_covariance` is that of the rate between samples, without the bias.
+    `rate_covariance` is that of the rate between samples, without the bias. With an `acceleration`,
+    the derivative of v_B, a reading y whose time of validity is too late by τ is taken as y + ẏ τ:
+    the latency τ is part of the state if that has one, and the noise covers a further `timing_std`
+    (s).
     """
     V = jnp.concatenate([nominal.v_B, rate - nominal.gyro_bias])
     found = []
-    for i, (sensor, place) in enumerate(zip(aids, offsets(aids), strict=True)):
+    for i, (sensor, place) in enumerate(
+        zip(aids, offsets(aids, nominal.sensors.size), strict=True)
+    ):
         seen = partial(sensor.innovation, nominal.X_WB, V, nominal.sensors[i : i + 1])
         right = values[i] - nominal.sensors[place]
         one = seen(right)
@@ -62,8 +70,32 @@ def innovations(
         R = jnp.diag(jnp.asarray([std**2 for std in sensor.noise_std], V.dtype))
         if one.rate is not None:
             R = R + one.rate @ rate_covariance @ one.rate.T
-        found.append(Innovation(one.residual, H, R))
+        residual = one.residual
+        if acceleration is not None:
+            changes = _derivative(sensor, one, V, acceleration)
+            R = R + timing_std**2 * jnp.outer(changes, changes)
+            late = _latency(aids, nominal, i)
+            if late is not None:
+                residual = residual + changes * late
+                H = H.at[:, INERTIAL + len(aids) + i].set(-changes)
+        found.append(Innovation(residual, H, R))
     return found
+
+
+def _derivative(
+    sensor: Sensor, one: Predicted, V: Float[Array, "6"], acceleration: Float[Array, "3"]
+) -> Float[Array, "m"]:
+    """ẏ of a sensor's values y, for a twist and the derivative of v_B."""
+    changes = jnp.zeros(sensor.value_size, V.dtype)
+    for slope, derivative in ((one.pose, V), (one.velocity, acceleration)):
+        changes = changes if slope is None else changes + slope @ derivative
+    return changes
+
+
+def _latency(aids: Sequence[Sensor], nominal: Navigation, i: int) -> Float[Array, ""] | None:
+    """Latency of sensor i (s), where latencies are part of the state."""
+    known = nominal.sensors.size > len(aids) + 2 * sum(sizes(aids))
+    return nominal.sensors[len(aids) + i] if known else None
 
 
 def off(
@@ -71,13 +103,20 @@ def off(
     nominal: Navigation,
     rate: Float[Array, "3"],
     values: Sequence[Float[Array, "_"]],
+    acceleration: Float[Array, "3"] | None = None,
 ) -> Float[Array, "m"]:
     """The errors that would explain the readings, beyond the sensors' estimated ones."""
     V = jnp.concatenate([nominal.v_B, rate - nominal.gyro_bias])
     found = []
-    for i, (sensor, place) in enumerate(zip(aids, offsets(aids), strict=True)):
+    for i, (sensor, place) in enumerate(
+        zip(aids, offsets(aids, nominal.sensors.size), strict=True)
+    ):
         slow = nominal.sensors[i : i + 1]
-        found.append(sensor.off(nominal.X_WB, V, slow, values[i] - nominal.sensors[place]))
+        right, late = values[i] - nominal.sensors[place], _latency(aids, nominal, i)
+        if acceleration is not None and late is not None:
+            one = sensor.innovation(nominal.X_WB, V, slow, right)
+            right = right + late * _derivative(sensor, one, V, acceleration)
+        found.append(sensor.off(nominal.X_WB, V, slow, right))
     return jnp.concatenate(found)
 
 

@@ -40,9 +40,10 @@ def offset_places(aids: Sequence[Sensor], errors: int) -> tuple[np.ndarray, np.n
     return np.arange(errors - 2 * m, errors - m), np.arange(errors - m, errors)
 
 
-def offsets(aids: Sequence[Sensor]) -> list[slice]:
-    """The places of the sensors' offsets among their errors, after their slow errors."""
-    return [slice(part.start + len(aids), part.stop + len(aids)) for part in parts(aids)]
+def offsets(aids: Sequence[Sensor], size: int) -> list[slice]:
+    """The places of the sensors' offsets among their `size` errors: before their drifts."""
+    first = size - 2 * sum(sizes(aids))
+    return [slice(first + part.start, first + part.stop) for part in parts(aids)]
 
 
 class Shown(NamedTuple):

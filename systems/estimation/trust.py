@@ -80,11 +80,12 @@ class Trust(NamedTuple):
     """When one of its jolts was last found to be an error (s)."""
 
     @classmethod
-    def start(cls, aids: Sequence[Sensor], dtype: jnp.dtype) -> "Trust":
-        """No sensor is suspect."""
+    def start(cls, aids: Sequence[Sensor], dtype: jnp.dtype, errors: int | None = None) -> "Trust":
+        """No sensor is suspect; δ has `errors` components, by default without latencies."""
         n, m = len(aids), sum(sizes(aids))
+        lasting = INERTIAL + n if errors is None else errors - 2 * m
         zero, one, never = jnp.zeros(n, dtype), jnp.ones(n, dtype), jnp.full(n, -1e9, dtype)
-        values, pulled = jnp.zeros(m, dtype), jnp.zeros((2, n, INERTIAL + n), dtype)
+        values, pulled = jnp.zeros(m, dtype), jnp.zeros((2, n, lasting), dtype)
         return cls(
             nis=zero,
             rejected=zero,
@@ -171,7 +172,7 @@ def counted(
     value = jnp.minimum(value, _CLIPPED * jnp.maximum(trust.scatter, 1))
     matched = trust.scatter + (value - trust.scatter) / _MATCHED
     several = jnp.sum(trust._scattered) > 1
-    small = jnp.all(trust.scatter <= 1)
+    small = jnp.median(trust.scatter) <= 1  # one sensor's noise may be other than it says
     shrunk = jnp.where(small, trust.imu_factor / _GROWTH, trust.imu_factor)
     factor = jnp.where(several, trust.imu_factor * _GROWTH, shrunk)
     return trust._replace(

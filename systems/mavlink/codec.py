@@ -109,18 +109,28 @@ def body_vector(forward: Field, right: Field, down: Field) -> Float[np.ndarray, 
 
 def imu_angular_rate(xgyro: Field, ygyro: Field, zgyro: Field) -> Float[np.ndarray, "3 *batch"]:
     """ω in B (rad/s) from RAW_IMU or SCALED_IMU fields (mrad/s, FRD)."""
-    return body_vector(xgyro, ygyro, zgyro) * 1e-3
+    return body_vector(*map(_untruncated, (xgyro, ygyro, zgyro))) * 1e-3
 
 
 def imu_specific_force(xacc: Field, yacc: Field, zacc: Field) -> Float[np.ndarray, "3 *batch"]:
     """Specific force in B (m/s²; +9.8 along z at rest, level) from RAW_IMU fields (mg, FRD)."""
-    return body_vector(xacc, yacc, zacc) * (G * 1e-3)
+    return body_vector(*map(_untruncated, (xacc, yacc, zacc))) * (G * 1e-3)
+
+
+def _untruncated(field: Field) -> np.ndarray:
+    """The middle of the values that an integer field stands for.
+
+    ArduPilot converts to integers by truncation towards zero (`GCS_MAVLINK::send_raw_imu`): in a
+    turn the rate is half a mrad/s too small on average, which attitude gains as an error.
+    """
+    values = np.asarray(field, float)
+    return np.asarray(values + np.sign(values) / 2)
 
 
 def imu_fields(
     omega_B: Float[np.ndarray, "3 *batch"], f_B: Float[np.ndarray, "3 *batch"]
 ) -> tuple[Float[np.ndarray, "3 *batch"], Float[np.ndarray, "3 *batch"]]:
-    """Gyro (mrad/s) and accelerometer (mg) fields of RAW_IMU, not yet rounded to integers."""
+    """Gyro (mrad/s) and accelerometer (mg) fields of RAW_IMU, not yet truncated to integers."""
     return frd_to_flu(omega_B) * 1e3, frd_to_flu(f_B) * (1e3 / G)
 
 

@@ -19,12 +19,15 @@ from scipy.spatial.transform import Rotation
 from ...models.sensors import Compass, DepthSensor, Dvl, Imu, Sensor
 from ..drake import drake_array, set_groups, value, value_or_none
 from . import telemetry
-from .codec import NEUTRAL_US, body_vector
+from .codec import NEUTRAL_US, body_vector, filter_delay
 from .driver import Acted, Driver
 from .inertial_samples import InertialSamples
 from .link import Received
 from .telemetry import Reading
 
+HELD = 1.5
+"""Periods of the filter for which an inertial sample is held, and half of those for which two are
+joined."""
 _AFTER = 5e-4  # s: commands go out after the updates of the same time
 _FRESH = 0.5  # s: older attitude or position of the autopilot is no estimate
 _GOOD, _LOST = 0.0, 2.0
@@ -75,8 +78,9 @@ class VehicleInterface(LeafSystem):
 
     Each sensor has an output port of its name with the layout of a simulated station's
     (`systems.plant.sensor_suite`); `pwm` are the outputs that the vehicle is told to give (µs).
-    The IMU's reading is the mean over the last period, NaN where nothing came or while it does not
-    change under thrust. Samples are dithered by their resolution: a vehicle at rest repeats them,
+    The IMU's reading is that of `imu_latency` ago, by when its samples have come; NaN where none
+    came or while they do not change under thrust. The delays of the autopilot's low-passes are
+    taken off. Samples are dithered by their resolution: a vehicle at rest repeats them,
     which is no fault (non-subtractive dither; Lipshitz et al. 1992). Other readings are
     taken at the sensors' configured rates at most, with their times of validity. A sensor that no
     message measures is never valid. `X_WB` and `health`, the estimate's, are for the guards.
@@ -110,16 +114,18 @@ class VehicleInterface(LeafSystem):
         *,
         command_period: float = 0.02,
         autopilot: bool = False,
+        imu_latency: float = 0.0,
     ):
         """For sensors by their ports' names, a number of thrusters and the length of `health`.
 
-        Without `autopilot` the ports of its estimate stay as they begin, lost.
+        `imu_latency` (s) is the filter's (`EkfConfig`). Without `autopilot` the ports of its
+        estimate stay as they begin, lost.
         """
         super().__init__()
         self._sensors = dict(sensors)
         mounts = {n: np.asarray(each.mount(jnp.dtype(float))) for n, each in sensors.items()}
         self._mounts = {name: _rotation(mount[:4]).as_matrix() for name, mount in mounts.items()}
-        self._estimated = autopilot
+        self._estimated, self._imu_latency = autopilot, imu_latency
         self._F = self.DeclareVectorInputPort("F_Bo_B", 6)
         self._X = self.DeclareVectorInputPort("X_WB", 7)
         self._health = self.DeclareVectorInputPort("health", health)
@@ -161,7 +167,9 @@ class VehicleInterface(LeafSystem):
         """Take readings from `driver`; `epoch` is the local time (s) at the context's time 0."""
         self.end()
         self._driver, self._epoch, self._anchor = driver, epoch, anchor or Anchor()
-        self._samples, self._taken = InertialSamples(), {}
+        names = ("INS_ACCEL_FILTER", "INS_GYRO_FILTER")
+        force, rate = (filter_delay(driver.parameters.get(name, 0.0)) for name in names)
+        self._samples, self._taken = InertialSamples(HELD * self.period, (force, rate)), {}
         self._sampled = time.monotonic()
         self._held.enter_context(driver.link.reading(self._inertial))
 
@@ -182,8 +190,7 @@ class VehicleInterface(LeafSystem):
         t = context.get_time()
         for name, sensor in self._sensors.items():
             if isinstance(sensor, Imu):
-                now = t + self._epoch
-                found = self._samples.mean(now - self.period, now)
+                found = self._samples.at(t + self._epoch - self._imu_latency)
                 if self._frozen():
                     found = np.full(6, np.nan)
             else:

@@ -26,7 +26,13 @@ def hardware_station(
     thrusters = config.load_vehicle().thrusters().positions.shape[1]
     builder = DiagramBuilder()
     own = estimator is not None or link is None or link.estimate == "own"
-    interface = VehicleInterface(sensors, thrusters, sizes["health"], autopilot=not own)
+    interface = VehicleInterface(
+        sensors,
+        thrusters,
+        sizes["health"],
+        autopilot=not own,
+        imu_latency=config.sensing.ekf.imu_latency,
+    )
     vehicle = builder.AddNamedSystem("vehicle", interface)
     suffix, ekf = "_autopilot", vehicle
     if own:

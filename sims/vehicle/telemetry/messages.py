@@ -96,13 +96,13 @@ def _gps_raw(s: State) -> Message:
 
 
 def _imu_fields(s: State) -> list[int]:
-    """Accelerometer, gyroscope and magnetic field, rounded."""
+    """Accelerometer, gyroscope and magnetic field, truncated as by an autopilot."""
     m = s.motion
     gyro, accelerometer = codec.imu_fields(m.omega_B, m.f_B)
     inverse = codec.quaternion_to_frd_ned(m.q_WB) * [1, -1, -1, -1]
     field = rotated(inverse, np.array(_FIELD_NED))
     values = [*accelerometer, *gyro, *field]
-    return [_whole(float(v)) for v in values]
+    return [_whole(math.trunc(v)) for v in values]
 
 
 def _raw_imu(s: State) -> Message:

@@ -196,7 +196,10 @@ def test_an_accelerometer_that_feels_no_gravity_is_left_out(tmp_path):
     assert "imu_specific_force" in recording.dataset
     assert found == {}
     for change, said in (
-        (lambda t, f: f / 9.8, "its specific force is 1 m/s²"),
+        (
+            lambda t, f: f / 9.8,
+            "its specific force is 1.01 m/s²",
+        ),  # 102.04 mg as 102, that is 102.5
         (lambda t, f: -f, "does not point up in the world"),
     ):
         recording, found, _ = imported(tmp_path, with_imu(dive(duration=DURATION), change))

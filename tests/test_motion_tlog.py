@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from log_writers import dialect, dive, truth
 
-from spinndrift.systems.logs.load import import_log
+from spinndrift.systems.logs.load import LogOptions, import_log
 from spinndrift.systems.logs.motion_tlog import upright
 from spinndrift.systems.logs.signals import Series
 
@@ -64,6 +64,35 @@ def test_positions_slower_than_the_climb_of_the_display_are_read_to_their_last(t
     runs = list(recording.trajectories())
     assert sum(len(run) for run in runs) * recording.dt > 30.0
     assert not np.isnan(runs[0].X_WB).any()
+
+
+STATUS = dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
+
+
+@pytest.mark.parametrize(
+    ("reported", "flags", "lasts"),
+    [
+        # the heartbeats end after 35 s
+        (lambda t: t < 104.0, 831, [35.0]),
+        (lambda t: t > 120.0, 831, [35.0]),
+        (lambda t: not 108.0 < t < 124.0, 831, [35.0]),
+        (lambda t: t < 104.0, 1 | 128, [3.0, 32.0]),  # without a horizontal estimate until 103 s
+    ],
+)
+def test_reports_of_the_filter_that_stop_leave_the_rest_to_the_position(
+    tmp_path, reported, flags, lasts
+):
+    log = dive(duration=36.0)
+    log.records = [r for r in log.records if number(r[1]) != STATUS or reported(r[0])]
+    if flags != 831:
+        log.records = [r for r in log.records if number(r[1]) != STATUS]
+        for t in np.arange(100.0, 104.0):
+            log.send(t, dialect.MAVLink_ekf_status_report_message(flags, 0, 0, 0, 0, 0))
+    recording, _ = imported(tmp_path, log, options=LogOptions(minimum=2.0))
+    runs = [len(run) * recording.dt for run in recording.trajectories()]
+    assert runs == pytest.approx(lasts, abs=0.3)
+    unknown = [np.isnan(run.V_WB_B[:, 0]).all() for run in recording.trajectories()]
+    assert unknown == [False] if len(lasts) == 1 else [True, False]
 
 
 def test_short_pauses_of_the_local_position_stay_gaps(tmp_path):

@@ -8,6 +8,7 @@ import pytest
 
 from spinndrift.models.config.errors import UserError
 from spinndrift.models.recordings.build import Trajectory
+from spinndrift.models.recordings.origin import states_estimated
 from spinndrift.models.recordings.outputs import outputs_of, with_outputs
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.recordings.summary import summarize
@@ -156,6 +157,9 @@ def test_concatenation_keeps_every_run():
     assert a.command_period == a.dt
     assert Recording.concat([a, sparse]).command_period == 0.2
     assert [r.commands_sampled for r in (a, sparse, both)] == [False, True, False]
+    own = Recording(a.dataset.assign_attrs(states_estimated=1))
+    joined = [Recording.concat(some).dataset for some in ([own, own], [own, a])]
+    assert [states_estimated(d) for d in joined] == [True, False]
     other = Recording.from_trajectories(
         [trajectory(commands={"pwm": np.full((40, 8), 1500.0)})], DT, vehicle="test"
     )

@@ -20,6 +20,7 @@ from ..se3 import WRENCH
 from ..vehicles.places import named_in
 from .build import Trajectory, assemble, window
 from .commands import forces_of, thrusters_of, voltage_of
+from .origin import PERIOD, of_all
 from .outputs import common_outputs, with_outputs
 from .schema import (
     COMMANDS,
@@ -37,7 +38,6 @@ from .schema import (
 )
 from .splits import run_parts, time_parts
 
-_PERIOD = "command_period"
 """Attribute of a log's recording: period (s) of its commands."""
 
 
@@ -84,12 +84,12 @@ class Recording:
     @property
     def command_period(self) -> float:
         """Period (s) of the commands in the log; `dt` if unknown."""
-        return float(self.dataset.attrs.get(_PERIOD, self.dt))
+        return float(self.dataset.attrs.get(PERIOD, self.dt))
 
     @property
     def commands_sampled(self) -> bool:
         """Whether commands are a log's samples of faster ones; else each was held over its step."""
-        return _PERIOD in self.dataset.attrs
+        return PERIOD in self.dataset.attrs
 
     @property
     def scenarios(self) -> tuple[str, ...]:
@@ -350,9 +350,9 @@ class Recording:
             source="; ".join(source for source in sources if source),
             notes=list(notes),
         )
-        sampled = [r.command_period for r in recordings if r.commands_sampled]
-        dataset = with_outputs(joined.dataset, common_outputs([r.dataset for r in recordings]))
-        return cls(dataset.assign_attrs({_PERIOD: max(sampled)} if sampled else {}))
+        datasets = [r.dataset for r in recordings]
+        dataset = with_outputs(joined.dataset, common_outputs(datasets))
+        return cls(dataset.assign_attrs(of_all(datasets)))
 
     # files
 

@@ -10,6 +10,7 @@ import numpy as np
 from ...models.config.errors import UserError
 from ...models.recordings.checks.finding import enforce, with_findings
 from ...models.recordings.csv import METADATA, read_csv
+from ...models.recordings.origin import ESTIMATED, PERIOD
 from ...models.recordings.outputs import with_outputs
 from ...models.recordings.schema import check_plausible
 from ...models.recordings.store import Recording
@@ -27,7 +28,7 @@ from .report import ImportReport, tell
 from .signals import Signals
 from .signals_dataflash import WANTED as BIN_WANTED
 from .signals_dataflash import signals_from_bin
-from .signals_tlog import AIDS, signals_from_tlog
+from .signals_tlog import ANYONE, signals_from_tlog
 from .signals_tlog import WANTED as TLOG_WANTED
 from .sound import sound
 from .tlog import read_tlog
@@ -147,7 +148,8 @@ def import_log(  # long: a third of it says what it takes and refuses
     recording = Recording(with_outputs(recording.dataset, signals.channels))
     recording, settled_ = settled(recording, signals.turned, signals.turned_since)
     dataset = with_findings(recording.dataset, [*signals.findings, *moved, *settled_])
-    return Recording(dataset.assign_attrs(command_period=period)), report
+    attrs = {PERIOD: period} | ({ESTIMATED: 1} if signals.estimated else {})
+    return Recording(dataset.assign_attrs(attrs)), report
 
 
 def usual_rate(signals: Signals) -> float:
@@ -256,7 +258,7 @@ def _signals(
         if raw.kind == "bin":
             read = read_bin(raw.data, BIN_WANTED, progress)
             return raw.notes, signals_from_bin(read, vehicle, density)
-        log = read_tlog(raw.data, TLOG_WANTED, options.system, progress, AIDS)
+        log = read_tlog(raw.data, TLOG_WANTED, options.system, progress, ANYONE)
         return raw.notes, signals_from_tlog(log, vehicle, density)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error

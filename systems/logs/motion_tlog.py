@@ -9,13 +9,13 @@ from itertools import pairwise
 import numpy as np
 
 from ..mavlink import codec
-from .signals import Series, Spans, sampled_spans, series
+from .signals import Series, Spans, series, silences, witnessed_spans
 from .streams import UNAIDED
 from .table import Table
 
 _VELOCITY_HORIZ, _POS_HORIZ, _CONST_POS = 2, 8 | 16, 128
-_SILENT_S, _SILENT_PERIODS = 2.0, 10.0
-"""Local positions that are silent for this long, and for this many of their periods, stopped."""
+_SHORTEST_S = 2.0
+"""Height and climb alone are taken for no less time than this."""
 _BEFORE_S = 1e-6
 """A span of local positions ends before its last sample: after it x and y are unknown."""
 _WINDOW_S = 0.5
@@ -115,16 +115,14 @@ def upright(position: Series | None, velocity: Series | None) -> tuple[Series | 
 
 def _covered(one: Series) -> list[tuple[float, float]]:
     """Spans in which a stream is not silent."""
-    allowed = max(_SILENT_S, _SILENT_PERIODS / one.rate if one.rate else _SILENT_S)
-    breaks = np.flatnonzero(np.diff(one.t) > allowed)
-    starts, stops = one.t[[0, *(breaks + 1)]], one.t[[*breaks, -1]]
-    return list(zip(starts.tolist(), stops.tolist(), strict=True))
+    edges = [float(one.t[0]), *(x for span in silences(one.t) for x in span), float(one.t[-1])]
+    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _outside(covered: list[tuple[float, float]], other: Series) -> list[tuple[float, float]]:
     """Spans of another stream that are longer than a short silence, and not covered."""
     edges = [float(other.t[0]), *(x for span in covered for x in span), float(other.t[-1])]
-    return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > _SILENT_S]
+    return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > _SHORTEST_S]
 
 
 def _with(one: Series, other: Series | None, outside: list[tuple[float, float]]) -> Series:
@@ -147,7 +145,7 @@ def _by_status(tables: Mapping[str, Table]) -> dict[str, Spans]:
         return {}
     flags = status["flags"].astype(int)
     aided = (flags & _VELOCITY_HORIZ > 0) & (flags & _POS_HORIZ > 0) & (flags & _CONST_POS == 0)
-    return {"aiding": sampled_spans(status["t"], ["" if a else UNAIDED for a in aided])}
+    return {"aiding": witnessed_spans(status["t"], ["" if a else UNAIDED for a in aided])}
 
 
 def _all(label: str) -> Spans:

@@ -17,6 +17,8 @@ from ..mavlink.codec import filter_delay
 
 LONGEST_STEP_S = 60.0
 """s between samples that still describe a motion; longer steps are gaps."""
+_SILENT_S, _SILENT_PERIODS = 2.0, 10.0
+"""A stream that is silent for this long, and for this many of its periods, has stopped."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,7 @@ class Signals:
         findings: what is wrong with the log.
         turned: thrusters (from 1) whose output was mirrored for SERVOn_REVERSED.
         turned_since: those of them from each time (s) on, where it changed.
+        estimated: whether attitude and velocity are known to be an autopilot's estimate.
         channels: output (from 1) of each thruster, 0 where none drives it; empty if unknown.
     """
 
@@ -90,6 +93,7 @@ class Signals:
     turned: tuple[int, ...] = ()
     turned_since: tuple[tuple[float, tuple[int, ...]], ...] = ()
     channels: tuple[int, ...] = ()
+    estimated: bool = False
 
 
 def series(t: np.ndarray, x: ArrayLike, source: str, quantity: str) -> Series | None:
@@ -122,6 +126,28 @@ def sampled_spans(t: np.ndarray, labels: Sequence[str]) -> Spans:
     change = np.flatnonzero(np.concatenate([[True], names[1:] != names[:-1]]))
     last = np.concatenate([change[1:] - 1, [len(names) - 1]])
     return Spans(t[change], t[last], tuple(str(names[i]) for i in change))
+
+
+def witnessed_spans(t: np.ndarray, labels: Sequence[str]) -> Spans:
+    """Spans of a state of which other streams tell as well: "" where its reports are silent.
+
+    As `sampled_spans`, but no time is lost before the first report, after the last one and where
+    they stop: a ground station may ask for them for a while only.
+    """
+    unreported = [(-np.inf, float(t[0])), *silences(t), (float(t[-1]), np.inf)]
+    after = [0, *(int(np.searchsorted(t, a)) + 1 for a, _ in unreported[1:])]
+    times = np.insert(t, np.repeat(after, 2), np.ravel(unreported))
+    names = np.insert(np.asarray(labels, dtype=object), np.repeat(after, 2), "")
+    return sampled_spans(times, names.tolist())
+
+
+def silences(t: np.ndarray) -> list[tuple[float, float]]:
+    """Spans between samples at times t (s, increasing) in which a stream has stopped."""
+    steps = np.diff(t)
+    if not steps.size:
+        return []
+    allowed = max(_SILENT_S, _SILENT_PERIODS * float(np.median(steps)))
+    return [(float(t[i]), float(t[i + 1])) for i in np.flatnonzero(steps > allowed)]
 
 
 def event_spans(t: np.ndarray, labels: Sequence[str], first: float, last: float) -> Spans:

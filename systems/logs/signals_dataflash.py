@@ -21,9 +21,9 @@ from .signals import (
     Spans,
     event_spans,
     parameters_of,
-    sampled_spans,
     series,
     undelayed,
+    witnessed_spans,
 )
 from .streams import UNAIDED, aid_spans, has_fix, missing_states
 from .table import Table, whole
@@ -129,6 +129,7 @@ def signals_from_bin(
         lacks=() if aids else ("No DVL, odometry or vision record and no GPS fix in the log.",),
         notes=(*log.notes, *strange, *wired.notes, *notes, *rate_notes, *depth.told),
         findings=tuple(findings),
+        estimated=True,
         **wired.of_signals(),
     )
 
@@ -274,7 +275,7 @@ def _aiding(tables: Mapping[str, Table], core: int) -> dict[str, Spans]:
     status = _of(tables["XKF4"], "C", core)
     flags = whole(status["SS"])
     aided = (flags & _HORIZ_VEL > 0) & (flags & _HORIZ_POS > 0) & (flags & _CONST_POS == 0)
-    return {"aiding": sampled_spans(status["t"], ["" if a else UNAIDED for a in aided])}
+    return {"aiding": witnessed_spans(status["t"], ["" if a else UNAIDED for a in aided])}
 
 
 def _states(tables: Mapping[str, Table], first: float, last: float) -> dict[str, Spans]:

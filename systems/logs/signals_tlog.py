@@ -22,6 +22,8 @@ from .signals import (
     series,
     undelayed,
 )
+from .sticks import NAMES as STICKS
+from .sticks import by_sticks
 from .streams import aid_spans, has_fix, missing_states
 from .table import Table
 from .tlog import TlogLog
@@ -36,6 +38,7 @@ WANTED = (
     "GPS_RAW_INT",
     "HEARTBEAT",
     "LOCAL_POSITION_NED",
+    "NAMED_VALUE_FLOAT",
     "PARAM_VALUE",
     "RAW_IMU",
     "RC_CHANNELS",
@@ -49,6 +52,8 @@ WANTED = (
     "SYS_STATUS",
 )
 AIDS = ("VISION_POSITION_DELTA", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE", "ODOMETRY")
+ANYONE = (*AIDS, *STICKS)
+"""Messages that are taken whoever sent them."""
 _BEYOND = 0.05
 """Share of the angles beyond a turn that damaged messages do not make."""
 
@@ -84,7 +89,9 @@ def signals_from_tlog(  # long: a line for each stream of a log
     told = [*bias_note, *rate_delay, *force_delay, *depth.told]
     aids = _aids(log)
     no_aid, stops = ({}, []) if "GPS" in aids else aid_spans(tables, AIDS, last)
-    spans = {"wiring": wired.spans, **_states(tables), **aiding, **no_aid}
+    states = _states(tables)
+    spans = {"wiring": wired.spans, **states, **aiding, **no_aid}
+    outputs, between = by_sticks(outputs, tables, (wired.spans, *states.values()))
     voltage = _voltage(tables)
     batteries = [name for name in ("BATTERY_STATUS", "SYS_STATUS") if name in tables]
     findings = kind_findings(*log.kind) or firmware_findings("STATUSTEXT", texts, log.kind[1])
@@ -114,8 +121,9 @@ def signals_from_tlog(  # long: a line for each stream of a log
         ),
         has=tuple(has),
         lacks=() if aids else ("No DVL, odometry, vision or GPS message in the log.",),
-        notes=(*log.notes, *strange, *wired.notes, *notes, *motion_notes, *told),
+        notes=(*log.notes, *strange, *wired.notes, *notes, *between, *motion_notes, *told),
         findings=(*findings, *direction_findings(wired)),
+        estimated=True,
         **wired.of_signals(),
     )
 

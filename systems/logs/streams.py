@@ -1,20 +1,17 @@
 """Streams that stop, or that are there and empty."""
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 
 import numpy as np
 
 from ...models.recordings.checks.finding import Finding
-from .signals import Series, Spans
+from .signals import Series, Spans, silences
 from .table import Table
 
 DEAD_RECKONING = "dead-reckoning"
 UNAIDED = "unaided"
 FIX_3D = 3
 """Least kind of a GPS fix with a position and a height, in MAVLink and DataFlash alike."""
-_SILENT_S, _SILENT_PERIODS = 2.0, 10.0
-"""An aid that is silent for this long, and for this many of its periods, has stopped."""
 
 
 def has_fix(table: Table | None, field: str) -> bool:
@@ -36,8 +33,7 @@ def aid_spans(
         return {}, []
     t = np.unique(np.concatenate(times))
     t = t[np.isfinite(t)]
-    allowed = max(_SILENT_S, _SILENT_PERIODS * float(np.median(np.diff(t))))
-    stops = [(a, b) for a, b in pairwise([*t.tolist(), last]) if b - a > allowed]
+    stops = silences(np.append(t, last))
     if not stops:
         return {}, []
     edges = [-np.inf, *(x for stop in stops for x in stop), np.inf]

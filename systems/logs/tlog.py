@@ -32,6 +32,9 @@ _STREAMS = (
 )  # fmt: skip
 """Messages that are sent at a steady rate."""
 
+RENAMED = {"t": "roll"}
+"""Columns of fields whose name is that of the times: MANUAL_CONTROL's `t`, right side down."""
+
 System = tuple[int, int]
 
 
@@ -85,7 +88,7 @@ def read_tlog(
             broken += int(candidates.size - good.size)
             if good.size:
                 index[name] = good
-                columns = {f: rows[f] for f in rows.dtype.names or ()}
+                columns = {RENAMED.get(f, f): rows[f] for f in rows.dtype.names or ()}
                 clean = {f: numbers(x) if x.dtype.kind == "f" else x for f, x in columns.items()}
                 tables[name] = Table(name, clean)
         progress(0.7 + 0.1 * n / len(names))

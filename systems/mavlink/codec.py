@@ -247,17 +247,18 @@ def manual_control_fields(
 
 
 def manual_control_demand(
-    x: int, y: int, z: int, r: int, s: int = 0, t: int = 0, gain: float = 0.5
-) -> Float[np.ndarray, "6"]:
+    x: Field, y: Field, z: Field, r: Field, s: Field = 0, t: Field = 0, gain: Field = 0.5
+) -> Float[np.ndarray, "6 *n"]:
     """Surge, sway, heave, roll, pitch, yaw in [−1, 1] about B from MANUAL_CONTROL fields."""
-    return np.array(
+    ahead, right, up, clockwise, nose_up, right_down, k = _stack(x, y, z, r, s, t, gain)
+    return np.stack(
         [
-            gain * x / 1000,
-            -gain * y / 1000,
-            gain * (z - 500) / 500,
-            t / 400,
-            -s / 400,
-            -gain * r / 1000,
+            k * ahead / 1000,
+            -k * right / 1000,
+            k * (up - 500) / 500,
+            right_down / 400,
+            -nose_up / 400,
+            -k * clockwise / 1000,
         ]
     )
 

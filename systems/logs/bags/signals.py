@@ -21,6 +21,7 @@ from ..signals import (
     sampled_spans,
     series,
     undelayed,
+    witnessed_spans,
 )
 from ..streams import UNAIDED, missing_states
 from ..wiring import PRESETS, Wiring, direction_findings, thruster_outputs, wiring
@@ -370,7 +371,7 @@ def _aiding(taken: Quantities, velocity: Series | None) -> dict[str, Spans]:
     _, t, aided = found
     order = np.argsort(t, kind="stable")
     labels = ["" if aided[0, i] else UNAIDED for i in order]
-    return {"aiding": sampled_spans(t[order], labels)}
+    return {"aiding": witnessed_spans(t[order], labels)}
 
 
 def _voltage(taken: Quantities) -> Series | None:

@@ -1,0 +1,22 @@
+"""What a log tells of its samples: attributes of a recording, which joined recordings keep."""
+
+from collections.abc import Sequence
+
+import xarray as xr
+
+PERIOD = "command_period"
+"""Mean time (s) between the outputs of a log."""
+ESTIMATED = "states_estimated"
+"""1 where the states are known to be an autopilot's estimate, as those of its logs are."""
+
+
+def states_estimated(dataset: xr.Dataset) -> bool:
+    """Whether the states are known to be an autopilot's estimate."""
+    return bool(dataset.attrs.get(ESTIMATED, 0))
+
+
+def of_all(datasets: Sequence[xr.Dataset]) -> dict[str, float | int]:
+    """The attributes of recordings together: the longest period, and whether all were estimated."""
+    periods = [float(d.attrs[PERIOD]) for d in datasets if PERIOD in d.attrs]
+    found: dict[str, float | int] = {PERIOD: max(periods)} if periods else {}
+    return found | ({ESTIMATED: 1} if all(map(states_estimated, datasets)) else {})

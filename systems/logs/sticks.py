@@ -1,0 +1,240 @@
+"""Outputs between the samples of a slow stream, as the pilot's sticks command them.
+
+A ground station gets the outputs at 2 to 10 Hz unless it asks for more, and logs its own sticks at
+20 Hz and more. In each mode the outputs are, beside what the autopilot adds, a linear map of the
+sticks, so with C fitted to all samples of a mode and s the sticks that hold at a time
+
+    u(t) = C s(t - lag) + line through (t_k, u_k - C s(t_k - lag)),
+
+for each thruster whose every second sample lies much nearer to this curve through the others than
+to their lines; elsewhere the outputs are those lines. One lag holds for the log: that at which the
+maps leave least.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..mavlink import codec
+from .signals import Series, Spans, silences
+from .table import Table
+from .tlog import RENAMED
+
+NAMES = ("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE")
+"""What a ground station sends."""
+_AXES = (*"xyzrs", RENAMED["t"])
+_GAIN = b"PilotGain"
+_LAGS_S = np.arange(-0.1, 0.3001, 0.01)
+_RANGE_US = (1100.0, 1900.0)
+"""Range of the outputs, or that of the samples where it is wider."""
+_STEP_S = 0.01
+"""Step of the outputs along sticks, which change within it."""
+_NEARER = 0.5
+"""Share of the squares of lines between every second sample that the curve may have: lines between
+all samples of an output that steps have half of them."""
+_LOST_PERIODS = 3.0
+"""Periods of the outputs beyond which a step between samples is a gap."""
+_AS_GOOD, _ROUNDING = 1.01, 1e-9
+_SAMPLES = 3
+"""Samples of a mode at least for each coefficient of its map."""
+
+
+class _Sticks(NamedTuple):
+    """Sticks s (m, n) in [-1, 1] that hold from times t (n,) on, of the message `name`."""
+
+    t: Float[np.ndarray, " n"]
+    s: Float[np.ndarray, "m n"]
+    name: str
+
+    def at(self, t: Float[np.ndarray, " k"]) -> Float[np.ndarray, "m k"]:
+        """The sticks that hold at some times."""
+        return self.s[:, np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, None)]
+
+
+class _Mode(NamedTuple):
+    """The samples of one mode: their indices, and its spans."""
+
+    rows: np.ndarray
+    inside: Spans
+
+    def within(self, t: Float[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
+        """Whether times lie in the mode."""
+        return _within(t, self.inside)
+
+
+def by_sticks(
+    outputs: Series, tables: Mapping[str, Table], states: Sequence[Spans]
+) -> tuple[Series, list[str]]:
+    """The outputs (µs) along the sticks where these tell what they were, and a sentence.
+
+    A mode is a combination of labels of the `states`, such as the autopilot's mode and the wiring.
+
+    They are as they were if no stream of sticks tells them better than lines between samples.
+    """
+    modes = _modes(states)
+    tried = []
+    for name in NAMES:
+        sticks = _sticks(tables, name)
+        series, misses = (None, ()) if sticks is None else _curves(outputs, sticks, modes)
+        if sticks is not None and series is not None:
+            tried.append((sticks, series, misses))
+    if not tried:
+        return outputs, []
+    sticks, series, misses = min(tried, key=lambda found: found[2][0])
+    return series, [
+        f"Outputs between samples ({outputs.rate:.1f} Hz) follow {sticks.name} at "
+        f"{_rate(sticks.t):.0f} Hz: left-out samples err by {misses[0]:.0f} µs (rms), where lines "
+        f"between the others err by {misses[1]:.0f} µs."
+    ]
+
+
+def _curves(
+    outputs: Series, sticks: _Sticks, modes: Sequence[Spans]
+) -> tuple[Series | None, tuple[float, float]]:
+    """The outputs along sticks, and what every second sample misses them and lines by (µs, rms)."""
+    groups = _groups(outputs, sticks, modes)
+    if not groups:
+        return None, (np.inf, np.inf)
+    lag = _lag(outputs, sticks, groups)
+    late = sticks._replace(t=sticks.t + lag)
+    t = _times(outputs, late)
+    x = np.stack([np.interp(t, outputs.t, u) for u in outputs.x])
+    curve, line, count = 0.0, 0.0, 0
+    for mode in groups:
+        own = outputs.t[mode.rows]
+        s, u = late.at(own), outputs.x[:, mode.rows]
+        C, missed = _map(s, u), _missed(own, s, u)
+        better = missed[0] < _NEARER * missed[1]
+        curve += float(np.where(better, *missed).sum())
+        line += float(missed[1].sum())
+        count += u.size
+        here = mode.within(t)
+        for i in np.flatnonzero(better):
+            rest = np.interp(t[here], own, u[i] - C[i] @ s)
+            low, high = min(_RANGE_US[0], u[i].min()), max(_RANGE_US[1], u[i].max())
+            x[i, here] = np.clip(C[i] @ late.at(t[here]) + rest, low, high)
+    if curve == line:  # no thruster follows the sticks
+        return None, (np.inf, np.inf)
+    misses = (float(np.sqrt(curve / count)), float(np.sqrt(line / count)))
+    return Series(t, x, f"{outputs.source} along {sticks.name}", outputs.left_out), misses
+
+
+def _missed(
+    t: Float[np.ndarray, " k"], s: Float[np.ndarray, "m k"], u: Float[np.ndarray, "n k"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Squares by which every second sample misses the curve, and the line, of the others."""
+    curve, line = np.zeros((2, len(u)))
+    for first in (0, 1):
+        out = np.arange(first, t.size, 2)
+        out = out[(out > 0) & (out < t.size - 1)]
+        rest = np.setdiff1d(np.arange(t.size), out)
+        C = _map(s[:, rest], u[:, rest])
+        left = u - C @ s
+        for i in range(len(u)):
+            line[i] += np.sum((u[i, out] - np.interp(t[out], t[rest], u[i, rest])) ** 2)
+            curve[i] += np.sum((left[i, out] - np.interp(t[out], t[rest], left[i, rest])) ** 2)
+    return curve, line
+
+
+def _map(s: Float[np.ndarray, "m k"], u: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n m"]:
+    """The map from sticks to outputs by least squares; nothing of sticks that stand still.
+
+    It is that of their changes between samples: what an autopilot adds changes little in one.
+    """
+    return np.linalg.lstsq(np.diff(s).T, np.diff(u).T, rcond=1e-6)[0].T
+
+
+def _lag(outputs: Series, sticks: _Sticks, groups: Sequence[_Mode]) -> float:
+    """The middle of the lags (s) at which the maps leave least, or hardly more."""
+    left = np.array([_left(outputs, sticks, groups, lag) for lag in _LAGS_S])
+    return float(np.mean(_LAGS_S[left <= _AS_GOOD * left.min() + _ROUNDING * left.max()]))
+
+
+def _left(outputs: Series, sticks: _Sticks, groups: Sequence[_Mode], lag: float) -> float:
+    """Sum of squares that the maps leave of the samples' changes, at a lag (s)."""
+    left = 0.0
+    for mode in groups:
+        s, u = sticks.at(outputs.t[mode.rows] - lag), outputs.x[:, mode.rows]
+        left += float(np.sum(np.diff(u - _map(s, u) @ s) ** 2))
+    return left
+
+
+def _groups(outputs: Series, sticks: _Sticks, modes: Sequence[Spans]) -> list[_Mode]:
+    """The modes with enough samples for a map."""
+    covered = (outputs.t > sticks.t[0]) & (outputs.t < sticks.t[-1])
+    groups = []
+    for inside in modes:
+        rows = np.flatnonzero(_within(outputs.t, inside) & covered)
+        if rows.size >= _SAMPLES * len(sticks.s):
+            groups.append(_Mode(rows, inside))
+    return groups
+
+
+def _modes(states: Sequence[Spans]) -> list[Spans]:
+    """The spans of each combination of labels."""
+    found = {(): [(-np.inf, np.inf)]}
+    for state in states:
+        both: dict[tuple[str, ...], list[tuple[float, float]]] = {}
+        for labels, spans in found.items():
+            for a, b, label in zip(state.start, state.stop, state.label, strict=True):
+                inside = [(max(a, x), min(b, y)) for x, y in spans if max(a, x) < min(b, y)]
+                both.setdefault((*labels, label), []).extend(inside)
+        found = both
+    return [_spans(s) for s in found.values() if s]
+
+
+def _times(outputs: Series, sticks: _Sticks) -> Float[np.ndarray, " k"]:
+    """A fine grid where neither sticks are silent nor samples are lost, and samples elsewhere."""
+    t = np.arange(outputs.t[0], outputs.t[-1], _STEP_S)
+    step = np.diff(outputs.t)
+    lost = np.flatnonzero(step > _LOST_PERIODS * np.median(step))
+    gaps = [(outputs.t[i], outputs.t[i + 1]) for i in lost]
+    gaps += [(-np.inf, sticks.t[0]), *silences(sticks.t), (sticks.t[-1], np.inf)]
+    spans = _spans(gaps)
+    own = outputs.t[_within(outputs.t, spans)]
+    return np.unique(np.concatenate([t[~_within(t, spans)], own]))
+
+
+def _spans(ends: Sequence[tuple[float, float]]) -> Spans:
+    start, stop = np.array(ends).T
+    return Spans(start, stop, ("",) * len(ends))
+
+
+def _within(t: np.ndarray, spans: Spans) -> np.ndarray:
+    return np.any((t >= spans.start[:, None]) & (t <= spans.stop[:, None]), axis=0)
+
+
+def _rate(t: np.ndarray) -> float:
+    return 1.0 / float(np.median(np.diff(t)))
+
+
+def _sticks(tables: Mapping[str, Table], name: str) -> _Sticks | None:
+    """The sticks of one message; MANUAL_CONTROL acts by the pilot's gain, where that was logged."""
+    table = tables.get(name)
+    if table is None:
+        return None
+    t, first = np.unique(table["t"], return_index=True)
+    if t.size < 4:
+        return None
+    if name == "MANUAL_CONTROL":
+        gain = _gain(tables.get("NAMED_VALUE_FLOAT"), table["t"])
+        s = codec.manual_control_demand(*(table[n] for n in _AXES), gain=gain)
+    else:
+        pulses = np.stack([table[f"chan{n}_raw"] for n in range(1, 9)]).astype(float)
+        left_alone = (pulses == 0) | (pulses == codec.UINT16_MAX)
+        s = np.asarray(codec.stick(np.where(left_alone, codec.NEUTRAL_US, pulses)))
+    return _Sticks(t, np.clip(s[:, first], -1, 1), name)
+
+
+def _gain(table: Table | None, t: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """The pilot's gain at some times, 1 if it was not logged: the maps then contain it."""
+    if table is None:
+        return np.ones(t.size)
+    own = np.array([bytes(name).rstrip(b"\0") == _GAIN for name in table["name"]], bool)
+    own &= np.isfinite(table["value"]) & (table["value"] > 0)
+    if not own.any():
+        return np.ones(t.size)
+    rows = table.rows(own)
+    return rows["value"][np.clip(np.searchsorted(rows["t"], t, side="right") - 1, 0, None)]

@@ -1,7 +1,7 @@
 """The diagnosis: innovations are white on a null, causes are named first, the JSON is as told."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import jax
 import jax.numpy as jnp
@@ -656,6 +656,41 @@ def test_positions_that_were_not_measured_tell_nothing_and_ask_for_nothing(tmp_p
     hidden["V_WB_B"][..., 3] = np.nan
     with pytest.raises(UserError, match="V_WB_B p is missing; a diagnosis needs"):
         Diagnoser(Recording(hidden), VEHICLE)
+
+
+def test_a_fit_goes_back_from_a_filter_that_diverges(tmp_path):
+    _, recording = recorded(tmp_path, 2, names=("net_buoyancy",), size=1.0)
+    problem = Diagnoser(recording, VEHICLE).problem
+    seen = problem.evaluate(problem.believed)
+    unstable = replace(seen.kalman, keep=30 * seen.kalman.keep)
+    row = next(i for i, e in enumerate(problem.library.entries) if e.cause == "net_buoyancy")
+    with pytest.raises(FloatingPointError, match="the filter of one-step errors diverges"):
+        problem.evaluate(problem.believed, [row], unstable)
+    real, tried = type(problem).evaluate, []
+
+    class Fragile(type(problem)):
+        """Its filter diverges the farther half of the way."""
+
+        def evaluate(self, theta, chosen=None, kalman=None, previous=None):
+            tried.append(theta[row])
+            far = abs(theta[row]) > 2.5
+            return real(self, theta, chosen, unstable if far else kalman, previous)
+
+    given = {f.name: getattr(problem, f.name) for f in fields(problem) if f.init}
+    start = problem.believed.copy()
+    start[row] = 4.0
+    found, _, _ = Fragile(**given).polish(start, [row], seen.kalman, origin=seen)
+    assert max(np.abs(tried)) == 4.0
+    assert abs(found[row]) <= 2.5
+
+
+def test_states_that_a_log_says_are_estimated_have_the_noise_of_estimates(tmp_path):
+    _, recording = recorded(tmp_path, 2, names=("net_buoyancy",), size=1.0)
+    told = Recording(recording.dataset.assign_attrs(states_estimated=1))
+    for given, estimated in ((recording, False), (told, True)):
+        problem = Diagnoser(given, VEHICLE).problem
+        assert problem.data.estimated == estimated
+        assert problem.predict(problem.believed)[1].estimated == estimated
 
 
 def test_axes_that_are_not_driven_and_filled_samples_are_told(tmp_path):

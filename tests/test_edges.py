@@ -1,5 +1,7 @@
 """Impacts beside thrusters that act in steps: those at the steps' edges are no law of their own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hidden.blind import NOISE
@@ -9,7 +11,7 @@ from hidden.scenarios import Plan
 from spinndrift.models.effects.unknown import Unknown
 from spinndrift.models.recordings.csv import read_csv
 from spinndrift.models.vehicles.vehicle import load_vehicle
-from spinndrift.training.diagnosis.disturbance.edges import without_rounding
+from spinndrift.training.diagnosis.disturbance.edges import without_commanded
 from spinndrift.training.diagnosis.disturbance.laws import Law, impacts
 from spinndrift.training.diagnosis.pipeline import Diagnoser
 
@@ -48,6 +50,28 @@ def test_impacts_must_not_know_the_commands(null, where, kept):
     gain, values, loss = impacts(evaluation.z[:, 6], data.weight, data.fold)
     law = Law("disturbance_impacts", "surge", values, gain, loss)
     assert law.heldout_gain > LEAST
-    assert without_rounding([law], wider, evaluation, LEAST) == [law] * kept
+    assert without_commanded([law], wider, evaluation, LEAST) == [law] * kept
     absent = evaluation._replace(theta=np.zeros_like(theta))
-    assert without_rounding([law], wider, absent, LEAST) == [law]
+    assert without_commanded([law], wider, absent, LEAST) == [law]
+
+
+@pytest.mark.parametrize(("where", "kept"), [("where commands change", False), ("anywhere", True)])
+def test_impacts_must_not_come_with_changes_of_sampled_commands(null, where, kept):
+    problem, seen = null
+    data, rng = problem.data, np.random.default_rng(0)
+    change = np.linalg.norm(np.diff(data.u, axis=0, prepend=data.u[:1]), axis=1)
+    large = change > np.quantile(change[data.weight > 0], 0.9)
+    hit = (
+        (rng.uniform(size=change.shape) < 0.01)
+        if where == "anywhere"
+        else ((rng.uniform(size=change.shape) < 0.1) & large)
+    )
+    z = rng.standard_normal(seen.z.shape)
+    z[:, 6] *= np.where(hit, 5.0, 1.0)
+    evaluation = seen._replace(z=z * data.weight[:, None])
+    gain, values, loss = impacts(evaluation.z[:, 6], data.weight, data.fold)
+    law = Law("disturbance_impacts", "surge", values, gain, loss)
+    sampled = replace(problem, data=replace(data, sampled=True))
+    assert law.heldout_gain > LEAST
+    assert without_commanded([law], sampled, evaluation, LEAST) == [law] * kept
+    assert without_commanded([law], problem, evaluation, LEAST) == [law]

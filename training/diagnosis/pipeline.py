@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ...models.dynamics import Dynamics
 from ...models.effects.base import Effect
 from ...models.effects.extended import Extended
-from ...models.effects.library import Library
+from ...models.effects.library import KINDS, Library, kind
 from ...models.recordings.checks.finding import findings_of
 from ...models.recordings.store import Recording
 from ...models.se3 import AXES
@@ -361,6 +361,17 @@ def diagnose(
         return _diagnose(recording, vehicle, base, config or DiagnoseConfig(), progress)
 
 
+def _for_all_coefficients(first: result.Diagnosis) -> str:
+    """Why a diagnosis is tried again with all coefficients fitted, or nothing."""
+    if first.left:
+        return "left-out data speak against the verdict"
+    named = {cause.name for cause in first.causes if cause.name in KINDS}
+    motion = {"linear", "command", "scales"}
+    several = sum(bool(motion & set(kind(name).refits)) for name in named)
+    # where most coefficients are wrong, single ones explain each other's errors
+    return "several coefficients are named" if several > 1 else ""
+
+
 def _diagnose(
     recording: Recording,
     vehicle: Vehicle,
@@ -371,10 +382,11 @@ def _diagnose(
     diagnoser = Diagnoser(recording, vehicle, base, config, progress)
     found = diagnoser.run()
     first = found.diagnosis
-    if config.refit != "auto" or not diagnoser.driven or not first.left:
+    why = _for_all_coefficients(first)
+    if config.refit != "auto" or not diagnoser.driven or not why:
         progress(1.0, "done")
         return found
-    progress(0.0, "again with all coefficients fitted, for left-out data speak against the verdict")
+    progress(0.0, f"again with all coefficients fitted, for {why}")
     again = Diagnoser(recording, vehicle, base, replace(config, refit="all"), progress).run()
     progress(1.0, "done")
     second = again.diagnosis

@@ -1,7 +1,6 @@
 """Recordings as the arrays that a diagnosis works on."""
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,10 +11,12 @@ from ....models.config.errors import UserError
 from ....models.effects.traits import Need, Region
 from ....models.recordings.checks.small_speeds import DeadZone
 from ....models.recordings.kinematics import dead_reckoned
+from ....models.recordings.origin import states_estimated
 from ....models.recordings.store import Recording
 from ....models.se3 import AXES, TWIST, XYZ
 from ....models.vehicles.vehicle import Vehicle
 from .lost import known_errors, with_lost_zero
+from .pieces import cut, stack, weight_of
 from .readings import sensors_of_latent
 from .reckoned import dead_reckoned_axes
 
@@ -68,6 +69,8 @@ class Data:
         began: time of each piece's first sample since the start of its run (s) (1, R).
         started: when each piece's run started, on the recorder's clock (s), if that is known (R,).
         labels: of the runs, by scenario.
+        sampled: whether commands are a log's samples of faster ones.
+        estimated: whether the states are known to be a filter's estimate.
         zones: small speeds that an instrument lost.
         spread: standard deviation that a lost velocity adds to its record, which is zero; 0 where
             it was measured (m/s) (N + 1, 6, R). None where no zone was found.
@@ -94,6 +97,8 @@ class Data:
     began: Float[np.ndarray, "1 R"] | None = None
     started: Float[np.ndarray, " R"] | None = None
     labels: tuple[str, ...] = ()
+    sampled: bool = False
+    estimated: bool = False
     zones: tuple[DeadZone, ...] = ()
     spread: Float[np.ndarray, "M 6 R"] | None = None
 
@@ -235,11 +240,10 @@ def make_data(
 ) -> Data:
     """Cut a recording into pieces and turn its commands into thruster forces.
 
-    Thruster forces are taken as they are; PWM goes through the vehicle's curve at the recorded
-    voltage; a wrench is allocated to the thrusters with the least effort. Runs `without` (by
-    number, scenario by scenario) are left out, unless none would remain. Commands before a run are
-    not known: its first `remembered` s (a tenth of it at most) only set the actuator states.
-    Positions that were not measured are dead-reckoned; velocities that were not, or lost, are zero.
+    Thruster forces are as they are; PWM goes through the vehicle's curve at the recorded voltage; a
+    wrench is allocated with the least effort. Runs `without` (by number, scenario by scenario) are
+    left out unless none would remain. Commands before a run are unknown: its first `remembered` s
+    (a tenth at most) set the actuators. Positions not measured are integrated; velocities are zero.
 
     Raises:
         UserError: attitude or rates are missing, or no run has two samples.
@@ -247,13 +251,12 @@ def make_data(
     unmeasured = unmeasured_channels(recording)
     latent = [i for i, name in enumerate(TWIST) if name in unmeasured]
     recording, zones, spread = with_lost_zero(recording)
-    extra = sensors_of_latent(recording, latent) | spread
     data, lengths = recording.dataset, recording.lengths
     thrust, volts = recording.thrust(vehicle)
+    extra = sensors_of_latent(recording, latent) | spread
     kept, behind = _kept(lengths, without), max(1, round(remembered / recording.dt))
     segment = min(segment, _longest_piece(kept, lengths))
-    pieces: list[dict[str, np.ndarray]] = []
-    scenario, run = [], []
+    pieces, scenario, run = list[dict[str, np.ndarray]](), list[int](), list[int]()
     for number, (j, k) in enumerate(np.argwhere(kept).tolist()):
         length = int(lengths[j, k])
         times, V = recording.elapsed(j, k), data["V_WB_B"].to_numpy()[j, k, :length].copy()
@@ -262,14 +265,14 @@ def make_data(
         of_run = X, V, thrust[j, k, :length], volts[j, k, :length], times
         first = min(behind, int(_OF_A_RUN * (length - 1))) if remembered else 0
         sensors = {name: values[j, k, :length] for name, values in extra.items()}
-        pieces += _cut(*of_run, sensors, first, segment, behind)
+        pieces += cut(*of_run, sensors, first, segment, behind)
         scenario += [j] * (len(pieces) - len(run))
         run += [number] * (len(pieces) - len(run))
     if not run:
         raise UserError("recording: no run is long enough for a diagnosis")
     _refuse_units(recording, vehicle, thrust)
-    arrays = {name: _stack([piece[name] for piece in pieces]) for name in pieces[0]}
-    weight = _weight(np.array([len(piece["u"]) for piece in pieces]))
+    arrays = {name: stack([piece[name] for piece in pieces]) for name in pieces[0]}
+    weight = weight_of(np.array([len(piece["u"]) for piece in pieces]))
     mean, arrays["step"] = _steps(recording, arrays["step"], weight)
     return Data(
         **arrays,
@@ -284,6 +287,8 @@ def make_data(
         reckoned=dead_reckoned_axes(arrays["X"], arrays["V"], arrays["step"], weight),
         started=_started(recording, kept, run),
         labels=run_labels(recording, kept),
+        sampled=recording.commands_sampled,
+        estimated=states_estimated(data),
         zones=zones,
     )
 
@@ -327,11 +332,6 @@ def run_labels(recording: Recording, kept: np.ndarray | None = None) -> tuple[st
     )
 
 
-def _weight(sizes: np.ndarray) -> np.ndarray:
-    """1 for the steps that pieces of these sizes have, else 0 (N, R)."""
-    return (np.arange(sizes.max())[:, None] < sizes).astype(float)
-
-
 def _kept(lengths: np.ndarray, without: Sequence[int]) -> np.ndarray:
     """Runs of three samples and more, `without` some unless none would remain."""
     long = lengths >= 3
@@ -355,25 +355,6 @@ def unmeasured_channels(recording: Recording) -> tuple[str, ...]:
     return (*lacking.get("X_WB", ()), *lacking.get("V_WB_B", ()))
 
 
-def _cut(
-    X: np.ndarray, V: np.ndarray, u: np.ndarray, volts: np.ndarray, times: np.ndarray,
-    sensors: dict[str, np.ndarray], first: int, segment: int, behind: int,
-) -> Iterator[dict[str, np.ndarray]]:  # fmt: skip
-    """Pieces of a run from sample `first` on, with the commands of `behind` steps before each."""
-    held = np.diff(times)
-    last = len(held)
-    count = -(-(last - first) // segment)
-    edges = np.linspace(first, last, count + 1).round().astype(int)
-    for a, b in itertools.pairwise(edges):
-        before = np.maximum(np.arange(a - behind, a), 0)
-        yield {
-            "X": X[a : b + 1], "V": V[a : b + 1], "u": u[a:b], "past": u[before],
-            "past_step": held[before], "voltage": volts[a:b], "step": held[a:b],
-            "began": times[a : a + 1],
-            **{name: values[a : b + 1] for name, values in sensors.items()},
-        }  # fmt: skip
-
-
 def _refuse_units(
     recording: Recording, vehicle: Vehicle, thrust: Float[np.ndarray, "S K N n"]
 ) -> None:
@@ -387,10 +368,3 @@ def _refuse_units(
             f"{share[k]:.0f} times what one of {vehicle.name} gives: give newtons (pulses in µs "
             "belong into columns pwm1, pwm2 …), or the --vehicle"
         )
-
-
-def _stack(parts: list[np.ndarray]) -> np.ndarray:
-    """Parts side by side, the last value held to the length of the longest."""
-    length = max(len(p) for p in parts)
-    padded = [np.concatenate([p, np.repeat(p[-1:], length - len(p), axis=0)]) for p in parts]
-    return np.stack(padded, axis=-1)

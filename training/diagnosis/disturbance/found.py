@@ -20,7 +20,7 @@ from ..filter.problem import DiagnosisProblem, Evaluation
 from ..filter.transition import Transition
 from ..selection.model_selection import margin
 from ..validation.validation import white_part
-from .edges import without_rounding
+from .edges import without_commanded
 from .estimator import is_estimators
 from .laws import Law, estimated, find_laws, growth_alone, run_constants
 from .levels import LEVEL, find_levels, levels_with_slow_noise, process_share
@@ -88,7 +88,7 @@ def all_laws(problem: DiagnosisProblem, evaluation: Evaluation, least: float) ->
         for law in laws_of(problem, evaluation)
         if law.where not in unmeasured and not is_estimators(law, problem, evaluation)
     ]
-    found = without_rounding(found, problem, evaluation, least)
+    found = without_commanded(found, problem, evaluation, least)
     alike = repeating(evaluation.z, problem.data)
     slow = [law for law in found if law.name == DisturbanceColour.name]
     if not unmeasured and max((law.heldout_gain for law in slow), default=0.0) > least:

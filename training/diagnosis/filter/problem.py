@@ -180,8 +180,8 @@ class DiagnosisProblem:
             raise FloatingPointError("predictions diverge")
         jacobian = np.asarray(p.jacobian)
         steps = Transition.along(jacobian, weight, p.late, p.latent)
-        mass, known = self.mass(theta), self.data.known
-        noise = estimate(error, weight, steps, mass, self.data.dt, known=known)
+        whose, known = self.data.estimated or None, self.data.known
+        noise = estimate(error, weight, steps, self.mass(theta), self.data.dt, None, whose, known)
         return p, noise, self.filter_in(noise, theta, p) if kalman is None else kalman
 
     def filter_in(self, noise: Noise, theta: Float[np.ndarray, " p"], p: Predictions) -> Filter:
@@ -259,7 +259,7 @@ class DiagnosisProblem:
 
         A step that makes one-step errors clearly less likely is halved; so is the first one, from
         `origin` to the start, if an origin is given. The fit returned is at the θ returned; its
-        standard errors are joint, clustered by run.
+        standard errors are joint, clustered by run. FloatingPointError where all steps diverge.
         """
         chosen = list(chosen)
         low, high = self.limits(chosen)

@@ -25,6 +25,8 @@ from .varying import Modulated, at_sample, changes_of
 
 LANES, FEW, INSTRUMENTS = 28, 8, 18
 """Probes that one call of the compiled program evaluates in parallel, besides the base."""
+FARTHEST = 1e9
+"""Standard deviations beyond which no innovation lies, but those of a filter that diverges."""
 AHEAD = 4
 """Calls queued or running while one is collected; each holds its probes' innovations in memory."""
 
@@ -149,6 +151,9 @@ def whitened_sensitivities(
     Rows of `probes` are differences from `theta`. Those of instruments use a compiled program in
     double precision, which poses need, all others one in single precision, `LANES` (or `FEW`) at a
     time. Up to `AHEAD` calls run in parallel.
+
+    Raises:
+        FloatingPointError: the filter diverges.
     """
     records, latent, instead = Records.of(data), predictions.latent, None
     predictions = predictions._replace(late=None, latent=None)
@@ -166,9 +171,6 @@ def whitened_sensitivities(
     found = np.empty((1 + len(probes), steps, data.u.shape[2]), np.float32)
     believed = library.filled(theta[:, None, None])
     running: deque[tuple[np.ndarray, Future[np.ndarray]]] = deque()
-
-    def run(*arguments: Any) -> np.ndarray:
-        return np.asarray(_whitened(*arguments))
 
     def collect() -> None:
         some, z = running.popleft()
@@ -188,13 +190,23 @@ def whitened_sensitivities(
             effects = _of_family(library.filled(by_lane), believed, instruments)
             arguments = predictions, records, filters, instead, size + 1, instruments
             more = changes_of(library, by_lane), data.reckoned
-            call = _threads().submit(_in_double, run, model, effects, *arguments, *more)
+            call = _threads().submit(_in_double, _run, model, effects, *arguments, *more)
             running.append((some, call))
             if len(running) > AHEAD:
                 collect()
     while running:
         collect()
-    return found
+    return _converged(found)
+
+
+def _run(*arguments: Any) -> np.ndarray:
+    return np.asarray(_whitened(*arguments))
+
+
+def _converged(z: Float[np.ndarray, "m N12 R"]) -> Float[np.ndarray, "m N12 R"]:
+    if not np.all(np.abs(z[0]) < FARTHEST):
+        raise FloatingPointError("the filter of one-step errors diverges")
+    return z
 
 
 def _of_family(

@@ -305,7 +305,10 @@ class Search:
             more = len(library.at(*top)) - len(library.at(*h))
             if simpler and more > 0:
                 continue
-            other, rival, alone = self._fitted(state, h, fits, seen.kalman)
+            try:
+                other, rival, alone = self._fitted(state, h, fits, seen.kalman)
+            except FloatingPointError:  # no parameters of the rival suit the cause's filter
+                continue
             named = library, np.zeros_like(other), alone
             won = _lost_by_run(best) - _lost_by_run(rival)
             if simpler:

@@ -147,6 +147,18 @@ def test_split_by_run_shares_nothing_and_loses_nothing():
         made.select("c")
 
 
+def test_force_of_outputs_that_changed_within_a_step_is_the_mean_of_their_forces():
+    pwm, std = np.full((40, 8), 1600.0), np.full((40, 8), 50.0)
+    made = Recording.from_trajectories(
+        [trajectory(commands={"pwm": pwm}, sensors={"pwm_std": std})], DT, vehicle="ardusub_sitl"
+    )
+    force = np.abs(made.thrust()[0])
+    # 51.48 N u|u| with u = (pwm - 1500) / 400, which is as often 0.375 as 0.125
+    np.testing.assert_allclose(force, 51.48 * (0.375**2 + 0.125**2) / 2, rtol=1e-6)
+    plain = Recording(made.dataset.drop_vars("pwm_std"))
+    np.testing.assert_allclose(np.abs(plain.thrust()[0]), 51.48 * 0.25**2, rtol=1e-6)
+
+
 def test_concatenation_keeps_every_run():
     a, b = recording(40, 25), recording(10, scenario="sway")
     both = Recording.concat([a, b, a])

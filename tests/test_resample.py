@@ -7,6 +7,7 @@ from motion import smooth_motion
 from spinndrift.models import se3
 from spinndrift.models.recordings.resample import (
     continuous,
+    deviation,
     geodesic,
     grid,
     hermite,
@@ -78,6 +79,35 @@ def test_mean_of_a_line_is_its_middle_and_of_a_sine_its_integral():
     np.testing.assert_allclose(mean(new, t, (3 * t)[None], 0.2)[0], 3 * new, atol=1e-10)
     expected = (np.cos(new - 0.1) - np.cos(new + 0.1)) / 0.2
     np.testing.assert_allclose(mean(new, t, np.sin(t)[None], 0.2)[0], expected, atol=1e-6)
+
+
+def test_deviation_of_a_line_and_of_a_step_at_an_unknown_time():
+    t = np.arange(0.0, 8.0)
+    middle = np.array([3.5])
+    line = np.stack([2.0 * t, np.full(8, 5.0)])
+    found = deviation(middle, t, line, 0.5)
+    np.testing.assert_allclose(found[:, 0], [2.0 * 0.5 / np.sqrt(12), 0.0], rtol=3e-3, atol=1e-12)
+    # between its two samples a step leaves both values equally likely, beside them nothing is open
+    step = (t > 3.5).astype(float) * 4.0
+    np.testing.assert_allclose(deviation(middle, t, step, 1.0), [2.0], rtol=1e-3)
+    np.testing.assert_allclose(deviation(np.array([1.5, 5.5]), t, step, 1.0), 0.0, atol=1e-9)
+    # a fine record of a step has the deviation of its two values
+    fine = np.arange(0.0, 8.0, 1e-3)
+    for share in (0.25, 0.5):
+        x = (fine > 3.0 + share).astype(float)
+        found = deviation(middle, fine, x, 1.0)
+        np.testing.assert_allclose(found, np.sqrt(share * (1 - share)), rtol=0.05)
+
+
+def test_deviation_of_a_smooth_signal_is_its_own():
+    t = np.arange(0.0, 6.0, 0.1)
+    middle = np.arange(1.0, 5.0, 0.07)
+    fine = middle + 0.1 * ((np.arange(1000) + 0.5)[:, None] / 1000 - 0.5)
+    own = np.sin(3 * fine).std(axis=0)
+    found = deviation(middle, t, np.sin(3 * t), 0.1)
+    # the slope of a line is that at its middle: off by h f''/2 at most
+    np.testing.assert_allclose(found, own, atol=0.1 * 9 / 2 * 0.1 / np.sqrt(12))
+    assert abs(np.mean(found**2) / np.mean(own**2) - 1) < 0.02
 
 
 def test_smooth_motion_converges_with_second_order():

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from ..config.errors import UserError
 from ..vehicles.vehicle import load_vehicle
+from .schema import PWM_STD
 
 
 def thrusters_of(dataset: xr.Dataset, vehicle: Any, command: str) -> Any:
@@ -26,14 +27,22 @@ def thrusters_of(dataset: xr.Dataset, vehicle: Any, command: str) -> Any:
 
 
 def forces_of(dataset: xr.Dataset, name: str, thrusters: Any) -> Float[Array, "n J K N"]:
-    """Forces (N) of a command in forces or PWM; of none beyond a trajectory's end."""
+    """Forces (N) of a command in forces or PWM; of none beyond a trajectory's end.
+
+    Where the PWM changed within a step by `pwm_std` about its mean, the mean force is that of the
+    two pulses with this mean and deviation: exact for a quadratic curve (Gauss's rule).
+    """
     values, mask = dataset[name].to_numpy(), dataset["mask"].to_numpy()
     check_count(dataset, name, thrusters.allocation.shape[1])
     rest = 1500.0 if name == "pwm" else 0.0
     command = jnp.asarray(np.moveaxis(np.where(mask[..., None], values, rest), -1, 0))
     if name == "thruster_force":
         return command
-    return thrusters.force(command, jnp.asarray(voltage_of(dataset, thrusters)))
+    volts = jnp.asarray(voltage_of(dataset, thrusters))
+    if PWM_STD not in dataset:
+        return thrusters.force(command, volts)
+    std = jnp.asarray(np.nan_to_num(np.moveaxis(dataset[PWM_STD].to_numpy(), -1, 0)))
+    return (thrusters.force(command + std, volts) + thrusters.force(command - std, volts)) / 2
 
 
 def check_count(dataset: xr.Dataset, name: str, count: int, vehicle: str = "the vehicle") -> None:

@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
+_PARTS = 16
+"""Of a step, for moments of what changes within it."""
 _SMALL = 1e-8
 
 
@@ -64,6 +66,32 @@ def mean(
     inside = span > _SMALL
     averaged = (path(high) - path(low)) / np.where(inside, span, 1.0)
     return np.where(inside, averaged, linear(t_new, t, x))
+
+
+def deviation(
+    t_new: Float[np.ndarray, " N"],
+    t: Float[np.ndarray, " n"],
+    x: Float[np.ndarray, "*c n"],
+    width: float,
+) -> Float[np.ndarray, "*c N"]:
+    """Standard deviation over t_new ± width/2 of a signal that may step between its samples.
+
+    Its mean is that of lines. At a share s of the way from one sample to the next a signal that
+    stepped at an unknown time has the variance s (1 - s) of the step, and a smooth one has none. A
+    step bends the signal at its two samples in opposite ways, by half of it each.
+    """
+    change = np.abs(np.diff(x))
+    bend = np.zeros_like(x)
+    if t.size > 2:
+        share = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
+        bend[..., 1:-1] = x[..., 1:-1] - (1 - share) * x[..., :-2] - share * x[..., 2:]
+    step = np.minimum(change, np.abs(np.diff(bend)))
+    offsets = width * ((np.arange(_PARTS) + 0.5) / _PARTS - 0.5)
+    at = np.clip(t_new + offsets[:, None], t[0], t[-1])
+    i, s = _locate(at, t)
+    line = x[..., i] + s * (x[..., i + 1] - x[..., i])
+    square = (line**2 + s * (1 - s) * step[..., i] ** 2).mean(axis=-2)
+    return np.sqrt(np.maximum(square - line.mean(axis=-2) ** 2, 0.0))
 
 
 def integral(

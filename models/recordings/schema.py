@@ -29,6 +29,8 @@ COMMANDS = {
 }
 UNEVEN = "elapsed"
 """Time since a trajectory's index 0, where its steps are uneven; dt is then a nominal step."""
+PWM_STD = "pwm_std"
+"""Standard deviation of the PWM in each step, of logs with sampled outputs; `pwm` is the mean."""
 SENSORS: dict[str, tuple[str | None, str]] = {
     "voltage": (None, "V"),
     "imu_specific_force": ("axis", "m/s^2"),
@@ -36,6 +38,7 @@ SENSORS: dict[str, tuple[str | None, str]] = {
     "pressure_depth": (None, "m"),
     "vertical_velocity": (None, "m/s"),
     "rc": ("channel", "us"),
+    PWM_STD: ("thruster", "us"),
     UNEVEN: (None, "s"),
 }
 LABELS: dict[str, tuple[str, ...]] = {

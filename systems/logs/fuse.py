@@ -16,6 +16,7 @@ import numpy as np
 
 from ...models.recordings.build import Trajectory
 from ...models.recordings.resample import (
+    deviation,
     grid,
     hermite,
     hold,
@@ -24,6 +25,7 @@ from ...models.recordings.resample import (
     rotations,
     slerp,
 )
+from ...models.recordings.schema import PWM_STD
 from .between import velocity_at
 from .segments import Segment, segments
 from .signals import Series, Signals
@@ -148,6 +150,9 @@ def at_instants(
         sensors["voltage"] = linear(t, signals.voltage.t, signals.voltage.x)
     if signals.rc is not None:
         sensors["rc"] = hold(t, signals.rc.t, signals.rc.x, dt).T
+    if signals.command == "pwm" and not signals.held:
+        outputs = signals.outputs
+        sensors[PWM_STD] = deviation(t + dt / 2, outputs.t, outputs.x, dt).T
     return Trajectory(
         name,
         np.concatenate([q, p]).T,

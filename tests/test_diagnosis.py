@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +43,7 @@ from spinndrift.training.diagnosis.findings.result import (
     schema,
 )
 from spinndrift.training.diagnosis.findings.sentences import sentence, verdict
-from spinndrift.training.diagnosis.pipeline import DiagnoseConfig, Diagnoser
+from spinndrift.training.diagnosis.pipeline import DiagnoseConfig, Diagnoser, for_all_coefficients
 from spinndrift.training.diagnosis.selection.hypotheses import Fit
 from spinndrift.training.diagnosis.selection.model_selection import admissible, choose, is_itself
 from spinndrift.training.diagnosis.selection.search import Search
@@ -691,6 +692,24 @@ def test_states_that_a_log_says_are_estimated_have_the_noise_of_estimates(tmp_pa
         problem = Diagnoser(given, VEHICLE).problem
         assert problem.data.estimated == estimated
         assert problem.predict(problem.believed)[1].estimated == estimated
+
+
+@pytest.mark.parametrize(
+    ("names", "left", "again"),
+    [
+        (("quadratic_drag", "added_mass"), (), True),
+        (("thrust_scale", "linear_drag", "tether"), (), True),
+        (("quadratic_drag", "quadratic_drag"), (), False),
+        (("quadratic_drag", "tether"), (), False),
+        (("unknown", "dvl_scale"), (), False),
+        ((), ("its forecasts diverge",), True),
+    ],
+)
+def test_all_coefficients_are_tried_where_several_are_named_or_something_is_left(
+    names, left, again
+):
+    causes = [SimpleNamespace(name=name) for name in names]
+    assert bool(for_all_coefficients(SimpleNamespace(causes=causes, left=left))) == again
 
 
 def test_axes_that_are_not_driven_and_filled_samples_are_told(tmp_path):

@@ -38,8 +38,6 @@ from .schema import (
 )
 from .splits import run_parts, time_parts
 
-"""Attribute of a log's recording: period (s) of its commands."""
-
 
 @dataclass(frozen=True)
 class Recording:

@@ -37,14 +37,14 @@ def segments(signals: Signals, gap: float) -> tuple[list[Segment], list[str]]:
     told: list[str] = []
     spans = [Segment(-np.inf, np.inf, ())]
     for state in signals.spans.values():
-        spans = _intersect(spans, state)
+        spans = intersect(spans, state)
     armed = [s for s in spans if "disarmed" not in s.labels]
     series = [signals.attitude, signals.rates, signals.outputs]
     series += [s for s in (signals.position, signals.velocity) if s is not None]
     gaps: list[tuple[float, float]] = []
     for one in series:
         pieces = _without_gaps(one, gap)
-        spans = _intersect(spans, pieces)
+        spans = intersect(spans, pieces)
         gaps += zip(pieces.stop[:-1].tolist(), pieces.start[1:].tolist(), strict=True)
     told += _short(signals, series[1:], armed, gap)
     felt = [(a, b) for a, b in gaps if any(a < s.stop and b > s.start for s in armed)]
@@ -54,7 +54,7 @@ def segments(signals: Signals, gap: float) -> tuple[list[Segment], list[str]]:
         longest = max(b - a for a, b in felt)
         told.append(f"{count} gap{'s' * (count > 1)} of up to {longest:.1f} s")
     cuts = [*signals.cuts, *jumps(signals)]
-    spans = _intersect(spans, _between([t for t, _ in cuts]))
+    spans = intersect(spans, _between([t for t, _ in cuts]))
     cuts = [(t, k) for t, k in cuts if any(s.start <= t <= s.stop for s in armed)]
     for kind in dict.fromkeys(kind for _, kind in cuts):
         times = np.sort([t for t, k in cuts if k == kind])
@@ -136,7 +136,8 @@ def _between(times: Sequence[float]) -> Spans:
     return Spans(start, stop, ("",) * start.size)
 
 
-def _intersect(segments: Sequence[Segment], spans: Spans) -> list[Segment]:
+def intersect(segments: Sequence[Segment], spans: Spans) -> list[Segment]:
+    """The parts of segments that lie in spans of a state, with its label in addition."""
     result = []
     for segment in segments:
         for start, stop, label in zip(spans.start, spans.stop, spans.label, strict=True):

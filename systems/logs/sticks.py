@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..mavlink import codec
+from .segments import Segment, intersect
 from .signals import Series, Spans, silences
 from .table import Table
 from .tlog import RENAMED
@@ -69,17 +70,14 @@ def by_sticks(
 ) -> tuple[Series, list[str]]:
     """The outputs (µs) along the sticks where these tell what they were, and a sentence.
 
-    A mode is a combination of labels of the `states`, such as the autopilot's mode and the wiring.
-
-    They are as they were if no stream of sticks tells them better than lines between samples.
+    They stay as they are if no sticks tell better than lines between samples do. A mode is a
+    combination of labels of the `states`, such as the autopilot's mode and the wiring.
     """
-    modes = _modes(states)
-    tried = []
-    for name in NAMES:
-        sticks = _sticks(tables, name)
-        series, misses = (None, ()) if sticks is None else _curves(outputs, sticks, modes)
-        if sticks is not None and series is not None:
-            tried.append((sticks, series, misses))
+    modes, tried = _modes(states), []
+    for sticks in (_sticks(tables, name) for name in NAMES):
+        curves = None if sticks is None else _curves(outputs, sticks, modes)
+        if curves is not None:
+            tried.append((sticks, *curves))
     if not tried:
         return outputs, []
     sticks, series, misses = min(tried, key=lambda found: found[2][0])
@@ -92,11 +90,14 @@ def by_sticks(
 
 def _curves(
     outputs: Series, sticks: _Sticks, modes: Sequence[Spans]
-) -> tuple[Series | None, tuple[float, float]]:
-    """The outputs along sticks, and what every second sample misses them and lines by (µs, rms)."""
+) -> tuple[Series, tuple[float, float]] | None:
+    """The outputs along sticks, and what every second sample misses them and lines by (µs, rms).
+
+    None where no thruster follows these sticks.
+    """
     groups = _groups(outputs, sticks, modes)
     if not groups:
-        return None, (np.inf, np.inf)
+        return None
     lag = _lag(outputs, sticks, groups)
     late = sticks._replace(t=sticks.t + lag)
     t = _times(outputs, late)
@@ -115,8 +116,8 @@ def _curves(
             rest = np.interp(t[here], own, u[i] - C[i] @ s)
             low, high = min(_RANGE_US[0], u[i].min()), max(_RANGE_US[1], u[i].max())
             x[i, here] = np.clip(C[i] @ late.at(t[here]) + rest, low, high)
-    if curve == line:  # no thruster follows the sticks
-        return None, (np.inf, np.inf)
+    if curve == line:
+        return None
     misses = (float(np.sqrt(curve / count)), float(np.sqrt(line / count)))
     return Series(t, x, f"{outputs.source} along {sticks.name}", outputs.left_out), misses
 
@@ -174,15 +175,13 @@ def _groups(outputs: Series, sticks: _Sticks, modes: Sequence[Spans]) -> list[_M
 
 def _modes(states: Sequence[Spans]) -> list[Spans]:
     """The spans of each combination of labels."""
-    found = {(): [(-np.inf, np.inf)]}
+    parts = [Segment(-np.inf, np.inf, ())]
     for state in states:
-        both: dict[tuple[str, ...], list[tuple[float, float]]] = {}
-        for labels, spans in found.items():
-            for a, b, label in zip(state.start, state.stop, state.label, strict=True):
-                inside = [(max(a, x), min(b, y)) for x, y in spans if max(a, x) < min(b, y)]
-                both.setdefault((*labels, label), []).extend(inside)
-        found = both
-    return [_spans(s) for s in found.values() if s]
+        parts = intersect(parts, state)
+    return [
+        _spans([(part.start, part.stop) for part in parts if part.labels == labels])
+        for labels in dict.fromkeys(part.labels for part in parts)
+    ]
 
 
 def _times(outputs: Series, sticks: _Sticks) -> Float[np.ndarray, " k"]:

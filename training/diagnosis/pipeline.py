@@ -361,7 +361,7 @@ def diagnose(
         return _diagnose(recording, vehicle, base, config or DiagnoseConfig(), progress)
 
 
-def _for_all_coefficients(first: result.Diagnosis) -> str:
+def for_all_coefficients(first: result.Diagnosis) -> str:
     """Why a diagnosis is tried again with all coefficients fitted, or nothing."""
     if first.left:
         return "left-out data speak against the verdict"
@@ -382,7 +382,7 @@ def _diagnose(
     diagnoser = Diagnoser(recording, vehicle, base, config, progress)
     found = diagnoser.run()
     first = found.diagnosis
-    why = _for_all_coefficients(first)
+    why = for_all_coefficients(first)
     if config.refit != "auto" or not diagnoser.driven or not why:
         progress(1.0, "done")
         return found

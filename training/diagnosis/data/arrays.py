@@ -242,8 +242,8 @@ def make_data(
 
     Thruster forces are as they are; PWM goes through the vehicle's curve at the recorded voltage; a
     wrench is allocated with the least effort. Runs `without` (by number, scenario by scenario) are
-    left out unless none would remain. Commands before a run are unknown: its first `remembered` s
-    (a tenth at most) set the actuators. Positions not measured are integrated; velocities are zero.
+    left out unless none would remain. A run's first `remembered` s (a tenth at most) set actuators.
+    Positions not measured are integrated velocities; velocities not measured, or lost, are zero.
 
     Raises:
         UserError: attitude or rates are missing, or no run has two samples.

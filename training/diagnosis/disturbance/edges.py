@@ -25,7 +25,7 @@ from .laws import Law, impacts
 def without_commanded(
     laws: Sequence[Law], problem: DiagnosisProblem, evaluation: Evaluation, least: float
 ) -> list[Law]:
-    """The laws without impacts that win less than `least` nats far from such places, twice."""
+    """The laws, but of impacts only those that win half of `least` nats far from such places."""
     data, kept = problem.data, []
     places = [_from_edges(problem, evaluation.theta), _from_changes(data)]
     halves = [_farther_half(distance, data) for distance in places if distance is not None]

@@ -1,4 +1,4 @@
-"""Velocity between slow samples follows an accelerometer that tells of it, and no other."""
+"""Attitude and velocity between slow samples follow sensors that tell of them, and no others."""
 
 from dataclasses import replace
 
@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from spinndrift.systems.logs.between import velocity_at
+from spinndrift.models.recordings.resample import slerp
+from spinndrift.systems.logs.between import attitude_at, velocity_at
+from spinndrift.systems.logs.load import own_rate, usual_rate
 from spinndrift.systems.logs.signals import Series, Signals
 
 GRAVITY = 9.80665
@@ -37,6 +39,81 @@ def log(period=0.1, bias=(0.0, 0.0, 0.0), noise=0.0):
         velocity=Series(slow, velocity(slow), "LOCAL_POSITION_NED"),
         specific_force=Series(t, f, "RAW_IMU"),
     )
+
+
+def turning(t):
+    """Attitudes q_WB that turn by up to 3 rad/s about all axes at times t (s)."""
+    angles = np.stack([0.4 * t, 0.35 * np.sin(5 * t), 0.5 * np.sin(6 * t + 1)], axis=1)
+    return Rotation.from_euler("ZYX", angles)
+
+
+def turned(period=0.1, bias=(0.0, 0.0, 0.0), fast=0.01):
+    """Attitudes of `turning` each `period` (s) and body rates each `fast` s."""
+    t, h = np.arange(0.0, 20.0, fast), 1e-4
+    omega = (turning(t - h).inv() * turning(t + h)).as_rotvec().T / (2 * h)
+    slow = np.arange(0.013, 20.0, period)
+    q = turning(slow).as_quat(scalar_first=True).T
+    rates = Series(t, omega + np.asarray(bias)[:, None], "RAW_IMU")
+    return Signals(attitude=Series(slow, q, "ATTITUDE"), rates=rates, outputs=rates)
+
+
+def angles_off(q, t=WANTED):
+    right = turning(t)
+    return (right.inv() * Rotation.from_quat(q.T, scalar_first=True)).magnitude()
+
+
+def geodesics(signals, t=WANTED):
+    return slerp(t, signals.attitude.t, signals.attitude.x)
+
+
+def test_a_turn_between_samples_is_that_of_the_gyro():
+    exact = turned()
+    line = np.sqrt(np.mean(angles_off(geodesics(exact)) ** 2))
+    assert line > 0.01
+    assert angles_off(attitude_at(exact, WANTED)).max() < 1e-3
+    biased = turned(bias=(0.02, -0.03, 0.01))
+    assert angles_off(attitude_at(biased, WANTED)).max() < 2e-3
+    inside = exact.attitude.t[5:-5]
+    assert angles_off(attitude_at(biased, inside), inside).max() < 1e-9
+
+
+def test_coning_between_samples_is_turned_in_the_right_order():
+    """A quarter of a second between attitudes, in which the axes of the turn change."""
+    exact = turned(period=0.25, fast=0.002)
+    assert angles_off(geodesics(exact)).max() > 0.1
+    assert angles_off(attitude_at(exact, WANTED)).max() < 0.01
+
+
+@pytest.mark.parametrize("wrong", ["sign", "axes", "slow", "silent"])
+def test_a_gyro_that_does_not_tell_of_the_turn_is_not_followed(wrong):
+    signals = turned(fast=0.08 if wrong == "slow" else 0.01)
+    rates = signals.rates
+    given = {
+        "sign": replace(rates, x=-rates.x),
+        "axes": replace(rates, x=np.roll(rates.x, 1, axis=0)),
+        "slow": rates,
+        "silent": replace(rates, x=0 * rates.x),
+    }[wrong]
+    found = attitude_at(replace(signals, rates=given), WANTED)
+    np.testing.assert_allclose(found, geodesics(signals), atol=1e-12)
+
+
+def test_a_pause_of_the_gyro_is_crossed_on_the_geodesic():
+    signals = turned()
+    paused = (signals.rates.t > 8.0) & (signals.rates.t < 8.5)
+    rates = replace(signals.rates, t=signals.rates.t[~paused], x=signals.rates.x[:, ~paused])
+    found = attitude_at(replace(signals, rates=rates), WANTED)
+    there = (WANTED > 8.1) & (WANTED < 8.4)
+    np.testing.assert_allclose(found[:, there], geodesics(signals)[:, there], atol=1e-12)
+    away = (WANTED < 7.8) | (WANTED > 8.7)
+    assert angles_off(found)[away].max() < 1e-3
+
+
+def test_attitudes_that_a_gyro_tells_of_count_at_its_rate():
+    assert own_rate(turned()) == 50
+    assert own_rate(turned(fast=0.04)) == usual_rate(turned(fast=0.04)) == 25
+    lone = turned(fast=0.04)
+    assert own_rate(replace(lone, rates=replace(lone.rates, x=-lone.rates.x))) == 10
 
 
 def velocities(signals) -> Series:

@@ -604,14 +604,24 @@ def test_a_log_may_keep_the_rate_of_its_slowest_stream():
     assert import_log(DEMO)[0].dt == pytest.approx(0.05)
 
     def rate(*each):
-        one, two, three = (Series(np.arange(0, 10, 1 / hz), np.zeros(1), "") for hz in each)
-        return own_rate(Signals(attitude=one, rates=two, outputs=three))
+        times = [np.arange(0, 10, 1 / hz) for hz in each]
+        one, two, three = (Series(t, np.ones((4, t.size)), "") for t in times)
+        rates = Series(two.t, 0 * two.x[:3], "")
+        return own_rate(Signals(attitude=one, rates=rates, outputs=three))
 
+    def dropping(every):
+        t = np.delete(np.arange(0, 10, 0.02), np.s_[::every])
+        one = Series(t, np.ones((4, t.size)), "")
+        return own_rate(Signals(attitude=one, rates=Series(t, 0 * one.x[:3], ""), outputs=one))
+
+    assert dropping(30) == dropping(4) == 50
     assert rate(100, 100, 100) == 50
-    assert rate(50, 48.5, 100) == 50  # a stream that drops a few
-    assert rate(50, 100, 30) == 25
-    assert rate(50, 50, 10) == 20
+    assert rate(50, 30, 100) == 30
+    assert rate(50, 50, 10) == 50  # between outputs it is known what to expect, and how well
+    assert rate(30, 50, 50) == 25  # every second sample of the body rates
+    assert rate(1000, 1000, 100) == 50
     assert rate(10, 100, 50) == rate(100, 10, 50) == rate(4, 100, 10) == 10
+    assert rate(14.3, 14.3, 50) == pytest.approx(14.3)
 
 
 def test_the_demo_log_is_what_its_command_makes():

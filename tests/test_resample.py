@@ -14,6 +14,7 @@ from spinndrift.models.recordings.resample import (
     hold,
     linear,
     mean,
+    rise,
     slerp,
 )
 
@@ -108,6 +109,21 @@ def test_deviation_of_a_smooth_signal_is_its_own():
     # the slope of a line is that at its middle: off by h f''/2 at most
     np.testing.assert_allclose(found, own, atol=0.1 * 9 / 2 * 0.1 / np.sqrt(12))
     assert abs(np.mean(found**2) / np.mean(own**2) - 1) < 0.02
+
+
+def test_rise_is_that_of_the_best_line():
+    t = np.arange(0.0, 3.0, 1e-3)
+    line = np.stack([4.0 * t, 1.0 - 2.0 * t])
+    np.testing.assert_allclose(rise(np.array([0.5, 1.7]), t, line, 0.4).T, [[1.6, -0.8]] * 2)
+    for share in (0.1, 0.5, 0.8):  # a step at a share of the width: 6 s (1 - s) by least squares
+        x = (t > 1.0 + 0.4 * share - 0.2 - 1e-9).astype(float)
+        found = rise(np.array([1.0]), t, x, 0.4)
+        np.testing.assert_allclose(found, 6 * share * (1 - share), atol=0.02)
+    at = 0.9 + 0.2 * (np.arange(4000) + 0.5) / 4000
+    x = 1500 + 100 * np.sin(40 * t)
+    fine = np.interp(at, t, x)
+    slope = np.polynomial.polynomial.polyfit(at, fine, 1)[1]
+    np.testing.assert_allclose(rise(np.array([1.0]), t, x, 0.2)[0], 0.2 * slope, rtol=0.01)
 
 
 def test_smooth_motion_converges_with_second_order():

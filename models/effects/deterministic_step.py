@@ -21,9 +21,9 @@ class Actuated(Protocol):
     """A model driven by thruster forces: `effects.Extended`, which documents these methods."""
 
     def actuate(
-        self, memory: Memory, command: Array, dt: Any, substeps: int
+        self, memory: Memory, command: Array, dt: Any, substeps: int, rise: Array | None = None
     ) -> tuple[Memory, Array]:
-        """Memories after a held command, and mean thruster forces over its substeps."""
+        """Memories after a step, and mean thruster forces over its substeps."""
         ...
 
     def feel(self, memory: Memory, V_WB_B: Array, dt: Any) -> tuple[Memory, Array | None]:
@@ -54,26 +54,27 @@ def advance(
     substeps: int = 1,
     voltage: Float[Array, "1 *#batch"] | None = None,
     push: Float[Array, "6 *#batch"] | None = None,
+    rise: Float[Array, "n *#batch"] | None = None,
 ) -> tuple[
     Memory, Float[Array, "7 *#batch"], Float[Array, "6 *#batch"], Float[Array, "12 *#batch"]
 ]:
     """Memory, pose and twist after `dt` s, and dV/dt and d²V/dt² at the end of the last substep.
 
     The second derivative is the difference quotient of the first over that substep. `dt` is a
-    scalar, or (1, *batch) where columns have different steps.
+    scalar, or (1, *batch) where columns have different steps; over it the command may `rise`.
 
     Runge–Kutta–Munthe-Kaas of order 4 for X' = X V (Munthe-Kaas 1999; Owren and Marthinsen 1999).
-    Thruster forces are linear over a substep, with the means of its two halves: in a fast turn the
-    response depends on the timing of thrust within 0.01 s. `inertia` is `model.inertia()`. The four
-    stages are one loop, so that a model of many effects compiles once.
+    Thruster forces are linear over a substep, with the means of its two halves: a fast turn depends
+    on their timing within 0.01 s. `inertia` is `model.inertia()`. The four stages are one loop, so
+    that a model of many effects compiles once.
     """
-    memory, levels = model.actuate(memory, command, dt, 2 * substeps)
+    memory, levels = model.actuate(memory, command, dt, 2 * substeps, rise)
     memory, felt = model.feel(memory, V_WB_B, dt)
     if felt is not None:
         push = felt if push is None else push + felt
     dtype = V_WB_B.dtype
     first, second = levels[..., ::2], levels[..., 1::2]
-    middle, rise = (first + second) / 2, second - first
+    middle, change = (first + second) / 2, second - first
     h = jnp.asarray(dt / substeps, dtype)
     own = inertia.inverse.shape[2:] if inertia.inverse.ndim - 1 == V_WB_B.ndim else ()
     batch = jnp.broadcast_shapes(X_WB.shape[1:], V_WB_B.shape[1:], middle.shape[1:-1], own)
@@ -83,12 +84,12 @@ def advance(
 
     def substep(carry: Any, force: tuple[Array, Array]) -> Any:
         X, V, _ = carry
-        middle, rise = force
+        middle, change = force
 
         def stage(carry: Any, numbers: Any) -> Any:
             X_s, V_s, twist, gain, _ = carry
             at, ahead, weight = numbers
-            a = model.drift(inertia, X_s, V_s, middle + at * rise, voltage, push)
+            a = model.drift(inertia, X_s, V_s, middle + at * change, voltage, push)
             twist, gain = twist + weight * V_s, gain + weight * a
             following = se3.retract(X, ahead * h * V_s), V + ahead * h * a
             return (*following, twist, gain, a), (V_s, a)
@@ -99,7 +100,6 @@ def advance(
         rates = jnp.concatenate([a, (a - a_s[0]) / h])
         return (se3.retract(X, h * twist), V + h * gain, rates), None
 
-    start = (X, V, jnp.zeros((12, *batch), dtype))
-    forces = (jnp.moveaxis(middle, -1, 0), jnp.moveaxis(rise, -1, 0))
-    (X, V, a), _ = jax.lax.scan(substep, start, forces)
+    forces = (jnp.moveaxis(middle, -1, 0), jnp.moveaxis(change, -1, 0))
+    (X, V, a), _ = jax.lax.scan(substep, (X, V, jnp.zeros((12, *batch), dtype)), forces)
     return memory, X, V, a

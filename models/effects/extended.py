@@ -124,11 +124,22 @@ class Extended(EffectsOnMotion):
         return tuple(e.initial(command) for e in self.effects if e.memory_size)
 
     def actuate(
-        self, memory: Memory, command: Float[Array, "n *#batch"], dt: Any, substeps: int
+        self,
+        memory: Memory,
+        command: Float[Array, "n *#batch"],
+        dt: Any,
+        substeps: int,
+        rise: Float[Array, "n *#batch"] | None = None,
     ) -> tuple[Memory, Float[Array, "n *#batch S"]]:
-        """Memories after a held command of `dt` s, and mean forces over its substeps."""
+        """Memories after `dt` s, and mean forces over its substeps.
+
+        The command is held, or the mean of one that changes by `rise` over the step.
+        """
         h = jnp.asarray(dt, command.dtype)
         level = jnp.broadcast_to(command[..., None], (*command.shape, substeps))
+        if rise is not None:
+            middles = (jnp.arange(substeps, dtype=command.dtype) + 0.5) / substeps - 0.5
+            level = level + jnp.tensordot(rise, middles, 0)
         kept, i = [], 0
         for effect in self.effects:
             if effect.memory_size:

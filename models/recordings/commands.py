@@ -10,7 +10,10 @@ from jaxtyping import Array, Float
 
 from ..config.errors import UserError
 from ..vehicles.vehicle import load_vehicle
-from .schema import PWM_STD
+from .schema import PWM_RISE, PWM_STD
+
+_LEAST_US = 1.0
+"""Least width (us) over which the slope of a thrust curve is taken."""
 
 
 def thrusters_of(dataset: xr.Dataset, vehicle: Any, command: str) -> Any:
@@ -41,8 +44,33 @@ def forces_of(dataset: xr.Dataset, name: str, thrusters: Any) -> Float[Array, "n
     volts = jnp.asarray(voltage_of(dataset, thrusters))
     if PWM_STD not in dataset:
         return thrusters.force(command, volts)
-    std = jnp.asarray(np.nan_to_num(np.moveaxis(dataset[PWM_STD].to_numpy(), -1, 0)))
+    std = _of_pwm(dataset, PWM_STD)
     return (thrusters.force(command + std, volts) + thrusters.force(command - std, volts)) / 2
+
+
+def rises_of(dataset: xr.Dataset, thrusters: Any) -> Float[np.ndarray, "J K N n"] | None:
+    """Changes of the thrusters' forces (N) over each step; None where commands are held.
+
+    Those of `pwm_rise` by the slope of the thrust curve from one deviation below the mean PWM to
+    one above it. 0 beyond a trajectory's end.
+    """
+    if not {"pwm", PWM_RISE} <= set(dataset) or "thruster_force" in dataset:
+        return None
+    change = _of_pwm(dataset, PWM_RISE)
+    width = jnp.abs(change) / np.sqrt(12.0)  # deviation of a line
+    if PWM_STD in dataset:
+        width = jnp.maximum(width, _of_pwm(dataset, PWM_STD))
+    width = jnp.maximum(width, _LEAST_US)
+    pwm, mask = dataset["pwm"].to_numpy(), dataset["mask"].to_numpy()
+    pwm = jnp.asarray(np.moveaxis(np.where(mask[..., None], pwm, 1500.0), -1, 0))
+    volts = jnp.asarray(voltage_of(dataset, thrusters))
+    above, below = (thrusters.force(pwm + sign * width, volts) for sign in (1, -1))
+    return np.moveaxis(np.asarray(change * (above - below) / (2 * width)), 0, -1)
+
+
+def _of_pwm(dataset: xr.Dataset, name: str) -> Float[Array, "n J K N"]:
+    """A variable beside the PWM; 0 where it is not known."""
+    return jnp.asarray(np.nan_to_num(np.moveaxis(dataset[name].to_numpy(), -1, 0)))
 
 
 def check_count(dataset: xr.Dataset, name: str, count: int, vehicle: str = "the vehicle") -> None:

@@ -7,6 +7,7 @@ body twist from one sample to the next. Arrays are component first, as in `model
 from collections.abc import Callable
 
 import numpy as np
+import scipy.integrate
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
@@ -92,6 +93,24 @@ def deviation(
     line = x[..., i] + s * (x[..., i + 1] - x[..., i])
     square = (line**2 + s * (1 - s) * step[..., i] ** 2).mean(axis=-2)
     return np.sqrt(np.maximum(square - line.mean(axis=-2) ** 2, 0.0))
+
+
+def rise(
+    t_new: Float[np.ndarray, " N"],
+    t: Float[np.ndarray, " n"],
+    x: Float[np.ndarray, "*c n"],
+    width: float,
+) -> Float[np.ndarray, "*c N"]:
+    """Change over t_new ± width/2 of the line that fits the linear interpolant there best.
+
+    12/h² ∫ (s - t) x ds over the width h, by parts. It is right in the mean for a signal that
+    stepped at any time between two samples.
+    """
+    path = integral(t, x)
+    offsets = np.linspace(-width / 2, width / 2, _PARTS + 1)
+    at = path((t_new + offsets[:, None]).ravel()).reshape(*x.shape[:-1], _PARTS + 1, -1)
+    area = scipy.integrate.simpson(at, offsets, axis=-2) / width
+    return 12 / width * ((at[..., 0, :] + at[..., -1, :]) / 2 - area)
 
 
 def integral(

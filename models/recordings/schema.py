@@ -31,6 +31,8 @@ UNEVEN = "elapsed"
 """Time since a trajectory's index 0, where its steps are uneven; dt is then a nominal step."""
 PWM_STD = "pwm_std"
 """Standard deviation of the PWM in each step, of logs with sampled outputs; `pwm` is the mean."""
+PWM_RISE = "pwm_rise"
+"""Change of the PWM over each step by the line that fits it best, of such logs."""
 SENSORS: dict[str, tuple[str | None, str]] = {
     "voltage": (None, "V"),
     "imu_specific_force": ("axis", "m/s^2"),
@@ -39,6 +41,7 @@ SENSORS: dict[str, tuple[str | None, str]] = {
     "vertical_velocity": (None, "m/s"),
     "rc": ("channel", "us"),
     PWM_STD: ("thruster", "us"),
+    PWM_RISE: ("thruster", "us"),
     UNEVEN: (None, "s"),
 }
 LABELS: dict[str, tuple[str, ...]] = {

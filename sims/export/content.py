@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from ...models.recordings.build import Trajectory
 from ...models.recordings.checks.finding import findings_of
-from ...models.recordings.schema import LABELS, PWM_STD, UNEVEN
+from ...models.recordings.schema import LABELS, PWM_RISE, PWM_STD, UNEVEN
 from ...models.recordings.store import Recording
 from ...models.se3 import TWIST, WRENCH, XYZ
 from ...systems.planning.mppi import FIGURES
@@ -35,6 +35,7 @@ _PLOTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "thruster_force": ("/command/thruster_force", ()),
     "pwm": ("/command/pwm", ()),
     PWM_STD: ("/command/pwm_std", ()),
+    PWM_RISE: ("/command/pwm_rise", ()),
     "voltage": ("/sensors/voltage", ("voltage",)),
     "pressure_depth": ("/sensors/pressure_depth", ("depth",)),
     "vertical_velocity": ("/sensors/vertical_velocity", ("climb",)),

@@ -1,13 +1,10 @@
 """Cuts and resamples a log's signals to one uniform grid: the trajectories of a recording.
 
-Attitude is interpolated along the geodesic, position by the Hermite cubic with the estimated
-velocity as its slope, velocity along the accelerometer (`between.py`) and then rotated into the
-body; rates and IMU are means about each instant (`models/recordings/resample.py`). Without a
-horizontal estimate height and climb are those of `vertical.py`. Accelerometer and pressure are
-measurements: they have a value where there was a sample, and are NaN elsewhere. The command of a
-step is the mean over that step of the linear interpolation of the logged outputs: a zero-order hold
-of these samples would delay the commands by half a sampling period (50 ms at the 10 Hz of a
-DataFlash log). Commands that act until the next one (`Signals.held`) are held.
+Attitude is interpolated along the gyro and velocity along the accelerometer (`between.py`),
+position by the Hermite cubic with the estimated velocity as its slope; rates and IMU are means
+about each instant (`models/recordings/resample.py`). Without a horizontal estimate height and climb
+are those of `vertical.py`. Accelerometer and pressure are measurements: they have a value where
+there was a sample, and are NaN elsewhere. Commands of the steps are those of `commanded.py`.
 """
 
 from itertools import pairwise
@@ -16,23 +13,23 @@ import numpy as np
 
 from ...models.recordings.build import Trajectory
 from ...models.recordings.resample import (
-    deviation,
     grid,
     hermite,
     hold,
     linear,
     mean,
     rotations,
-    slerp,
 )
-from ...models.recordings.schema import PWM_STD
-from .between import velocity_at
+from .between import attitude_at, velocity_at
+from .commanded import over_steps
 from .segments import Segment, segments
 from .signals import Series, Signals
 from .streams import DEAD_RECKONING, UNAIDED
 from .vertical import vertical
 
-_FAST_HZ, _MEAN_S = 200.0, 0.01
+FAST_HZ = 200.0
+"""Rate above which inertial sensors are averaged over `_MEAN_S` about each instant."""
+_MEAN_S = 0.01
 _LONGEST_S = 300.0
 _EQUAL = 0.95
 """Samples in a step of the grid from which on a signal counts as no slower than it."""
@@ -124,7 +121,7 @@ def at_instants(
     signals: Signals, segment: Segment, t: np.ndarray, name: str, dt: float
 ) -> Trajectory:
     """What a log holds of a segment at the instants t (s) in it, `dt` apart."""
-    q = slerp(t, signals.attitude.t, signals.attitude.x)
+    q = attitude_at(signals, t)
     omega = _instants(signals.rates, t)
     aided = UNAIDED not in segment.labels
     p, v = np.full((2, 3, t.size), np.nan)
@@ -150,15 +147,13 @@ def at_instants(
         sensors["voltage"] = linear(t, signals.voltage.t, signals.voltage.x)
     if signals.rc is not None:
         sensors["rc"] = hold(t, signals.rc.t, signals.rc.x, dt).T
-    if signals.command == "pwm" and not signals.held:
-        outputs = signals.outputs
-        sensors[PWM_STD] = deviation(t + dt / 2, outputs.t, outputs.x, dt).T
+    command, beside = over_steps(signals, t, dt)
     return Trajectory(
         name,
         np.concatenate([q, p]).T,
         np.concatenate([v, omega]).T,
-        {signals.command: _commands(signals, t, dt)},
-        sensors,
+        {signals.command: command},
+        sensors | beside,
         float(t[0]),
     )
 
@@ -186,14 +181,6 @@ def _first(rates: Series, segment: Segment, dt: float) -> float:
     return first if first < segment.start + dt else segment.start
 
 
-def _commands(signals: Signals, t: np.ndarray, dt: float) -> np.ndarray:
-    """Mean command of each step, time first."""
-    outputs = signals.outputs
-    if signals.held:
-        return hold(t, outputs.t, outputs.x, dt).T
-    return mean(t + dt / 2, outputs.t, outputs.x, dt).T
-
-
 def _at(series: Series, t: np.ndarray) -> np.ndarray:
     same = series.t.size == t.size and np.array_equal(series.t, t)
     return series.x if same else linear(t, series.t, series.x)
@@ -204,7 +191,7 @@ def _instants(series: Series, t: np.ndarray) -> np.ndarray:
 
     A mean over half a step of 50 ms would attenuate accelerations at 5 Hz by 2 %.
     """
-    if series.rate > _FAST_HZ:
+    if series.rate > FAST_HZ:
         return mean(t, series.t, series.x, _MEAN_S)
     return linear(t, series.t, series.x)
 

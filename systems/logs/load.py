@@ -19,13 +19,14 @@ from ...models.vehicles.vehicle import load_vehicle
 from .align import aligned, reference
 from .bags.bag import bag_kind
 from .bags.signals import read_bag
+from .between import gyro_tells
 from .consistency import motion_findings
 from .dataflash import read_bin
 from .frame import settled
-from .fuse import fuse
+from .fuse import FAST_HZ, fuse
 from .log_bytes import Progress, no_progress, read_log_bytes
 from .report import ImportReport, tell
-from .signals import Signals
+from .signals import Series, Signals
 from .signals_dataflash import WANTED as BIN_WANTED
 from .signals_dataflash import signals_from_bin
 from .signals_tlog import ANYONE, signals_from_tlog
@@ -35,8 +36,11 @@ from .tlog import read_tlog
 
 RATE = 20.0
 """Rate (Hz) of an imported log, if none is given and attitude and body rates are not slower."""
-_RATES = (50.0, 40.0, 25.0, RATE)
-_SLOW = 10.0
+_FASTEST, _SLOW = 50.0, 10.0
+"""Largest and least rate (Hz) of an imported log, if none is given."""
+_ENOUGH, _NEAR, _LOST = 0.95, 0.01, 1.5
+"""Share of a rate that a stream reaches if it drops a few samples, and by which a rate is near
+another; multiple of a usual step from which on samples were lost."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,7 @@ def import_log(  # long: a third of it says what it takes and refuses
 
     Args:
         path: the log; its kind is determined from its content.
-        rate: of the recording (Hz); None takes 20, or 10 (`usual_rate`).
+        rate: of the recording (Hz); None takes about 20 (`usual_rate`).
         fine: without a rate, take that of the streams (`own_rate`).
         vehicle: preset or file whose thruster directions the PWM is to have; None takes the preset
             with the thrusters of the log's frame (`wiring`). It is named in the result.
@@ -153,30 +157,67 @@ def import_log(  # long: a third of it says what it takes and refuses
 
 
 def usual_rate(signals: Signals) -> float:
-    """20 Hz, or 10 if attitude or body rates are slower: between two of their samples nothing is
-    known of a rotation.
+    """About 20 Hz, or the rate of attitude or body rates if that is slower, from 10 Hz on.
+
+    Body rates below 40 Hz keep their own rate or a part of it: what is read between their samples
+    is smoothed.
     """
-    return _SLOW if min(signals.attitude.rate, signals.rates.rate) < 0.95 * RATE else RATE
+    rotation = _rotation_rate(signals)
+    if rotation < _ENOUGH * RATE:
+        return max(_SLOW, rotation)
+    return RATE if rotation >= _ENOUGH * 2 * RATE else _part(signals.rates, rotation)
 
 
 def own_rate(signals: Signals) -> float:
-    """The largest of 50, 40, 25 and 20 Hz that every stream of state and outputs reaches, or 20.
+    """The rate of the body rates or a part of it, so that they are not interpolated: 50 Hz at most.
 
-    It is 10 where `usual_rate` is. Without a horizontal velocity the accelerometer counts as such a
-    stream: nothing else tells of surge and sway, and it has no reading at a sample between two of
-    its own. From 10 to 20 Hz its own rate is taken; one below 10 Hz is too slow to tell of them.
+    It is the largest part that every stream of the state reaches, or else the least one from 20 Hz
+    on; below it is that of `usual_rate`. Without a horizontal velocity the accelerometer counts as
+    such a stream: nothing else tells of surge and sway, and it has no reading at a sample between
+    two of its own. From 10 to 20 Hz its own rate is taken; one below 10 Hz is too slow to tell.
     """
-    if usual_rate(signals) == _SLOW:
-        return _SLOW
-    streams = [signals.attitude, signals.rates, signals.outputs, signals.velocity]
+    rotation = _rotation_rate(signals)
+    if rotation < _ENOUGH * RATE:
+        return max(_SLOW, rotation)
+    reached = [rotation, _FASTEST]
     v, force = signals.velocity, signals.specific_force
+    if v is not None:
+        reached.append(v.rate)
     if force is not None and (v is None or not np.isfinite(v.x[:2]).any()):
-        if force.rate >= 0.95 * RATE:
-            streams.append(force)
-        elif 1.05 * force.rate >= _SLOW:
-            return max(_SLOW, float(np.floor(2 * force.rate) / 2))
-    slowest = min(s.rate for s in streams if s is not None)
-    return next((rate for rate in _RATES if rate <= 1.05 * slowest), RATE)
+        if force.rate >= _ENOUGH * RATE:
+            reached.append(force.rate)
+        elif force.rate >= _ENOUGH * _SLOW:
+            return max(_SLOW, _nominal(force))
+    return _part(signals.rates, min(reached))
+
+
+def _part(rates: Series, most: float) -> float:
+    """The largest part of a stream's rate up to `most` Hz, or else the least one from 20 Hz on.
+
+    A stream that is averaged about each instant counts as one of `FAST_HZ`.
+    """
+    rate = min(_nominal(rates), FAST_HZ)
+    parts = rate / np.arange(1, max(int(rate / (_ENOUGH * RATE)), 1) + 1)
+    reached = parts[parts <= most / _ENOUGH]
+    return float(reached[0] if reached.size else parts[-1])
+
+
+def _rotation_rate(signals: Signals) -> float:
+    """Rate (Hz) up to which a rotation is known: that of the slower of attitude and body rates.
+
+    It is that of the body rates where these tell of the attitude between its samples.
+    """
+    own = _nominal(signals.rates)
+    told = gyro_tells(signals.attitude, signals.rates)
+    return own if told else min(own, _nominal(signals.attitude))
+
+
+def _nominal(series: Series) -> float:
+    """Rate (Hz) of a stream that loses no samples, in halves of 1 Hz if it is near one."""
+    steps = np.diff(series.t)
+    usual = 1.0 / float(np.mean(steps[steps < _LOST * np.median(steps)]))
+    near = round(2 * usual) / 2
+    return near if abs(near - usual) < _NEAR * usual else usual
 
 
 def load_data(  # long: half of it says what it takes and refuses

@@ -69,6 +69,7 @@ class Signals:
         turned: thrusters (from 1) whose output was mirrored for SERVOn_REVERSED.
         turned_since: those of them from each time (s) on, where it changed.
         estimated: whether attitude and velocity are known to be an autopilot's estimate.
+        low_pass: cutoff (Hz) of the autopilot's low-pass that the rates went through; 0 for none.
         channels: output (from 1) of each thruster, 0 where none drives it; empty if unknown.
     """
 
@@ -94,6 +95,7 @@ class Signals:
     turned_since: tuple[tuple[float, tuple[int, ...]], ...] = ()
     channels: tuple[int, ...] = ()
     estimated: bool = False
+    low_pass: float = 0.0
 
 
 def series(t: np.ndarray, x: ArrayLike, source: str, quantity: str) -> Series | None:

@@ -98,7 +98,9 @@ def signals_from_bin(
     depth = _pressure_depth(tables, parameters, density, position)
     rates, rate_notes = _rates(tables, core)
     force = _imu(tables, core, "ACC", ("AccX", "AccY", "AccZ"), "specific force")
+    low_pass = 0.0
     if not rates.source.startswith("GYR"):  # GYR and ACC are the sensors before the filters
+        low_pass = known.get("INS_GYRO_FILTER", 0.0)
         rates, delay = undelayed(rates, known, "INS_GYRO_FILTER")
         rate_notes = (*rate_notes, *delay)
     if force is not None and force.source != "ACC":
@@ -130,6 +132,7 @@ def signals_from_bin(
         notes=(*log.notes, *strange, *wired.notes, *notes, *rate_notes, *depth.told),
         findings=tuple(findings),
         estimated=True,
+        low_pass=low_pass,
         **wired.of_signals(),
     )
 

@@ -124,6 +124,7 @@ def signals_from_tlog(  # long: a line for each stream of a log
         notes=(*log.notes, *strange, *wired.notes, *notes, *between, *motion_notes, *told),
         findings=(*findings, *direction_findings(wired)),
         estimated=True,
+        low_pass=known.get("INS_GYRO_FILTER", 0.0),
         **wired.of_signals(),
     )
 

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from ....models.config.errors import UserError
 from ....models.effects.traits import Need, Region
 from ....models.recordings.checks.small_speeds import DeadZone
+from ....models.recordings.commands import rises_of
 from ....models.recordings.kinematics import dead_reckoned
 from ....models.recordings.origin import states_estimated
 from ....models.recordings.store import Recording
@@ -70,6 +71,8 @@ class Data:
         started: when each piece's run started, on the recorder's clock (s), if that is known (R,).
         labels: of the runs, by scenario.
         sampled: whether commands are a log's samples of faster ones.
+        rise: change of the command over each step (N), whose mean it then is; None where it is held
+            (N, n, R).
         estimated: whether the states are known to be a filter's estimate.
         zones: small speeds that an instrument lost.
         spread: standard deviation that a lost velocity adds to its record, which is zero; 0 where
@@ -98,6 +101,7 @@ class Data:
     started: Float[np.ndarray, " R"] | None = None
     labels: tuple[str, ...] = ()
     sampled: bool = False
+    rise: Float[np.ndarray, "N n R"] | None = None
     estimated: bool = False
     zones: tuple[DeadZone, ...] = ()
     spread: Float[np.ndarray, "M 6 R"] | None = None
@@ -253,7 +257,7 @@ def make_data(
     recording, zones, spread = with_lost_zero(recording)
     data, lengths = recording.dataset, recording.lengths
     thrust, volts = recording.thrust(vehicle)
-    extra = sensors_of_latent(recording, latent) | spread
+    extra = sensors_of_latent(recording, latent) | spread | _risen(recording, vehicle)
     kept, behind = _kept(lengths, without), max(1, round(remembered / recording.dt))
     segment = min(segment, _longest_piece(kept, lengths))
     pieces, scenario, run = list[dict[str, np.ndarray]](), list[int](), list[int]()
@@ -291,6 +295,11 @@ def make_data(
         estimated=states_estimated(data),
         zones=zones,
     )
+
+
+def _risen(recording: Recording, vehicle: Vehicle) -> dict[str, np.ndarray]:
+    rise = rises_of(recording.dataset, vehicle.thrusters())
+    return {} if rise is None else {"rise": rise}
 
 
 def _longest_piece(kept: np.ndarray, lengths: np.ndarray) -> int:

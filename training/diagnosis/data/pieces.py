@@ -5,6 +5,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+_OF_STEPS = ("rise",)
+"""What belongs to the step after a sample; else to the sample."""
+
 
 def cut(
     X: np.ndarray, V: np.ndarray, u: np.ndarray, volts: np.ndarray, times: np.ndarray,
@@ -21,7 +24,7 @@ def cut(
             "X": X[a : b + 1], "V": V[a : b + 1], "u": u[a:b], "past": u[before],
             "past_step": held[before], "voltage": volts[a:b], "step": held[a:b],
             "began": times[a : a + 1],
-            **{name: values[a : b + 1] for name, values in sensors.items()},
+            **{name: values[a : b + (name not in _OF_STEPS)] for name, values in sensors.items()},
         }  # fmt: skip
 
 

@@ -46,6 +46,7 @@ class Records(NamedTuple):
     step: Float[Array, "N *_"]
     past: Float[Array, "P n *R"]
     past_step: Float[Array, "P *_"]
+    rise: Float[Array, "N n *R"] | None = None
 
     @classmethod
     def of(cls, data: Data, pieces: Int[np.ndarray, " K"] | slice = slice(None)) -> "Records":
@@ -53,11 +54,13 @@ class Records(NamedTuple):
         now = (a[..., pieces] for a in (data.X, data.V, data.u, data.voltage))
         steps = data.own_steps(pieces), data.past_steps(pieces)
         arrays = (*now, steps[0], data.past[..., pieces], steps[1])
-        return cls(*(jnp.asarray(a) for a in arrays))
+        rise = None if data.rise is None else jnp.asarray(data.rise[..., pieces])
+        X, V, u, voltage, step, past, past_step = (jnp.asarray(a) for a in arrays)
+        return cls(X, V, u, voltage, step, past, past_step, rise)
 
     def in_lanes(self) -> "Records":
         """The same with an axis for lanes, which are simulated side by side, before the pieces."""
-        return Records(*(a[..., None, :] for a in self))
+        return jax.tree.map(lambda a: a[..., None, :], self)
 
 
 class Step(NamedTuple):
@@ -71,6 +74,7 @@ class Step(NamedTuple):
         before: those of the step before.
         voltage: relative to the nominal one.
         length: of the step (s).
+        rise: change of the command over the step (N), which is then the mean; None if it is held.
     """
 
     number: Int[Array, ""]
@@ -82,6 +86,7 @@ class Step(NamedTuple):
     before: Float[Array, "n *R"]
     voltage: Float[Array, "1 *R"]
     length: Float[Array, "1 *_"]
+    rise: Float[Array, "n *R"] | None = None
 
 
 class State(NamedTuple):
@@ -162,7 +167,7 @@ class AlongRecords(eqx.Module):
         """After a recorded step, under a wrench `push` in addition."""
         memory, X, V, rates = advance(
             self.model, self.inertia, state.memory, state.X, state.V, given.command, given.length,
-            self.substeps, given.voltage, push,
+            self.substeps, given.voltage, push, given.rise,
         )  # fmt: skip
         recent = state.recent.after(Recent.over(state.V, V, rates, given.length))
         end = state._replace(memory=memory, X=X, V=V, recent=recent)
@@ -194,10 +199,10 @@ def with_position(
 
 def scan(step: Callable[[State, Step], tuple[State, Out]], state: State, records: Records) -> Out:
     """Results of all recorded steps, stacked."""
-    X, V, u, voltage, length, past, _ = records
+    X, V, u, voltage, length, past, _, rise = records
     before = jnp.concatenate([past[-1:], u[:-1]])
     ends = X[:-1], V[:-1], X[1:], V[1:]
-    steps = Step(jnp.arange(len(u)), *ends, u, before, voltage[:, None], length[:, None])
+    steps = Step(jnp.arange(len(u)), *ends, u, before, voltage[:, None], length[:, None], rise)
     return jax.lax.scan(step, state, steps)[1]
 
 

@@ -62,7 +62,7 @@ def _whitened(
         single = _single((every, predictions, records, filters, instead, changes))
         every, predictions, records, filters, instead, changes = single
     first, predictions = predictions.first, predictions._replace(first=None)
-    (X, V, u, voltage, step, past, past_step), (keep, whiten, weight) = records, filters
+    (X, V, u, voltage, step, past, past_step, _), (keep, whiten, weight) = records, filters
     inertia = every.inertia()
 
     def body(carry: Any, given: Any) -> Any:

@@ -201,7 +201,8 @@ def simulate_maneuvers(
         u = single + np.asarray(allocated).swapaxes(0, 1)
         names = [name for name, _ in some] + [""] * (R - len(some))
         data = replace(
-            own, X=X, V=np.zeros_like(own.V), u=u, past=np.zeros_like(own.past), voltage=voltage,
+            own, X=X, V=np.zeros_like(own.V), u=u, rise=None, past=np.zeros_like(own.past),
+            voltage=voltage,
             weight=np.repeat([[float(name != "") for name in names]], len(u), axis=0),
         )  # fmt: skip
         yield names, _flown(model, data)

@@ -1,0 +1,104 @@
+"""Commands that change within a step: mean and rise stand for what is not resolved."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from spinndrift.models import se3
+from spinndrift.models.effects import KINDS, Extended
+from spinndrift.models.effects.deterministic_step import advance
+from spinndrift.models.recordings.build import Trajectory
+from spinndrift.models.recordings.commands import rises_of
+from spinndrift.models.recordings.store import Recording
+from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.diagnosis.data.arrays import make_data
+
+VEHICLE = load_vehicle("ardusub_sitl")
+STEP, PARTS = 0.1, 40
+
+
+def turning(linear):
+    """The vehicle with linear drag alone in yaw, whose rate settles within 1/linear s."""
+    damping = (0.0,) * 5 + (linear * VEHICLE.inertia[2],)
+    own = dataclasses.replace(VEHICLE, linear_damping=damping, quadratic_damping=(0.0,) * 6)
+    return Extended.create(own.dynamics(), (), own.thrusters())
+
+
+@jax.jit
+def yaw_rates(model, commands, h, rise=None):
+    """Yaw rates (P) after commands (S, n, P) in turn, each for h s, from rest."""
+    P = commands.shape[2]
+    X = jnp.tile(se3.identity(jnp.float64)[:, None], P)
+    inertia = model.inertia()
+
+    def after(state, u):
+        return advance(model, inertia, (), *state, u, h, 10, rise=rise)[1:3], None
+
+    return jax.lax.scan(after, (X, jnp.zeros((6, P))), commands)[0][1][5]
+
+
+def test_steps_at_any_time_are_right_in_the_mean_with_rises_alone():
+    """A rate that settles in a third of a step, under commands that step at all times within it."""
+    model = turning(30.0)
+    push = np.asarray(model.inverse[:, 5])
+    share = (np.arange(PARTS) + 0.5) / PARTS
+    at = np.arange(PARTS)[:, None]
+    stepped = np.where(at == np.arange(PARTS), 0.5, at > np.arange(PARTS))  # part by step's time
+    exact = yaw_rates(model, jnp.asarray(push[:, None] * stepped[:, None]), STEP / PARTS)
+    mean = push[None, :, None] * (1 - share)
+    held = yaw_rates(model, jnp.asarray(mean), STEP)
+    rise = jnp.asarray(push[:, None] * (6 * share * (1 - share)))
+    risen = yaw_rates(model, jnp.asarray(mean), STEP, rise)
+    settled = 1 / (30.0 * VEHICLE.inertia[2])
+    mean = np.mean([exact, held, risen], axis=1) / settled
+    # ∫ over the time of the step: 1 - (1 - e^-ah) / ah, and half of what a held command settles to
+    assert mean[0] == pytest.approx(1 - (1 - np.exp(-3)) / 3, abs=1e-3)
+    assert mean[1] == pytest.approx((1 - np.exp(-3)) / 2, abs=1e-3)
+    assert mean[2] == pytest.approx(mean[0], abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["thruster_lag", "actuation_delay"])
+def test_actuators_follow_a_rise_within_the_step(name):
+    model = turning(1.0).with_effects((KINDS[name].neutral(thrusters=8),))
+    u, rise = jnp.arange(8.0), jnp.linspace(-2.0, 2.0, 8)
+    memory = model.remember(u)
+    _, levels = model.actuate(memory, u, STEP, 20, rise)
+    _, plain = turning(1.0).actuate((), u, STEP, 20, rise)
+    np.testing.assert_allclose(plain.mean(axis=-1), u, atol=1e-12)
+    np.testing.assert_allclose(plain[:, -1] - plain[:, 0], 0.95 * rise, atol=1e-12)
+    np.testing.assert_allclose(levels, plain, atol=0.02)  # neutral: no lag, no delay
+
+
+def recording(rise=0.0, std=0.0, **commands):
+    N = 60
+    X = np.tile([1.0, 0, 0, 0, 0, 0, -2.0], (N, 1))
+    given = commands or {"pwm": np.full((N, 8), 1600.0)}
+    sensors = {"pwm_rise": np.full((N, 8), rise), "pwm_std": np.full((N, 8), std)}
+    run = Trajectory("still", X, np.zeros((N, 6)), given, sensors)
+    return Recording.from_trajectories([run], STEP, vehicle="ardusub_sitl")
+
+
+def test_rises_of_forces_are_those_of_the_curve():
+    made = recording(40.0)
+    rise = rises_of(made.dataset, VEHICLE.thrusters())
+    # 51.48 u|u| N with u = (pwm - 1500) / 400, here u²; forces of thrusters in own directions
+    right = 51.48 * (0.3**2 - 0.2**2)
+    np.testing.assert_allclose(np.abs(rise), right, rtol=1e-6)
+    data = make_data(made, VEHICLE)
+    assert data.rise is not None
+    assert data.rise.shape == data.u.shape
+    np.testing.assert_allclose(np.abs(data.rise), right, rtol=1e-6)
+    forces = recording(thruster_force=np.ones((60, 8)))
+    assert rises_of(forces.dataset, VEHICLE.thrusters()) is None
+    assert make_data(forces, VEHICLE).rise is None
+
+
+def test_rise_of_the_force_of_a_step_of_the_pulse_at_half_time_is_exact():
+    """From 1540 to 1700 us: by the best line 1.5 times the change of the force."""
+    made = recording(1.5 * 160.0, 80.0, pwm=np.full((60, 8), 1620.0))
+    right = 51.48 * (0.5**2 - 0.1**2) * 1.5
+    rise = rises_of(made.dataset, VEHICLE.thrusters())
+    np.testing.assert_allclose(np.abs(rise), right, rtol=1e-6)

@@ -7,7 +7,7 @@ from log_writers import dialect, dive
 from spinndrift.models.recordings.origin import states_estimated
 from spinndrift.systems.logs.load import import_log
 from spinndrift.systems.logs.signals import Series, Spans
-from spinndrift.systems.logs.sticks import by_sticks
+from spinndrift.systems.logs.sticks import by_controllers, by_sticks
 from spinndrift.systems.logs.table import Table
 
 MIXER = 400 * np.random.default_rng(3).uniform(-0.7, 0.7, (6, 6))  # µs: outputs by demands
@@ -100,6 +100,9 @@ def test_a_pilots_gain_that_changes_is_taken_in():
     slow = flight.logged(1.9)
     tables = {"MANUAL_CONTROL": flight.table(), "NAMED_VALUE_FLOAT": flight.reports()}
     found, _ = by_sticks(slow, tables, MANUAL)
+    assert found.measured == 0.0
+    slow.x[2] = np.random.default_rng(6).uniform(1300, 1700, slow.t.size)
+    assert by_sticks(slow, tables, MANUAL)[0].measured == slow.rate
     assert misses(flight, found, within=(1.0, 58.0)) < 1e-6
     assert misses(flight, found, within=(62.0, END - 1.0)) < 1e-6
 
@@ -148,6 +151,77 @@ def test_lost_outputs_and_silent_sticks_leave_what_was_there():
     assert not np.any((found.t > 40.2) & (found.t < 44.8))
     own = slow.t[(slow.t > 80.1) & (slow.t < 90.0)]
     assert set(found.t[(found.t > 80.1) & (found.t < 90.0)]) == set(own)
+
+
+def controlled(rate=24.7, forward=0.0, until=END):
+    """RATE at a rate (Hz), and outputs at some times, of controllers that work at 1 to 2 Hz.
+
+    A pilot's `forward` (µs) is beside them on the first two outputs.
+    """
+    frequencies = np.array([[1.3], [1.7], [1.1], [0.9]])
+    mixer = 400 * np.array([[0.0, 0, 1, 0], [0, 0, -1, 0], [1, -1, 0, -2], [-1, -1, 0, -2]])
+
+    def outputs(t):
+        demand = 0.2 * np.sin(2 * np.pi * frequencies * t + frequencies)
+        beside = forward * np.sin(2 * np.pi * 1.5 * t) * np.array([[1.0], [1], [0], [0]])
+        return 1500 + np.where(t < until, mixer @ demand, 0.0) + beside
+
+    t = np.arange(0.0, END, 1 / rate)
+    demand = 0.2 * np.sin(2 * np.pi * frequencies * t + frequencies)
+    return Table("RATE", {"t": t, **dict(zip(CONTROLLERS, demand, strict=True))}), outputs
+
+
+CONTROLLERS = ("ROut", "POut", "YOut", "AOut")
+BETWEEN = np.arange(2.0, END - 2.0, 0.0173)
+
+
+def off(series, outputs, t=BETWEEN):
+    """Root mean square error (µs) of each output."""
+    found = np.stack([np.interp(t, series.t, x) for x in series.x])
+    return np.sqrt(np.mean((found - outputs(t)) ** 2, axis=1))
+
+
+@pytest.mark.parametrize("forward", [0.0, 20.0])
+def test_outputs_of_an_autopilots_log_follow_its_controllers(forward):
+    rate, outputs = controlled(forward=forward)
+    t = np.arange(0.013, END, 0.1)
+    slow = Series(t, outputs(t), "RCOU")
+    found, told = by_controllers(slow, rate, MANUAL)
+    lines, beside = off(slow, outputs), forward * (np.pi * 1.5 * 0.1) ** 2 / np.sqrt(15)
+    assert (off(found, outputs)[2:] < 0.2 * lines[2:]).all()
+    assert found.measured == 0.0
+    # a forward command that no controller knows is left to lines, and no more than that
+    assert (off(found, outputs)[:2] < 0.2 * lines[:2] + 1.5 * beside).all()
+    assert "follow RATE at 25 Hz" in told[0]
+
+
+def test_controllers_that_do_not_act_or_are_slow_change_nothing():
+    rate, outputs = controlled(until=0.0, forward=100.0)
+    t = np.arange(0.013, END, 0.1)
+    slow = Series(t, outputs(t), "RCOU")
+    assert by_controllers(slow, rate, MANUAL) == (slow, [])
+    rate, outputs = controlled(rate=10.0)
+    slow = Series(t, outputs(t), "RCOU")
+    assert by_controllers(slow, rate, MANUAL) == (slow, [])
+    assert by_controllers(slow, None, MANUAL) == (slow, [])
+    assert by_controllers(slow, Table("RATE", {"t": rate["t"]}), MANUAL) == (slow, [])
+
+
+def test_demands_within_doubt_have_no_part_in_a_map():
+    """Noise on an output makes coefficients of all demands, of which one is beyond doubt."""
+    rng = np.random.default_rng(5)
+    rate, _ = controlled()
+    t = np.arange(0.013, END, 0.1)
+    yaw = 400 * np.interp(t, rate["t"], rate["YOut"])
+    slow = Series(t, 1500 + np.stack([yaw + 10 * rng.normal(size=t.size)]), "RCOU")
+    found, _ = by_controllers(slow, rate, MANUAL)
+    moved = np.stack([np.interp(found.t, rate["t"], rate[name]) for name in CONTROLLERS])
+    rest = found.x[0] - np.interp(found.t, t, slow.x[0])
+    lines = np.stack([np.interp(found.t, t, np.interp(t, rate["t"], m)) for m in
+                      (rate[name] for name in CONTROLLERS)])  # fmt: skip
+    C = np.linalg.lstsq((moved - lines).T, rest, rcond=None)[0]
+    assert C[2] == pytest.approx(400, rel=0.1)
+    np.testing.assert_allclose(C[[0, 1, 3]], 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("version", [1, 2])

@@ -143,7 +143,7 @@ def import_log(  # long: a third of it says what it takes and refuses
         check_plausible(recording.dataset)
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
-    period = 1.0 / signals.outputs.rate
+    period = 1.0 / (signals.outputs.measured or signals.outputs.rate)
     # the reader of a bag compares the axes of topics with the motion, and is believed if accepted
     told = any(f.word == "wrong-frame" for f in signals.findings)
     moved = [] if told else motion_findings(signals, trajectories, recording)

@@ -30,6 +30,8 @@ class Series:
     source: str
     left_out: int = 0
     """Number of samples that were not finite or beyond the `LIMITS` of the quantity."""
+    measured: float = 0.0
+    """Rate (Hz) of the samples that were logged, where others between them are not certain."""
 
     @property
     def rate(self) -> float:

@@ -25,6 +25,7 @@ from .signals import (
     undelayed,
     witnessed_spans,
 )
+from .sticks import by_controllers
 from .streams import UNAIDED, aid_spans, has_fix, missing_states
 from .table import Table, whole
 from .wiring import Wiring, direction_findings, thruster_outputs, wiring
@@ -109,7 +110,9 @@ def signals_from_bin(
     aids = [name for name in _AIDS if name in tables]
     no_aid, stops = aid_spans(tables, aids, last)
     aids += ["GPS"] if has_fix(tables.get("GPS"), "Status") else []
-    spans = {"wiring": wired.spans, **_states(tables, first, last), **_aiding(tables, core)}
+    states = _states(tables, first, last)
+    spans = {"wiring": wired.spans, **states, **_aiding(tables, core)}
+    outputs, between = by_controllers(outputs, tables.get("RATE"), (wired.spans, *states.values()))
     voltage = _voltage(tables)
     batteries = [name for name in ("BAT",) if name in tables]
     findings = [*firmware_findings("MSG", texts), *frame, *stops]
@@ -129,7 +132,7 @@ def signals_from_bin(
         cuts=(*((t, "step back of the clock") for t in log.boots), *wired.cuts),
         has=(f"Horizontal aid: {', '.join(aids)}.",) if aids else (),
         lacks=() if aids else ("No DVL, odometry or vision record and no GPS fix in the log.",),
-        notes=(*log.notes, *strange, *wired.notes, *notes, *rate_notes, *depth.told),
+        notes=(*log.notes, *strange, *wired.notes, *notes, *between, *rate_notes, *depth.told),
         findings=tuple(findings),
         estimated=True,
         low_pass=low_pass,

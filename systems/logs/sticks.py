@@ -1,14 +1,15 @@
-"""Outputs between the samples of a slow stream, as the pilot's sticks command them.
+"""Outputs between the samples of a slow stream, as they were demanded.
 
 A ground station gets the outputs at 2 to 10 Hz unless it asks for more, and logs its own sticks at
-20 Hz and more. In each mode the outputs are, beside what the autopilot adds, a linear map of the
-sticks, so with C fitted to all samples of a mode and s the sticks that hold at a time
+20 Hz and more; an autopilot's log has them at 10 Hz, and what its controllers demand often faster
+(RATE). In each mode the outputs are, beside what else acts on them, a linear map of such demands,
+so with C fitted to all samples of a mode and s the demands at a time
 
     u(t) = C s(t - lag) + line through (t_k, u_k - C s(t_k - lag)),
 
-for each thruster whose every second sample lies much nearer to this curve through the others than
-to their lines; elsewhere the outputs are those lines. One lag holds for the log: that at which the
-maps leave least.
+for each thruster whose every second sample lies nearer to this curve through the others than to
+their lines, beyond doubt; elsewhere the outputs are those lines. A map has the demands whose
+coefficients are beyond doubt. Sticks have one lag in a log: that at which the maps leave least.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,6 +26,7 @@ from .tlog import RENAMED
 
 NAMES = ("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE")
 """What a ground station sends."""
+_CONTROLLERS = ("ROut", "POut", "YOut", "AOut")
 _AXES = (*"xyzrs", RENAMED["t"])
 _GAIN = b"PilotGain"
 _LAGS_S = np.arange(-0.1, 0.3001, 0.01)
@@ -32,9 +34,10 @@ _RANGE_US = (1100.0, 1900.0)
 """Range of the outputs, or that of the samples where it is wider."""
 _STEP_S = 0.01
 """Step of the outputs along sticks, which change within it."""
-_NEARER = 0.5
-"""Share of the squares of lines between every second sample that the curve may have: lines between
-all samples of an output that steps have half of them."""
+_DOUBT = 3.0
+"""Standard errors from which on a coefficient or a difference is beyond doubt."""
+_FASTER = 1.5
+"""Times the rate of the outputs that a controller's demands have, to tell of what is between."""
 _LOST_PERIODS = 3.0
 """Periods of the outputs beyond which a step between samples is a gap."""
 _AS_GOOD, _ROUNDING = 1.01, 1e-9
@@ -42,15 +45,21 @@ _SAMPLES = 3
 """Samples of a mode at least for each coefficient of its map."""
 
 
-class _Sticks(NamedTuple):
-    """Sticks s (m, n) in [-1, 1] that hold from times t (n,) on, of the message `name`."""
+class _Demands(NamedTuple):
+    """Demands s (m, n) in [-1, 1] at times t (n,), of the message `name`.
+
+    Those of a pilot are held until the next; those of a controller are samples of faster ones.
+    """
 
     t: Float[np.ndarray, " n"]
     s: Float[np.ndarray, "m n"]
     name: str
+    held: bool = True
 
     def at(self, t: Float[np.ndarray, " k"]) -> Float[np.ndarray, "m k"]:
-        """The sticks that hold at some times."""
+        """The demands at some times."""
+        if not self.held:
+            return np.stack([np.interp(t, self.t, x) for x in self.s])
         return self.s[:, np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, None)]
 
 
@@ -68,49 +77,74 @@ class _Mode(NamedTuple):
 def by_sticks(
     outputs: Series, tables: Mapping[str, Table], states: Sequence[Spans]
 ) -> tuple[Series, list[str]]:
-    """The outputs (µs) along the sticks where these tell what they were, and a sentence.
+    """The outputs (µs) of a telemetry log along the pilot's sticks, and a sentence.
 
     They stay as they are if no sticks tell better than lines between samples do. A mode is a
     combination of labels of the `states`, such as the autopilot's mode and the wiring.
     """
+    return _along(outputs, [_sticks(tables, name) for name in NAMES], states)
+
+
+def by_controllers(
+    outputs: Series, rate: Table | None, states: Sequence[Spans]
+) -> tuple[Series, list[str]]:
+    """The outputs (µs) of an autopilot's log along what its controllers demand, and a sentence.
+
+    These are ROut, POut, YOut and AOut (climb) of RATE. Forward and lateral are not among them.
+    """
+    if rate is None or not set(_CONTROLLERS) <= set(rate):
+        return outputs, []
+    t, first = np.unique(rate["t"], return_index=True)
+    if t.size < 4 or _rate(t) < _FASTER * outputs.rate:
+        return outputs, []
+    s = np.stack([rate[name][first].astype(float) for name in _CONTROLLERS])
+    return _along(outputs, [_Demands(t, np.clip(s, -1, 1), "RATE", held=False)], states)
+
+
+def _along(
+    outputs: Series, demands: Sequence[_Demands | None], states: Sequence[Spans]
+) -> tuple[Series, list[str]]:
+    """The outputs along those demands that tell best, and a sentence."""
     modes, tried = _modes(states), []
-    for sticks in (_sticks(tables, name) for name in NAMES):
-        curves = None if sticks is None else _curves(outputs, sticks, modes)
+    for one in demands:
+        curves = None if one is None else _curves(outputs, one, modes)
         if curves is not None:
-            tried.append((sticks, *curves))
+            tried.append((one, *curves))
     if not tried:
         return outputs, []
-    sticks, series, misses = min(tried, key=lambda found: found[2][0])
+    one, series, misses = min(tried, key=lambda found: found[2][0])
     return series, [
-        f"Outputs between samples ({outputs.rate:.1f} Hz) follow {sticks.name} at "
-        f"{_rate(sticks.t):.0f} Hz: left-out samples err by {misses[0]:.0f} µs (rms), where lines "
+        f"Outputs between samples ({outputs.rate:.1f} Hz) follow {one.name} at "
+        f"{_rate(one.t):.0f} Hz: left-out samples err by {misses[0]:.0f} µs (rms), where lines "
         f"between the others err by {misses[1]:.0f} µs."
     ]
 
 
 def _curves(
-    outputs: Series, sticks: _Sticks, modes: Sequence[Spans]
+    outputs: Series, sticks: _Demands, modes: Sequence[Spans]
 ) -> tuple[Series, tuple[float, float]] | None:
     """The outputs along sticks, and what every second sample misses them and lines by (µs, rms).
 
-    None where no thruster follows these sticks.
+    None where no thruster follows these demands.
     """
     groups = _groups(outputs, sticks, modes)
     if not groups:
         return None
-    lag = _lag(outputs, sticks, groups)
+    lag = _lag(outputs, sticks, groups) if sticks.held else 0.0
     late = sticks._replace(t=sticks.t + lag)
     t = _times(outputs, late)
     x = np.stack([np.interp(t, outputs.t, u) for u in outputs.x])
-    curve, line, count = 0.0, 0.0, 0
+    curve, line, count, all_follow = 0.0, 0.0, 0, True
     for mode in groups:
         own = outputs.t[mode.rows]
         s, u = late.at(own), outputs.x[:, mode.rows]
         C, missed = _map(s, u), _missed(own, s, u)
-        better = missed[0] < _NEARER * missed[1]
-        curve += float(np.where(better, *missed).sum())
+        gain = missed[1] - missed[0]
+        better = gain.sum(axis=1) > _DOUBT * np.sqrt((gain**2).sum(axis=1))
+        curve += float(np.where(better[:, None], *missed).sum())
         line += float(missed[1].sum())
         count += u.size
+        all_follow &= bool((better | (missed[1] == 0).all(axis=1)).all())
         here = mode.within(t)
         for i in np.flatnonzero(better):
             rest = np.interp(t[here], own, u[i] - C[i] @ s)
@@ -119,14 +153,15 @@ def _curves(
     if curve == line:
         return None
     misses = (float(np.sqrt(curve / count)), float(np.sqrt(line / count)))
-    return Series(t, x, f"{outputs.source} along {sticks.name}", outputs.left_out), misses
+    source, measured = f"{outputs.source} along {sticks.name}", 0.0 if all_follow else outputs.rate
+    return Series(t, x, source, outputs.left_out, measured), misses
 
 
 def _missed(
     t: Float[np.ndarray, " k"], s: Float[np.ndarray, "m k"], u: Float[np.ndarray, "n k"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
     """Squares by which every second sample misses the curve, and the line, of the others."""
-    curve, line = np.zeros((2, len(u)))
+    curve, line = np.zeros((2, *u.shape))
     for first in (0, 1):
         out = np.arange(first, t.size, 2)
         out = out[(out > 0) & (out < t.size - 1)]
@@ -134,26 +169,35 @@ def _missed(
         C = _map(s[:, rest], u[:, rest])
         left = u - C @ s
         for i in range(len(u)):
-            line[i] += np.sum((u[i, out] - np.interp(t[out], t[rest], u[i, rest])) ** 2)
-            curve[i] += np.sum((left[i, out] - np.interp(t[out], t[rest], left[i, rest])) ** 2)
+            line[i, out] = (u[i, out] - np.interp(t[out], t[rest], u[i, rest])) ** 2
+            curve[i, out] = (left[i, out] - np.interp(t[out], t[rest], left[i, rest])) ** 2
     return curve, line
 
 
 def _map(s: Float[np.ndarray, "m k"], u: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n m"]:
-    """The map from sticks to outputs by least squares; nothing of sticks that stand still.
+    """The map from demands to outputs by least squares; nothing of those that stand still.
 
-    It is that of their changes between samples: what an autopilot adds changes little in one.
+    It is that of their changes between samples: what else acts on outputs changes little in one.
+    Demands whose coefficients are within doubt of zero are left out.
     """
-    return np.linalg.lstsq(np.diff(s).T, np.diff(u).T, rcond=1e-6)[0].T
+    ds, du = np.diff(s).T, np.diff(u).T
+    C = np.linalg.lstsq(ds, du, rcond=1e-6)[0].T
+    spread = np.sqrt(np.diag(np.linalg.pinv(ds.T @ ds, rcond=1e-12, hermitian=True)))
+    noise = np.sqrt(np.mean((du - ds @ C.T) ** 2, axis=0))
+    kept = np.abs(C) > _DOUBT * noise[:, None] * spread
+    for i in np.flatnonzero(~kept.all(axis=1)):
+        C[i] = 0.0
+        C[i, kept[i]] = np.linalg.lstsq(ds[:, kept[i]], du[:, i], rcond=1e-6)[0]
+    return C
 
 
-def _lag(outputs: Series, sticks: _Sticks, groups: Sequence[_Mode]) -> float:
+def _lag(outputs: Series, sticks: _Demands, groups: Sequence[_Mode]) -> float:
     """The middle of the lags (s) at which the maps leave least, or hardly more."""
     left = np.array([_left(outputs, sticks, groups, lag) for lag in _LAGS_S])
     return float(np.mean(_LAGS_S[left <= _AS_GOOD * left.min() + _ROUNDING * left.max()]))
 
 
-def _left(outputs: Series, sticks: _Sticks, groups: Sequence[_Mode], lag: float) -> float:
+def _left(outputs: Series, sticks: _Demands, groups: Sequence[_Mode], lag: float) -> float:
     """Sum of squares that the maps leave of the samples' changes, at a lag (s)."""
     left = 0.0
     for mode in groups:
@@ -162,7 +206,7 @@ def _left(outputs: Series, sticks: _Sticks, groups: Sequence[_Mode], lag: float)
     return left
 
 
-def _groups(outputs: Series, sticks: _Sticks, modes: Sequence[Spans]) -> list[_Mode]:
+def _groups(outputs: Series, sticks: _Demands, modes: Sequence[Spans]) -> list[_Mode]:
     """The modes with enough samples for a map."""
     covered = (outputs.t > sticks.t[0]) & (outputs.t < sticks.t[-1])
     groups = []
@@ -184,7 +228,7 @@ def _modes(states: Sequence[Spans]) -> list[Spans]:
     ]
 
 
-def _times(outputs: Series, sticks: _Sticks) -> Float[np.ndarray, " k"]:
+def _times(outputs: Series, sticks: _Demands) -> Float[np.ndarray, " k"]:
     """A fine grid where neither sticks are silent nor samples are lost, and samples elsewhere."""
     t = np.arange(outputs.t[0], outputs.t[-1], _STEP_S)
     step = np.diff(outputs.t)
@@ -209,7 +253,7 @@ def _rate(t: np.ndarray) -> float:
     return 1.0 / float(np.median(np.diff(t)))
 
 
-def _sticks(tables: Mapping[str, Table], name: str) -> _Sticks | None:
+def _sticks(tables: Mapping[str, Table], name: str) -> _Demands | None:
     """The sticks of one message; MANUAL_CONTROL acts by the pilot's gain, where that was logged."""
     table = tables.get(name)
     if table is None:
@@ -224,7 +268,7 @@ def _sticks(tables: Mapping[str, Table], name: str) -> _Sticks | None:
         pulses = np.stack([table[f"chan{n}_raw"] for n in range(1, 9)]).astype(float)
         left_alone = (pulses == 0) | (pulses == codec.UINT16_MAX)
         s = np.asarray(codec.stick(np.where(left_alone, codec.NEUTRAL_US, pulses)))
-    return _Sticks(t, np.clip(s[:, first], -1, 1), name)
+    return _Demands(t, np.clip(s[:, first], -1, 1), name)
 
 
 def _gain(table: Table | None, t: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

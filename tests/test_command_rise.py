@@ -11,7 +11,7 @@ from spinndrift.models import se3
 from spinndrift.models.effects import KINDS, Extended
 from spinndrift.models.effects.deterministic_step import advance
 from spinndrift.models.recordings.build import Trajectory
-from spinndrift.models.recordings.commands import rises_of
+from spinndrift.models.recordings.commands import forces_of, rises_of
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.training.diagnosis.data.arrays import make_data
@@ -72,33 +72,78 @@ def test_actuators_follow_a_rise_within_the_step(name):
     np.testing.assert_allclose(levels, plain, atol=0.02)  # neutral: no lag, no delay
 
 
-def recording(rise=0.0, std=0.0, **commands):
+MIDDLE = 20
+
+
+def recording(rise=4.0, std=0.0, **commands):
+    """Commands whose PWM is 1600 us at step `MIDDLE`, and rises by 4 us a step."""
     N = 60
     X = np.tile([1.0, 0, 0, 0, 0, 0, -2.0], (N, 1))
-    given = commands or {"pwm": np.full((N, 8), 1600.0)}
-    sensors = {"pwm_rise": np.full((N, 8), rise), "pwm_std": np.full((N, 8), std)}
-    run = Trajectory("still", X, np.zeros((N, 6)), given, sensors)
+    ramp = np.repeat(1600.0 + 4.0 * (np.arange(N) - MIDDLE)[:, None], 8, axis=1)
+    sensors = {"pwm_rise": np.zeros((N, 8)) + rise, "pwm_std": np.zeros((N, 8)) + std}
+    run = Trajectory("still", X, np.zeros((N, 6)), commands or {"pwm": ramp}, sensors)
     return Recording.from_trajectories([run], STEP, vehicle="ardusub_sitl")
 
 
+def rise_at_middle(dataset):
+    rise = rises_of(dataset, VEHICLE.thrusters())
+    assert rise is not None
+    return np.abs(rise[0, 0, MIDDLE])
+
+
+def quadratic(after, before):
+    """Rise of 51.48 u|u| N with u = (pwm - 1500) / 400, of pulses (us) above neutral."""
+    return 51.48 * (after**2 - before**2) / 400**2
+
+
 def test_rises_of_forces_are_those_of_the_curve():
-    made = recording(40.0)
-    rise = rises_of(made.dataset, VEHICLE.thrusters())
-    # 51.48 u|u| N with u = (pwm - 1500) / 400, here u²; forces of thrusters in own directions
-    right = 51.48 * (0.3**2 - 0.2**2)
-    np.testing.assert_allclose(np.abs(rise), right, rtol=1e-6)
+    made = recording()
+    np.testing.assert_allclose(rise_at_middle(made.dataset), quadratic(102, 98), rtol=1e-6)
     data = make_data(made, VEHICLE)
     assert data.rise is not None
     assert data.rise.shape == data.u.shape
-    np.testing.assert_allclose(np.abs(data.rise), right, rtol=1e-6)
+    rise = rises_of(made.dataset, VEHICLE.thrusters())
+    found = [np.unique(np.round(np.abs(x), 6)) for x in (data.rise, rise)]
+    assert set(found[0]) <= set(found[1])
+    assert len(found[0]) > 40  # the first and the last steps are left out, or padding
     forces = recording(thruster_force=np.ones((60, 8)))
     assert rises_of(forces.dataset, VEHICLE.thrusters()) is None
     assert make_data(forces, VEHICLE).rise is None
 
 
+def test_a_diagnosis_takes_commands_behind_the_filter_of_the_rates():
+    rng = np.random.default_rng(0)
+    own = recording(pwm=1500 + 100 * rng.choice([-1.0, 1.0], (60, 8))).dataset
+    before = np.roll(own["pwm"].to_numpy(), 1, axis=2)
+    own = own.assign(pwm_rise=(own["pwm"].dims, 0.3 * (own["pwm"].to_numpy() - before), {}))
+    made = make_data(Recording(own.assign_attrs(rates_low_pass=2.0)), VEHICLE)
+    plain = make_data(Recording(own), VEHICLE)
+    assert made.rise is not None
+    kept = (made.weight > 0)[:, None] & np.ones_like(made.u, bool)
+    assert np.std(made.u[kept]) < 0.8 * np.std(plain.u[kept])  # 10 Hz of steps behind 2 Hz
+    assert Recording.concat([Recording(own.assign_attrs(rates_low_pass=2.0))] * 2).dataset.attrs[
+        "rates_low_pass"
+    ] == pytest.approx(2.0)
+
+
+def test_a_pwm_that_was_changed_without_its_rises_is_taken_alone():
+    t = STEP * np.arange(60)[:, None]
+    wave = 200 * np.sin(2 * t + np.arange(8.0))
+    rise = 400 * STEP * np.cos(2 * (t + STEP / 2) + np.arange(8.0))
+    own = recording(rise, pwm=1500 + wave).dataset
+    assert rises_of(own, VEHICLE.thrusters()) is not None
+    signs = np.where(np.arange(8) == 2, -1, 1)
+    for pwm in (1500 + signs * wave, 1500 + wave[:, ::-1]):
+        changed = own.assign(pwm=(own["pwm"].dims, pwm[None, None], {}))
+        plain = changed.drop_vars(["pwm_rise", "pwm_std"])
+        assert rises_of(changed, VEHICLE.thrusters()) is None
+        both = [forces_of(d, "pwm", VEHICLE.thrusters()) for d in (changed, plain)]
+        np.testing.assert_array_equal(*both)
+
+
 def test_rise_of_the_force_of_a_step_of_the_pulse_at_half_time_is_exact():
     """From 1540 to 1700 us: by the best line 1.5 times the change of the force."""
-    made = recording(1.5 * 160.0, 80.0, pwm=np.full((60, 8), 1620.0))
-    right = 51.48 * (0.5**2 - 0.1**2) * 1.5
-    rise = rises_of(made.dataset, VEHICLE.thrusters())
-    np.testing.assert_allclose(np.abs(rise), right, rtol=1e-6)
+    step = np.arange(60)[:, None] - np.full(8, MIDDLE)
+    pwm = 1620.0 + 80.0 * np.sign(step)
+    made = recording(np.where(step == 0, 240.0, 0.0), np.where(step == 0, 80.0, 0.0), pwm=pwm)
+    np.testing.assert_allclose(rise_at_middle(made.dataset), 1.5 * quadratic(200, 40), rtol=1e-6)

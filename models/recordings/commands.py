@@ -12,6 +12,8 @@ from ..config.errors import UserError
 from ..vehicles.vehicle import load_vehicle
 from .schema import PWM_RISE, PWM_STD
 
+_OF_THIS_PWM = 0.2
+"""Slope of changes of the PWM over its rises below which it was changed without these."""
 _LEAST_US = 1.0
 """Least width (us) over which the slope of a thrust curve is taken."""
 
@@ -37,12 +39,11 @@ def forces_of(dataset: xr.Dataset, name: str, thrusters: Any) -> Float[Array, "n
     """
     values, mask = dataset[name].to_numpy(), dataset["mask"].to_numpy()
     check_count(dataset, name, thrusters.allocation.shape[1])
-    rest = 1500.0 if name == "pwm" else 0.0
-    command = jnp.asarray(np.moveaxis(np.where(mask[..., None], values, rest), -1, 0))
     if name == "thruster_force":
-        return command
+        return jnp.asarray(np.moveaxis(np.where(mask[..., None], values, 0.0), -1, 0))
+    command = _pulses(dataset)
     volts = jnp.asarray(voltage_of(dataset, thrusters))
-    if PWM_STD not in dataset:
+    if PWM_STD not in dataset or not _describe(dataset):
         return thrusters.force(command, volts)
     std = _of_pwm(dataset, PWM_STD)
     return (thrusters.force(command + std, volts) + thrusters.force(command - std, volts)) / 2
@@ -56,16 +57,38 @@ def rises_of(dataset: xr.Dataset, thrusters: Any) -> Float[np.ndarray, "J K N n"
     """
     if not {"pwm", PWM_RISE} <= set(dataset) or "thruster_force" in dataset:
         return None
+    if not _describe(dataset):
+        return None
     change = _of_pwm(dataset, PWM_RISE)
     width = jnp.abs(change) / np.sqrt(12.0)  # deviation of a line
     if PWM_STD in dataset:
         width = jnp.maximum(width, _of_pwm(dataset, PWM_STD))
     width = jnp.maximum(width, _LEAST_US)
-    pwm, mask = dataset["pwm"].to_numpy(), dataset["mask"].to_numpy()
-    pwm = jnp.asarray(np.moveaxis(np.where(mask[..., None], pwm, 1500.0), -1, 0))
+    pwm = _pulses(dataset)
     volts = jnp.asarray(voltage_of(dataset, thrusters))
     above, below = (thrusters.force(pwm + sign * width, volts) for sign in (1, -1))
     return np.moveaxis(np.asarray(change * (above - below) / (2 * width)), 0, -1)
+
+
+def _pulses(dataset: xr.Dataset) -> Float[Array, "n J K N"]:
+    """Mean PWM of each step; neutral beyond a trajectory's end."""
+    pwm, mask = dataset["pwm"].to_numpy(), dataset["mask"].to_numpy()[..., None]
+    return jnp.asarray(np.moveaxis(np.where(mask, pwm, 1500.0), -1, 0))
+
+
+def _describe(dataset: xr.Dataset) -> bool:
+    """Whether what a recording has beside the PWM is of this PWM, which may have been changed.
+
+    Half the change from the step before to the step after one is `pwm_rise` for a line, and a third
+    of it for steps of the PWM in the middle of a step.
+    """
+    if PWM_RISE not in dataset:
+        return True
+    pwm, rise = (dataset[name].to_numpy() for name in ("pwm", PWM_RISE))
+    around, rise = (pwm[:, :, 2:] - pwm[:, :, :-2]) / 2, rise[:, :, 1:-1]
+    both = np.isfinite(around) & np.isfinite(rise)
+    product, square = (np.where(both, x * rise, 0.0).sum((0, 1, 2)) for x in (around, rise))
+    return bool(np.all(product >= _OF_THIS_PWM * square))
 
 
 def _of_pwm(dataset: xr.Dataset, name: str) -> Float[Array, "n J K N"]:

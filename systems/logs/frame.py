@@ -9,6 +9,7 @@ from jaxtyping import Float
 from ...models.recordings.checks.commands import command_findings
 from ...models.recordings.checks.finding import Finding
 from ...models.recordings.outputs import in_words, outputs_of
+from ...models.recordings.schema import PWM_RISE
 from ...models.recordings.store import Recording
 from ...models.vehicles.vehicle import load_vehicle
 from ..mavlink.codec import FRAME_THRUSTERS, NEUTRAL_US
@@ -208,11 +209,15 @@ def _unmirrored(
     since: Sequence[tuple[float, tuple[int, ...]]],
 ) -> Recording:
     """The recording with the PWM of some thrusters (from 1) mirrored back where it was mirrored."""
-    pwm = recording.dataset["pwm"]
-    values = pwm.to_numpy().copy()
-    starts = recording.dataset["start_time"].to_numpy()
+    dataset = recording.dataset
+    centres = {"pwm": 2 * NEUTRAL_US, PWM_RISE: 0.0}
+    values = {name: dataset[name].to_numpy().copy() for name in centres if name in dataset}
+    starts = dataset["start_time"].to_numpy()
     for j, k in np.argwhere(recording.lengths > 0).tolist():
         own = [mirrored for t, mirrored in since if t <= starts[j, k] + recording.dt]
         columns = [n - 1 for n in thrusters if not own or n in own[-1]]
-        values[j, k][:, columns] = 2 * NEUTRAL_US - values[j, k][:, columns]
-    return Recording(recording.dataset.assign(pwm=(pwm.dims, values, pwm.attrs)))
+        for name, x in values.items():
+            x[j, k][:, columns] = centres[name] - x[j, k][:, columns]
+    return Recording(
+        dataset.assign({n: (dataset[n].dims, x, dataset[n].attrs) for n, x in values.items()})
+    )

@@ -10,12 +10,13 @@ import numpy as np
 from ...models.config.errors import UserError
 from ...models.recordings.checks.finding import enforce, with_findings
 from ...models.recordings.csv import METADATA, read_csv
-from ...models.recordings.origin import ESTIMATED, PERIOD
+from ...models.recordings.origin import ESTIMATED, LOW_PASS, PERIOD
 from ...models.recordings.outputs import with_outputs
 from ...models.recordings.schema import check_plausible
 from ...models.recordings.store import Recording
 from ...models.vehicles.places import absolute
 from ...models.vehicles.vehicle import load_vehicle
+from ..mavlink.codec import filter_delay
 from .align import aligned, reference
 from .bags.bag import bag_kind
 from .bags.signals import read_bag
@@ -153,6 +154,7 @@ def import_log(  # long: a third of it says what it takes and refuses
     recording, settled_ = settled(recording, signals.turned, signals.turned_since)
     dataset = with_findings(recording.dataset, [*signals.findings, *moved, *settled_])
     attrs = {PERIOD: period} | ({ESTIMATED: 1} if signals.estimated else {})
+    attrs |= {LOW_PASS: signals.low_pass} if filter_delay(signals.low_pass) else {}
     return Recording(dataset.assign_attrs(attrs)), report
 
 

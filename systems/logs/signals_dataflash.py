@@ -97,16 +97,7 @@ def signals_from_bin(
     outputs, notes, frame = _outputs(tables["RCOU"], channels, wired, vehicle is not None)
     position, velocity = _motion(tables, core, known, density)
     depth = _pressure_depth(tables, parameters, density, position)
-    rates, rate_notes = _rates(tables, core)
-    force = _imu(tables, core, "ACC", ("AccX", "AccY", "AccZ"), "specific force")
-    low_pass = 0.0
-    if not rates.source.startswith("GYR"):  # GYR and ACC are the sensors before the filters
-        low_pass = known.get("INS_GYRO_FILTER", 0.0)
-        rates, delay = undelayed(rates, known, "INS_GYRO_FILTER")
-        rate_notes = (*rate_notes, *delay)
-    if force is not None and force.source != "ACC":
-        force, delay = undelayed(force, known, "INS_ACCEL_FILTER")
-        rate_notes = (*rate_notes, *delay)
+    rates, force, low_pass, rate_notes = _inertial(tables, core, known)
     aids = [name for name in _AIDS if name in tables]
     no_aid, stops = aid_spans(tables, aids, last)
     aids += ["GPS"] if has_fix(tables.get("GPS"), "Status") else []
@@ -239,6 +230,23 @@ def _imu(
             table = _of(tables[name], "I", core)
             return series(table["t"], codec.body_vector(*(table[a] for a in axes)), name, quantity)
     return None
+
+
+def _inertial(
+    tables: Mapping[str, Table], core: int, known: Mapping[str, float]
+) -> tuple[Series, Series | None, float, tuple[str, ...]]:
+    """Body rates and specific force without the delays of their filters, that of the rates (Hz)."""
+    rates, notes = _rates(tables, core)
+    force = _imu(tables, core, "ACC", ("AccX", "AccY", "AccZ"), "specific force")
+    low_pass = 0.0
+    if not rates.source.startswith("GYR"):  # GYR and ACC are the sensors before the filters
+        low_pass = known.get("INS_GYRO_FILTER", 0.0)
+        rates, delay = undelayed(rates, known, "INS_GYRO_FILTER")
+        notes = (*notes, *delay)
+    if force is not None and force.source != "ACC":
+        force, delay = undelayed(force, known, "INS_ACCEL_FILTER")
+        notes = (*notes, *delay)
+    return rates, force, low_pass, notes
 
 
 def _rates(tables: Mapping[str, Table], core: int) -> tuple[Series, tuple[str, ...]]:

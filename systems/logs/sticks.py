@@ -161,7 +161,7 @@ def _missed(
     t: Float[np.ndarray, " k"], s: Float[np.ndarray, "m k"], u: Float[np.ndarray, "n k"]
 ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
     """Squares by which every second sample misses the curve, and the line, of the others."""
-    curve, line = np.zeros((2, *u.shape))
+    curve, line = np.zeros_like(u), np.zeros_like(u)
     for first in (0, 1):
         out = np.arange(first, t.size, 2)
         out = out[(out > 0) & (out < t.size - 1)]

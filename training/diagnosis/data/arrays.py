@@ -12,10 +12,11 @@ from ....models.effects.traits import Need, Region
 from ....models.recordings.checks.small_speeds import DeadZone
 from ....models.recordings.commands import rises_of
 from ....models.recordings.kinematics import dead_reckoned
-from ....models.recordings.origin import states_estimated
+from ....models.recordings.origin import LOW_PASS, states_estimated
 from ....models.recordings.store import Recording
 from ....models.se3 import AXES, TWIST, XYZ
 from ....models.vehicles.vehicle import Vehicle
+from .behind_filter import behind_filter
 from .lost import known_errors, with_lost_zero
 from .pieces import cut, stack, weight_of
 from .readings import sensors_of_latent
@@ -256,8 +257,8 @@ def make_data(
     latent = [i for i, name in enumerate(TWIST) if name in unmeasured]
     recording, zones, spread = with_lost_zero(recording)
     data, lengths = recording.dataset, recording.lengths
-    thrust, volts = recording.thrust(vehicle)
-    extra = sensors_of_latent(recording, latent) | spread | _risen(recording, vehicle)
+    thrust, volts, risen = _commands(recording, vehicle)
+    extra = sensors_of_latent(recording, latent) | spread | risen
     kept, behind = _kept(lengths, without), max(1, round(remembered / recording.dt))
     segment = min(segment, _longest_piece(kept, lengths))
     pieces, scenario, run = list[dict[str, np.ndarray]](), list[int](), list[int]()
@@ -297,9 +298,23 @@ def make_data(
     )
 
 
-def _risen(recording: Recording, vehicle: Vehicle) -> dict[str, np.ndarray]:
+def _commands(
+    recording: Recording, vehicle: Vehicle
+) -> tuple[Float[np.ndarray, "S K N n"], Float[np.ndarray, "S K N"], dict[str, np.ndarray]]:
+    """Thruster forces, relative voltage, and rises of forces over each step where they are known.
+
+    Forces are then those behind the filter of the body rates.
+    """
+    thrust, volts = recording.thrust(vehicle)
     rise = rises_of(recording.dataset, vehicle.thrusters())
-    return {} if rise is None else {"rise": rise}
+    cutoff = float(recording.dataset.attrs.get(LOW_PASS, 0.0))
+    if rise is None:
+        return thrust, volts, {}
+    thrust, rise = thrust.copy(), rise.copy()
+    for j, k in np.argwhere(recording.lengths > 0).tolist() if cutoff else ():
+        own = j, k, slice(int(recording.lengths[j, k]))
+        thrust[own], rise[own] = behind_filter(thrust[own], rise[own], recording.dt, cutoff)
+    return thrust, volts, {"rise": rise}
 
 
 def _longest_piece(kept: np.ndarray, lengths: np.ndarray) -> int:

@@ -12,11 +12,11 @@ from ....models.effects.traits import Need, Region
 from ....models.recordings.checks.small_speeds import DeadZone
 from ....models.recordings.commands import rises_of
 from ....models.recordings.kinematics import dead_reckoned
-from ....models.recordings.origin import LOW_PASS, states_estimated
+from ....models.recordings.origin import states_estimated
 from ....models.recordings.store import Recording
 from ....models.se3 import AXES, TWIST, XYZ
 from ....models.vehicles.vehicle import Vehicle
-from .behind_filter import behind_filter
+from .behind_filter import with_filtered_pulses
 from .lost import known_errors, with_lost_zero
 from .pieces import cut, stack, weight_of
 from .readings import sensors_of_latent
@@ -303,18 +303,14 @@ def _commands(
 ) -> tuple[Float[np.ndarray, "S K N n"], Float[np.ndarray, "S K N"], dict[str, np.ndarray]]:
     """Thruster forces, relative voltage, and rises of forces over each step where they are known.
 
-    Forces are then those behind the filter of the body rates.
+    Forces are then those of pulses behind the filter of the body rates.
     """
-    thrust, volts = recording.thrust(vehicle)
     rise = rises_of(recording.dataset, vehicle.thrusters())
-    cutoff = float(recording.dataset.attrs.get(LOW_PASS, 0.0))
     if rise is None:
-        return thrust, volts, {}
-    thrust, rise = thrust.copy(), rise.copy()
-    for j, k in np.argwhere(recording.lengths > 0).tolist() if cutoff else ():
-        own = j, k, slice(int(recording.lengths[j, k]))
-        thrust[own], rise[own] = behind_filter(thrust[own], rise[own], recording.dt, cutoff)
-    return thrust, volts, {"rise": rise}
+        return *recording.thrust(vehicle), {}
+    recording = with_filtered_pulses(recording)
+    rise = rises_of(recording.dataset, vehicle.thrusters())
+    return *recording.thrust(vehicle), {} if rise is None else {"rise": rise}
 
 
 def _longest_piece(kept: np.ndarray, lengths: np.ndarray) -> int:

@@ -1,16 +1,40 @@
 """Commands behind the low-pass that the recorded body rates went through.
 
 An autopilot logs its rates behind a filter (INS_GYRO_FILTER). Behind one filter, what commands do
-is what filtered commands do (Ljung 1999, section 14.4), so the forces are filtered likewise. An
-import has already moved the rates back by the filter's delay, so that of the forces is left out.
+is what filtered commands do (Ljung 1999, section 14.4), so the pulses are filtered likewise: forces
+are those of a believed curve, whose dead band would hide small ones behind their neighbours. An
+import has already moved the rates back by the filter's delay, so that of the pulses is left out.
 """
 
 import numpy as np
 import scipy.signal
 from jaxtyping import Float
 
+from ....models.recordings.origin import LOW_PASS
+from ....models.recordings.schema import PWM_RISE
+from ....models.recordings.store import Recording
+
 _PARTS = 20.0
 """Samples in a period of the filter's cutoff, within which steps are resolved."""
+
+
+def with_filtered_pulses(recording: Recording) -> Recording:
+    """A recording of pulses with their rises, behind the filter of its rates where it tells one.
+
+    The filter overshoots; the range of each output in a run is kept.
+    """
+    dataset = recording.dataset
+    cutoff = float(dataset.attrs.get(LOW_PASS, 0.0))
+    if not cutoff:
+        return recording
+    pwm, rise = (dataset[name].to_numpy().copy() for name in ("pwm", PWM_RISE))
+    for j, k in np.argwhere(recording.lengths > 0).tolist():
+        own = j, k, slice(int(recording.lengths[j, k]))
+        low, high = pwm[own].min(axis=0), pwm[own].max(axis=0)
+        mean, rise[own] = behind_filter(pwm[own], np.nan_to_num(rise[own]), recording.dt, cutoff)
+        pwm[own] = np.clip(mean, low, high)
+    new = {"pwm": pwm, PWM_RISE: rise}
+    return Recording(dataset.assign({n: (dataset[n].dims, x, {}) for n, x in new.items()}))
 
 
 def behind_filter(

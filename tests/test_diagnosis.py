@@ -140,7 +140,7 @@ def test_noise_is_found_and_innovations_are_white_on_a_null(null):
         assert diagnoser.data.steps == 20 * 110  # half a second is what thrusters remember
 
 
-@pytest.mark.parametrize("reckoned", [(), (0, 1, 2), (0, 1)])
+@pytest.mark.parametrize("reckoned", [(), pytest.param((0, 1, 2), marks=pytest.mark.slow), (0, 1)])
 def test_responses_of_instruments_are_derivatives_of_the_innovations(null, reckoned):
     """Also where instruments are at fault already: records differ as they show states.
 

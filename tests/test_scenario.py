@@ -23,7 +23,7 @@ SMALL = """
 planner: {horizon: 10, sequences: 16, realisations: 1, knots: [2], effective_samples: 4,
     shown_paths: 4}
 """
-_SELDOM = ("tracking_calm", "keeping_harbour", "hold_depth_vehicle")
+_SELDOM = ("tracking_calm", "keeping_harbour", "crossing_harbour", "hold_depth_vehicle")
 BASE = """
 name: base
 duration: 5

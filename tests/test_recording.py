@@ -166,6 +166,11 @@ def test_concatenation_keeps_every_run():
     assert both.lengths.tolist() == [[40, 25, 40, 25], [10, 0, 0, 0]]
     assert both.notes == ("one", "two")
     sparse = Recording(a.dataset.assign_attrs(command_period=0.2))
+    for wrong in ("fast", 0.0, 1e4):
+        with pytest.raises(
+            ValueError, match="rates_low_pass: must be a number of Hz from 1 to 500"
+        ):
+            Recording(a.dataset.assign_attrs(rates_low_pass=wrong))
     assert a.command_period == a.dt
     assert Recording.concat([a, sparse]).command_period == 0.2
     assert [r.commands_sampled for r in (a, sparse, both)] == [False, True, False]

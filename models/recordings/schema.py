@@ -10,6 +10,7 @@ import xarray as xr
 from jaxtyping import Bool, Float
 
 from ..se3 import POSE, TWIST, WRENCH, XYZ
+from .origin import LOW_PASS
 from .outputs import check_outputs
 
 FORMAT = "spinndrift recording 1"
@@ -87,6 +88,8 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
 MAY_LACK = {"X_WB": XYZ, "V_WB_B": TWIST}
 _NORM_TOLERANCE = 1e-4
 _SHORTEST_STEP, _LONGEST_STEP = 1e-6, 1e4
+_CUTOFFS = (1.0, 500.0)
+"""Cutoffs (Hz) that an autopilot's low-pass may have."""
 
 
 def variable_dims(name: str) -> tuple[str, ...]:
@@ -231,6 +234,8 @@ def _check_time(dataset: xr.Dataset) -> None:
     time, dt = dataset["time"].to_numpy(), _seconds(dataset, "dt")
     if "command_period" in dataset.attrs:
         _seconds(dataset, "command_period")
+    if LOW_PASS in dataset.attrs:
+        _number(dataset, LOW_PASS, _CUTOFFS, "Hz")
     if not np.issubdtype(time.dtype, np.floating) or time.ndim != 1:
         raise ValueError(f"time: must be numbers (s), got {time.dtype}")
     if "start_time" in dataset:
@@ -246,12 +251,16 @@ def _check_time(dataset: xr.Dataset) -> None:
 
 def _seconds(dataset: xr.Dataset, name: str) -> float:
     """An attribute that is a time step."""
-    value = dataset.attrs[name]
+    return _number(dataset, name, (_SHORTEST_STEP, _LONGEST_STEP), "seconds")
+
+
+def _number(dataset: xr.Dataset, name: str, limits: tuple[float, float], unit: str) -> float:
+    """An attribute that is a number within limits."""
+    value, (least, most) = dataset.attrs[name], limits
     number = isinstance(value, int | float | np.floating | np.integer)
-    if not number or not _SHORTEST_STEP <= value <= _LONGEST_STEP:
+    if not number or not least <= value <= most:
         raise ValueError(
-            f"{name}: must be a number of seconds from {_SHORTEST_STEP:g} to {_LONGEST_STEP:g}, "
-            f"got {str(value)[:60]}"
+            f"{name}: must be a number of {unit} from {least:g} to {most:g}, got {str(value)[:60]}"
         )
     return float(value)
 

@@ -7,8 +7,8 @@ like that of a heavier vehicle. With f the specific force and I the integral of 
     v(t) = I(t) + line through (t_i, v_i - I(t_i)),
 
 which keeps every sample; a bias of the accelerometer has no effect. Attitudes are connected along
-the gyro in the same way: by its rotation vector since the sample before, with the term of second
-order of Bortz's equation (Savage 1998, equation 33), closed by a constant rate. Whether a sensor
+the gyro in the same way: by its rotation vector since the sample before, to second order in the
+angle (Bortz 1971), closed by a constant rate. Whether a sensor
 tells is asked of the samples: every second one must be nearer to this curve through the others than
 to their lines. A value that stands still is kept: its stream was lost, and the checks of the data
 are to see that.

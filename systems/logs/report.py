@@ -214,7 +214,7 @@ def _lacking(signals: Signals) -> list[str]:
         )
     if signals.attitude.rate < _SLOW_STATE_HZ:
         told.append(f"Attitude at {signals.attitude.rate:.1f} Hz only: fast turns are smoothed.")
-    rate = signals.outputs.rate
+    rate = signals.outputs.measured or signals.outputs.rate
     if rate < _SLOW_OUTPUTS_HZ and not signals.held:
         told.append(
             f"Thruster outputs at {rate:.1f} Hz: thruster lag and delays below about "

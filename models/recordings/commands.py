@@ -43,7 +43,7 @@ def forces_of(dataset: xr.Dataset, name: str, thrusters: Any) -> Float[Array, "n
         return jnp.asarray(np.moveaxis(np.where(mask[..., None], values, 0.0), -1, 0))
     command = _pulses(dataset)
     volts = jnp.asarray(voltage_of(dataset, thrusters))
-    if PWM_STD not in dataset or not _describe(dataset):
+    if PWM_STD not in dataset or not _unchanged(dataset):
         return thrusters.force(command, volts)
     std = _of_pwm(dataset, PWM_STD)
     return (thrusters.force(command + std, volts) + thrusters.force(command - std, volts)) / 2
@@ -57,7 +57,7 @@ def rises_of(dataset: xr.Dataset, thrusters: Any) -> Float[np.ndarray, "J K N n"
     """
     if not {"pwm", PWM_RISE} <= set(dataset) or "thruster_force" in dataset:
         return None
-    if not _describe(dataset):
+    if not _unchanged(dataset):
         return None
     change = _of_pwm(dataset, PWM_RISE)
     width = jnp.abs(change) / np.sqrt(12.0)  # deviation of a line
@@ -76,8 +76,8 @@ def _pulses(dataset: xr.Dataset) -> Float[Array, "n J K N"]:
     return jnp.asarray(np.moveaxis(np.where(mask, pwm, 1500.0), -1, 0))
 
 
-def _describe(dataset: xr.Dataset) -> bool:
-    """Whether what a recording has beside the PWM is of this PWM, which may have been changed.
+def _unchanged(dataset: xr.Dataset) -> bool:
+    """Whether the rises of a recording are those of its PWM, which was not changed without them.
 
     Half the change from the step before to the step after one is `pwm_rise` for a line, and a third
     of it for steps of the PWM in the middle of a step.

@@ -218,6 +218,4 @@ def _unmirrored(
         columns = [n - 1 for n in thrusters if not own or n in own[-1]]
         for name, x in values.items():
             x[j, k][:, columns] = centres[name] - x[j, k][:, columns]
-    return Recording(
-        dataset.assign({n: (dataset[n].dims, x, dataset[n].attrs) for n, x in values.items()})
-    )
+    return Recording(dataset.assign({n: dataset[n].copy(data=x) for n, x in values.items()}))

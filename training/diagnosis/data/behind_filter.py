@@ -34,7 +34,7 @@ def with_filtered_pulses(recording: Recording) -> Recording:
         mean, rise[own] = behind_filter(pwm[own], np.nan_to_num(rise[own]), recording.dt, cutoff)
         pwm[own] = np.clip(mean, low, high)
     new = {"pwm": pwm, PWM_RISE: rise}
-    return Recording(dataset.assign({n: (dataset[n].dims, x, {}) for n, x in new.items()}))
+    return Recording(dataset.assign({n: dataset[n].copy(data=x) for n, x in new.items()}))
 
 
 def behind_filter(
@@ -52,7 +52,7 @@ def behind_filter(
     """
     parts = max(int(np.ceil(dt * _PARTS * cutoff)), 2)
     step = dt / parts
-    delay = step / (np.sqrt(2.0) * np.tan(np.pi * cutoff * step))  # of the filter in steps
+    delay = step / (np.sqrt(2.0) * np.tan(np.pi * cutoff * step))  # s, of the sampled filter
     along = (np.arange(parts) + 0.5) / parts - 0.5
     fine = (u[:, None] + rise[:, None] * along[:, None]).reshape(-1, u.shape[1])
     fine = np.concatenate([fine, np.repeat(fine[-1:], int(delay / step) + 2, axis=0)])

@@ -53,6 +53,17 @@ def step(
     return dynamics.displace(X_WB, V_WB_B * h), V_WB_B + dV
 
 
+def over_substeps(
+    mean: Float[Array, "*shape"], rise: Float[Array, "*shape"] | None, substeps: int
+) -> Float[Array, "*shape S"]:
+    """Means over a step's substeps of a command with this `mean`: held, or with a linear `rise`."""
+    levels = jnp.broadcast_to(mean[..., None], (*mean.shape, substeps))
+    if rise is None:
+        return levels
+    middles = (jnp.arange(substeps, dtype=mean.dtype) + 0.5) / substeps - 0.5
+    return levels + jnp.tensordot(rise, middles, 0)
+
+
 def rollout(
     dynamics: Dynamics,
     X_WB: Float[Array, "7 *#batch"],

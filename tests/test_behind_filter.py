@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from spinndrift.systems.mavlink.codec import filter_delay
-from spinndrift.training.diagnosis.data.behind_filter import behind_filter
+from spinndrift.training.data.behind_filter import behind_filter
 
 CUTOFF = 20.0
 

@@ -10,11 +10,15 @@ import pytest
 from spinndrift.models import se3
 from spinndrift.models.effects import KINDS, Extended
 from spinndrift.models.effects.deterministic_step import advance
+from spinndrift.models.effects.recorded_rollout import Commands, simulate_recorded
+from spinndrift.models.integrate import over_substeps
 from spinndrift.models.recordings.build import Trajectory
 from spinndrift.models.recordings.commands import forces_of, rises_of
 from spinndrift.models.recordings.store import Recording
 from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.data.windows import make_windows
 from spinndrift.training.diagnosis.data.arrays import make_data
+from spinndrift.training.predict import predict_drift
 
 VEHICLE = load_vehicle("ardusub_sitl")
 STEP, PARTS = 0.1, 40
@@ -147,3 +151,57 @@ def test_rise_of_the_force_of_a_step_of_the_pulse_at_half_time_is_exact():
     pwm = 1620.0 + 80.0 * np.sign(step)
     made = recording(np.where(step == 0, 240.0, 0.0), np.where(step == 0, 80.0, 0.0), pwm=pwm)
     np.testing.assert_allclose(rise_at_middle(made.dataset), 1.5 * quadratic(200, 40), rtol=1e-6)
+
+
+def test_a_predicted_motion_follows_a_rise_as_it_does_steps_of_the_substeps():
+    """By the wrench, and by the thrusters of a model with effects."""
+    T, parts, W = 6, 4, 3
+    rng = np.random.default_rng(1)
+    start = jnp.tile(se3.identity(jnp.float64)[:, None], W), jnp.zeros((6, W))
+    level, rise = jnp.asarray(rng.normal(size=(2, T, 8, W)))
+    fine = over_substeps(level, rise, parts)
+    np.testing.assert_allclose(fine.mean(axis=-1), level, atol=1e-12)
+    each = jnp.moveaxis(fine, -1, 1).reshape(T * parts, 8, W)
+    model = turning(5.0)
+    allocation = jnp.asarray(VEHICLE.thrusters().allocation, jnp.float64)
+
+    def wrench(u):
+        return jnp.einsum("in,tnw->tiw", allocation, u)
+
+    found = predict_drift(
+        model.base, *start, wrench(level), STEP, substeps=parts, rise=wrench(rise)
+    )
+    right = predict_drift(model.base, *start, wrench(each), STEP / parts)
+    for a, b in zip(found, right, strict=True):
+        np.testing.assert_allclose(a, b[parts - 1 :: parts], atol=1e-9)
+
+    def commands(u, rise=None):
+        volts, past = jnp.ones((len(u), 1, W)), jnp.zeros((1, 8, W))
+        return Commands(u, volts, past, jnp.zeros((1, 6, W)), rise)
+
+    given = [commands(level, rise), commands(each)]
+    found = simulate_recorded(model, *start, given[0], STEP, substeps=parts)
+    right = simulate_recorded(model, *start, given[1], STEP / parts)
+    for a, b in zip(found, right, strict=True):
+        np.testing.assert_allclose(a, b[parts - 1 :: parts], atol=1e-9)
+
+
+def test_windows_have_the_rises_of_their_steps():
+    made = recording(pwm=1500.0 + np.linspace(100, 336, 60)[:, None] * np.ones(8))
+    whole = rises_of(made.dataset, VEHICLE.thrusters())
+    assert whole is not None
+    w = make_windows(made, length_s=1.0, stride_s=0.5, remembered=0.2, dtype=np.float64)
+    assert w.rise is not None
+    assert w.commands is not None
+    rises = w.commands.rise
+    assert rises is not None
+    allocation = np.asarray(VEHICLE.thrusters().allocation)
+    for i, begin in enumerate(np.round(w.start / STEP).astype(int)):
+        own = whole[0, 0, begin : begin + 10]
+        np.testing.assert_allclose(rises[..., i], own, atol=1e-9)
+        np.testing.assert_allclose(w.rise[..., i], own @ allocation.T, atol=1e-5)
+    part = w.subdivide(2).take([0, 1])
+    assert part.rise is not None
+    np.testing.assert_array_equal(part.rise, w.rise[:2, :, :2])
+    held = Recording(made.dataset.drop_vars("pwm_rise"))
+    assert make_windows(held, length_s=1.0).rise is None

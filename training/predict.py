@@ -7,7 +7,7 @@ from jaxtyping import Array, DTypeLike, Float, Int
 from ..models.dynamics import Dynamics
 from ..models.effects.extended import Extended
 from ..models.effects.recorded_rollout import Commands, gaussians, simulate_recorded
-from ..models.integrate import rollout
+from ..models.integrate import over_substeps, rollout
 
 
 def predict(
@@ -24,6 +24,7 @@ def predict(
     place: Int[Array, " W"] | None = None,
     commands: Commands | None = None,
     spread: Float[Array, "6 6 W"] | None = None,
+    rise: Float[Array, "T 6 W"] | None = None,
 ) -> tuple[Float[Array, "T 7 P W"], Float[Array, "T 6 P W"]]:
     """Draw `samples` motions from each window's initial state and commands, at t_1 … t_T.
 
@@ -31,6 +32,7 @@ def predict(
     `key` and the windows' places (0, 1 … W - 1 by default). A model with effects takes the
     thrusters' `commands`, if given, and returns simulated measurements (`simulate_recorded`).
     With `spread`, L, the samples' first twists are drawn with the covariance L Lᵀ about `V_0`.
+    Wrenches are held for a step, or have the mean `F` and change by `rise` over it.
     """
     T, _, W = F.shape
     count = samples + with_path_of_drift
@@ -63,7 +65,7 @@ def predict(
     # substeps become steps, so that one step is compiled for any number of them
     dt = dt / substeps
     dW = jnp.asarray(dt**0.5, F.dtype) * drawn(T * substeps, 1, model.brownian_size)
-    Xs, Vs = rollout(model, flat(X_0), start, jnp.repeat(flat(F), substeps, axis=0), dt, dW)
+    Xs, Vs = rollout(model, flat(X_0), start, flat(in_substeps(F, rise, substeps)), dt, dW)
     return _by_sample(Xs[substeps - 1 :: substeps], W), _by_sample(Vs[substeps - 1 :: substeps], W)
 
 
@@ -91,9 +93,17 @@ def predict_drift(
     *,
     substeps: int = 1,
     commands: Commands | None = None,
+    rise: Float[Array, "T 6 W"] | None = None,
 ) -> tuple[Float[Array, "T 7 W"], Float[Array, "T 6 W"]]:
-    """The noise-free motion of each window at t_1 … t_T; `commands` as in `predict`."""
+    """The noise-free motion of each window at t_1 … t_T; `commands`, `rise` as in `predict`."""
     if isinstance(model, Extended) and commands is not None:
         return simulate_recorded(model, X_0, V_0, commands, dt, substeps=substeps)
-    Xs, Vs = rollout(model, X_0, V_0, jnp.repeat(F, substeps, axis=0), dt / substeps)
+    Xs, Vs = rollout(model, X_0, V_0, in_substeps(F, rise, substeps), dt / substeps)
     return Xs[substeps - 1 :: substeps], Vs[substeps - 1 :: substeps]
+
+
+def in_substeps(
+    F: Float[Array, "T 6 W"], rise: Float[Array, "T 6 W"] | None, substeps: int
+) -> Float[Array, "N 6 W"]:
+    """The wrenches of T steps, each as those of its substeps (`over_substeps`)."""
+    return jnp.moveaxis(over_substeps(F, rise, substeps), -1, 1).reshape(-1, *F.shape[1:])

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from .. import se3
 from ..dynamics import Dynamics, Memory
+from ..integrate import over_substeps
 from ..rigid_body import FossenDynamics
 from ..thrusters import Thrusters
 from .base import Effect
@@ -136,10 +137,7 @@ class Extended(EffectsOnMotion):
         The command is held, or the mean of one that changes by `rise` over the step.
         """
         h = jnp.asarray(dt, command.dtype)
-        level = jnp.broadcast_to(command[..., None], (*command.shape, substeps))
-        if rise is not None:
-            middles = (jnp.arange(substeps, dtype=command.dtype) + 0.5) / substeps - 0.5
-            level = level + jnp.tensordot(rise, middles, 0)
+        level = over_substeps(command, rise, substeps)
         kept, i = [], 0
         for effect in self.effects:
             if effect.memory_size:

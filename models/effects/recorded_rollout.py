@@ -20,16 +20,18 @@ class Commands(NamedTuple):
     """Thruster commands in a window and before it.
 
     Attributes:
-        level: force along each thruster's axis (N), held for a step.
+        level: mean force along each thruster's axis (N) in a step.
         voltage: voltage of the battery, relative to the nominal one.
         before: commands (N) of the steps before the window.
         V_before: recorded twists at the start of these steps.
+        rise: change of the forces (N) over each step; None if they are held.
     """
 
     level: Float[Array | np.ndarray, "T n *batch"]
     voltage: Float[Array | np.ndarray, "T 1 *batch"]
     before: Float[Array | np.ndarray, "K n *batch"]
     V_before: Float[Array | np.ndarray, "K 6 *batch"]
+    rise: Float[Array | np.ndarray, "T n *batch"] | None = None
 
 
 def gaussians(model: Extended) -> int:
@@ -68,11 +70,11 @@ def simulate_recorded(
 
     def advance(carry: Any, given: Any) -> Any:
         carried, X, V, recent = carry
-        level, voltage, w, extra, number = given
+        level, voltage, rise, w, extra, number = given
         pushes = [jnp.zeros_like(V)] * count if extra is None else list(extra)
         w = None if w is None else list(w)
         carried, X1, V1 = advanced(
-            model, carried, X, V, level, voltage, pushes, w, dt, number > 0
+            model, carried, X, V, level, voltage, pushes, w, dt, number > 0, rise=rise
         )  # fmt: skip
         seen = X1, V1
         if recent is not None:
@@ -81,7 +83,8 @@ def simulate_recorded(
             seen = model.observe(X1, V1, recent)
         return (carried, X1, V1, recent), seen
 
-    xs = (commands.level, commands.voltage, noise, lasting, jnp.arange(len(commands.level)))
+    numbers = jnp.arange(len(commands.level))
+    xs = (commands.level, commands.voltage, commands.rise, noise, lasting, numbers)
     start = ((memory, random), X, V, recent)
     return jax.lax.scan(jax.checkpoint(advance), start, xs)[1]
 
@@ -95,8 +98,13 @@ def actuated(
     """
     commands = jax.tree.map(jnp.asarray, commands)
     memory = _after(model, model.remember(commands.before[0]), commands, dt)
-    level = jnp.asarray(commands.level)
-    return jax.lax.scan(lambda m, u: model.actuate(m, u, dt, substeps), memory, level)[1]
+
+    def step(memory: Any, given: tuple[Array, Array | None]) -> tuple[Any, Array]:
+        level, rise = given
+        return model.actuate(memory, level, dt, substeps, rise)
+
+    given: Any = (commands.level, commands.rise)
+    return jax.lax.scan(step, memory, given)[1]
 
 
 def _after(model: Extended, memory: Any, commands: Commands, dt: float) -> Any:

@@ -27,8 +27,11 @@ def advanced(
     period: float,
     started: Any = True,
     water: Sequence[Flow | None] | None = None,
+    rise: Float[Array, "n *#batch"] | None = None,
 ) -> tuple[tuple[Memory, Random], Float[Array, "7 *#batch"], Float[Array, "6 *#batch"]]:
-    """Simulation state, pose and twist after a `period` (s) under held thruster forces.
+    """Simulation state, pose and twist after a `period` (s) under thruster forces.
+
+    These are held, or have the mean `level` and change by `rise` over the period.
 
     It takes a substep for each wrench of `F_Bo_B`, which adds to the thrusters'; `noise` holds the
     unit Gaussians of each substep (`Extended.noise_size`), `water` its flow. If not `started`, the
@@ -37,7 +40,7 @@ def advanced(
     memory, random = carried
     body, count = model.body, len(F_Bo_B)
     h = period / count
-    memory, levels = model.actuate(memory, level, period, count)
+    memory, levels = model.actuate(memory, level, period, count, rise)
     memory, felt = model.feel(memory, V_WB_B, period)
     X, V = X_WB, V_WB_B
     for s, F_other in enumerate(F_Bo_B):

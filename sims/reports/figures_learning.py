@@ -172,6 +172,7 @@ def bands_figure(
         return eqx.filter_jit(predict)(
             model, one.X[0], one.V[0], one.F, windows.dt, jax.random.key(0), count,
             substeps=substeps, with_path_of_drift=True, commands=one.commands,
+            rise=one.rise,
         )  # fmt: skip
 
     X, V = drawn(learned, samples, substeps[0])

@@ -25,8 +25,11 @@ def fingerprint(windows: Windows) -> str:
         windows.start,
         *(windows.commands or ()),
         *(windows.hidden or ()),
+        windows.rise,
     )
     for array in arrays:
+        if array is None:
+            continue
         digest.update(repr((array.shape, str(array.dtype))).encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(repr((windows.dt, windows.names, windows.normalise)).encode())

@@ -4,7 +4,7 @@ Every window is one sample of a conditional law: that of the motion given the in
 commands. Arrays are time-major, component-first, windows last (`models.se3`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -19,6 +19,7 @@ from ...models.effects.extended import Extended
 from ...models.effects.recorded_rollout import Commands
 from ...models.recordings.store import Recording
 from ..smoothing.complete import Completed
+from .behind_filter import with_rises, wrench_rise
 
 Normalisation = Literal["heading", "identity", "none"]
 _REMEMBERED = 10.0  # s of commands and motion before a window, at most
@@ -47,7 +48,7 @@ class Windows:
     Attributes:
         X: poses at t_0 … t_T.
         V: body twists at t_0 … t_T.
-        F: wrenches, the n-th acting from t_n to t_(n+1).
+        F: mean wrenches, the n-th acting from t_n to t_(n+1).
         dt: step (s).
         scenario: index into `names` of each window's scenario.
         run: label of the trajectory within its scenario.
@@ -56,6 +57,7 @@ class Windows:
         normalise: normalisation of the windows' first pose.
         commands: thruster commands in the windows and before them, for models with effects.
         hidden: of recordings without some channels, for which X and V then hold estimates.
+        rise: change of the wrenches over each step; None if they are held.
     """
 
     X: Float[np.ndarray, "N 7 W"]
@@ -69,6 +71,7 @@ class Windows:
     normalise: Normalisation = "heading"
     commands: Commands | None = None
     hidden: Hidden | None = None
+    rise: Float[np.ndarray, "T 6 W"] | None = None
 
     def __len__(self) -> int:
         return self.X.shape[2]
@@ -101,6 +104,7 @@ class Windows:
             start=self.start[i],
             commands=jax.tree.map(lambda a: a[..., i], self.commands),
             hidden=jax.tree.map(lambda a: a[..., i], self.hidden),
+            rise=None if self.rise is None else self.rise[..., i],
         )
 
     def thin(self, count: int) -> "Windows":
@@ -122,25 +126,18 @@ class Windows:
                 start=self.start + k * self.dt,
                 commands=self._commands_from(k, steps),
                 hidden=self._hidden_from(k, steps),
+                rise=None if self.rise is None else self.rise[k : k + steps],
             )
             for k in range(0, self.steps - steps + 1, steps)
         ]
-        X = np.concatenate([part.X for part in parts], axis=2)
-        return replace(
-            parts[0],
-            X=_normalised(X, self.normalise),
-            V=np.concatenate([part.V for part in parts], axis=2),
-            F=np.concatenate([part.F for part in parts], axis=2),
-            scenario=np.concatenate([part.scenario for part in parts]),
-            run=np.concatenate([part.run for part in parts]),
-            start=np.concatenate([part.start for part in parts]),
-            commands=jax.tree.map(
-                lambda *a: np.concatenate(a, axis=-1), *(part.commands for part in parts)
-            ),
-            hidden=jax.tree.map(
-                lambda *a: np.concatenate(a, axis=-1), *(part.hidden for part in parts)
-            ),
-        )
+
+        def joined(name: str) -> Any:
+            of_parts = (getattr(part, name) for part in parts)
+            return jax.tree.map(lambda *a: np.concatenate(a, axis=-1), *of_parts)
+
+        whole = ("V", "F", "scenario", "run", "start", "commands", "hidden", "rise")
+        X = _normalised(joined("X"), self.normalise)
+        return replace(parts[0], X=X, **{name: joined(name) for name in whole})
 
     def _hidden_from(self, k: int, steps: int) -> Hidden | None:
         """What is hidden in windows that begin k steps later; their starts count as known."""
@@ -161,6 +158,7 @@ class Windows:
             c.voltage[k : k + steps],
             np.concatenate([c.before, c.level[:k]])[-earlier:],
             np.concatenate([c.V_before, self.V[:k]])[-earlier:],
+            None if c.rise is None else c.rise[k : k + steps],
         )
 
     def overlaps(self, other: "Windows") -> bool:
@@ -210,21 +208,19 @@ def make_windows(
         >>> make_windows(recording, length_s=1.0).steps
         20
     """
-    recording = _whole(recording, completed, normalise)
+    recording, rise = with_rises(_whole(recording, completed, normalise), vehicle)
     steps, places = window_places(recording, length_s, stride_s)
-    data = recording.dataset
-    X, V = data["X_WB"].to_numpy(), data["V_WB_B"].to_numpy()
+    X, V = (recording.dataset[name].to_numpy() for name in ("X_WB", "V_WB_B"))
 
     def cut(values: np.ndarray, first: int = 0, last: int = steps) -> np.ndarray:
         at = np.arange(first, last)
         return np.stack([values[j, k, np.maximum(n + at, 0)] for j, k, n in places], axis=-1)
 
-    def commanded(remembered: float) -> Commands:
-        level, voltage = recording.thrust(vehicle)
-        back = -max(1, round(remembered / recording.dt))
-        kept = cut(level), cut(voltage)[:, None], cut(level, back, 0), cut(V, back, 0)
-        return Commands(*(part.astype(dtype) for part in kept))
-
+    commands = None
+    if remembered is not None:
+        back = max(1, round(remembered / recording.dt))
+        commands = _commands(cut, *recording.thrust(vehicle), V, rise, back, dtype)
+    change = wrench_rise(recording, vehicle, rise)
     twists, hidden = cut(V, 0, steps + 1), None
     if completed is not None:
         twists[0] = cut(completed.causal, 0, 1)[0]
@@ -237,9 +233,25 @@ def make_windows(
         **_labels(recording, places),
         names=recording.scenarios,
         normalise=normalise,
-        commands=None if remembered is None else commanded(remembered),
+        commands=commands,
         hidden=hidden,
+        rise=None if change is None else cut(change).astype(dtype),
     )
+
+
+def _commands(
+    cut: Callable[..., np.ndarray],
+    level: Float[np.ndarray, "J K N n"],
+    voltage: Float[np.ndarray, "J K N"],
+    V: Float[np.ndarray, "J K N 6"],
+    rise: Float[np.ndarray, "J K N n"] | None,
+    back: int,
+    dtype: Any,
+) -> Commands:
+    """Commands that `cut` takes for the windows, and those of `back` steps before them."""
+    past = cut(level, -back, 0), cut(V, -back, 0)
+    found = Commands(cut(level), cut(voltage)[:, None], *past, None if rise is None else cut(rise))
+    return jax.tree.map(lambda part: part.astype(dtype), found)
 
 
 def windowing(model: Dynamics | None, normalise: Normalisation) -> dict[str, Any]:

@@ -265,6 +265,7 @@ def _compare(
         with_path_of_drift=True,
         commands=batch.commands,
         spread=batch.spread,
+        rise=batch.rise,
     )
     X, V = batch.shown(X, V)
     y = batch.X[1:, :, None], batch.V[1:, :, None]

@@ -80,6 +80,7 @@ def _displacements(
     X, V = predict(
         model, batch.X[0], batch.V[0], batch.F, dt, key, _SAMPLES, substeps=substeps,
         with_path_of_drift=True, commands=batch.commands, spread=batch.spread,
+        rise=batch.rise,
     )  # fmt: skip
     drift = X[:, :, _SAMPLES:], V[:, :, _SAMPLES:]
     e = displacement(X[:, :, :_SAMPLES], V[:, :, :_SAMPLES], *drift)

@@ -108,7 +108,7 @@ def _telling(pieces: Windows, model: Dynamics, count: int, substeps: int) -> Win
     batch = Batch.of(pieces)
     _, V = eqx.filter_jit(predict_drift)(
         model, batch.X[0], batch.V[0], batch.F, pieces.dt, substeps=substeps,
-        commands=batch.commands,
+        commands=batch.commands, rise=batch.rise,
     )  # fmt: skip
     change = np.nan_to_num(np.abs(np.asarray(V[-1]) - pieces.V[0]), nan=0.0, posinf=0.0)
     largest = np.argsort(-change, axis=1, kind="stable")[:, : max(1, count // 12)]
@@ -129,8 +129,9 @@ def _residuals(
         model, batch, unit = given
         model = eqx.tree_at(constants, model, unravel(values))
         X, V = predict_drift(
-            model, batch.X[0], batch.V[0], batch.F, dt, substeps=substeps, commands=batch.commands
-        )
+            model, batch.X[0], batch.V[0], batch.F, dt, substeps=substeps,
+            commands=batch.commands, rise=batch.rise,
+        )  # fmt: skip
         errors = jnp.stack(unit.by_axis(X[:, :, None], V[:, :, None], batch))
         errors = errors[:, :, 1::4]  # neighbouring times are nearly redundant
         # a large step of the solver may diverge: a large finite error makes it step back

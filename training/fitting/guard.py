@@ -83,7 +83,9 @@ def explain_non_finite(
 def runaways(model: Dynamics, windows: Windows, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Windows whose noise-free motion is not finite, and after how many seconds it is not."""
     arrays = Batch.of(windows)
-    X, V = eqx.filter_jit(predict_drift)(model, arrays.X[0], arrays.V[0], arrays.F, dt)
+    X, V = eqx.filter_jit(predict_drift)(
+        model, arrays.X[0], arrays.V[0], arrays.F, dt, rise=arrays.rise
+    )  # fmt: skip
     state = np.concatenate([np.asarray(X), np.asarray(V)], axis=1)
     finite: np.ndarray = np.asarray(np.isfinite(state).all(axis=1))
     lost = np.flatnonzero(~finite.all(0))

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, DTypeLike, Float
 
 from ...models.dynamics import Dynamics
+from ...models.integrate import over_substeps
 from ..data.windows import Windows
 
 _PART = 20  # consecutive steps that are kept together when steps are left out
@@ -28,10 +29,11 @@ class Steps(eqx.Module):
     Attributes:
         X: poses at the start.
         V: twists at the start.
-        F: wrenches.
+        F: mean wrenches.
         V_next: twists at the end; the poses there carry no further information.
         follows: whether a step's end is the next one's start.
         dt: length of each (s).
+        rise: change of the wrenches over them; None if they are held.
     """
 
     X: Float[Array, "7 N"]
@@ -40,6 +42,7 @@ class Steps(eqx.Module):
     V_next: Float[Array, "6 N"]
     follows: Bool[Array, " N"]
     dt: float = eqx.field(static=True)
+    rise: Float[Array, "6 N"] | None = None
 
     @classmethod
     def of(cls, windows: Windows, most: int) -> "Steps":
@@ -63,6 +66,7 @@ class Steps(eqx.Module):
             V_next=jnp.asarray(pieces.V[1]),
             follows=jnp.asarray(np.append(after, np.zeros(min(1, len(chosen)), bool))),
             dt=pieces.dt,
+            rise=None if pieces.rise is None else jnp.asarray(pieces.rise[0]),
         )
 
     def __len__(self) -> int:
@@ -143,9 +147,10 @@ def _motion(
     """The twists at the steps' ends without noise, and the states at the start of each substep."""
     X, V, path = steps.X, steps.V, []
     h = jnp.asarray(steps.dt / substeps, V.dtype)
-    for _ in range(substeps):
+    F = over_substeps(steps.F, steps.rise, substeps)
+    for s in range(substeps):
         path.append((X, V))
-        X, V = model.displace(X, V * h), V + h * model.acceleration(X, V, steps.F)
+        X, V = model.displace(X, V * h), V + h * model.acceleration(X, V, F[..., s])
     return V, path
 
 
@@ -157,9 +162,10 @@ def _spread(
     h = jnp.asarray(steps.dt / substeps, V_end.dtype)
     eye = jnp.broadcast_to(jnp.eye(6, dtype=V_end.dtype)[:, :, None], (6, 6, len(steps)))
     columns: list[Array] = []  # response to unit noise in each of the substeps so far
-    for X, V in path:
+    F = over_substeps(steps.F, steps.rise, substeps)
+    for s, (X, V) in enumerate(path):
         mass = model.coefficients(V).mass
-        _, push = jax.linearize(lambda v, X=X: model.acceleration(X, v, steps.F), V)
+        _, push = jax.linearize(lambda v, X=X, s=s: model.acceleration(X, v, F[..., s]), V)
         A = eye + h * jax.vmap(push, in_axes=1, out_axes=1)(eye)
         columns = [jnp.einsum("ijn,jkn->ikn", A, G) for G in columns]
         columns.append(jnp.stack([mass.solve(eye[:, i]) for i in range(6)], axis=1))

@@ -47,7 +47,8 @@ def estimate_diffusion(
     steps = int(np.clip(round(horizon_s / windows.dt), 1, windows.steps))
     pieces = windows.thin(256).subdivide(steps).thin(1024)
     batch = Batch.of(pieces)
-    start, commands = (batch.X[0], batch.V[0], batch.F, windows.dt), batch.commands
+    start = batch.X[0], batch.V[0], batch.F, windows.dt
+    given = {"substeps": substeps, "commands": batch.commands, "rise": batch.rise}
     M = mass_at_rest(dynamics, batch.V.dtype)
     floor = 1e-3 * np.diag(M)
 
@@ -56,7 +57,7 @@ def estimate_diffusion(
         miss = miss[:, np.isfinite(miss).all(axis=0)]
         return np.median(miss, axis=1) / _NORMAL_QUARTILE if miss.size else np.zeros(6)
 
-    _, V = eqx.filter_jit(predict_drift)(dynamics, *start, substeps=substeps, commands=commands)
+    _, V = eqx.filter_jit(predict_drift)(dynamics, *start, **given)
     missed = spread(batch.V[-1] - V[-1])
     b = np.maximum(missed / (steps * windows.dt) ** 0.5, floor)
     own = core(dynamics)
@@ -64,9 +65,7 @@ def estimate_diffusion(
         return b
     for _ in range(2):
         model = with_diffusion(dynamics, b)
-        _, Vs = eqx.filter_jit(predict)(
-            model, *start, jax.random.key(0), 1, substeps=substeps, commands=commands
-        )
+        _, Vs = eqx.filter_jit(predict)(model, *start, jax.random.key(0), 1, **given)
         drawn = spread(Vs[-1, :, 0] - V[-1])
         b = np.maximum(b * np.clip(missed / np.maximum(drawn, 1e-12), 0.25, 4.0), floor)
     return b
@@ -177,7 +176,7 @@ def _nearer(first: Model, second: Model, windows: Windows, substeps: int) -> Mod
     def miss(model: Model) -> Array:
         X, V = predict_drift(
             model, batch.X[0], batch.V[0], batch.F, windows.dt, substeps=substeps,
-            commands=batch.commands,
+            commands=batch.commands, rise=batch.rise,
         )  # fmt: skip
         return unit(X[:, :, None], V[:, :, None], batch)
 

@@ -237,7 +237,7 @@ def mean_over_devices(of_part: Callable[..., Any], devices: int) -> Callable[...
         return jax.lax.pmean(of_part(batch, *whole), _WINDOWS)
 
     share = Spec(None, None, _WINDOWS)
-    parts = Batch(share, share, share, Spec(_WINDOWS), share, share)  # pyright: ignore[reportArgumentType]
+    parts = Batch(share, share, share, Spec(_WINDOWS), share, share, share)  # pyright: ignore[reportArgumentType]
     mean = jax.shard_map(
         here, mesh=_mesh(devices), in_specs=(parts, Spec()), out_specs=Spec(), check_vma=False
     )

@@ -22,7 +22,8 @@ class Batch(NamedTuple):
 
     `place` numbers the windows: the noise of a window depends on its place, not on the other
     windows, so that a batch split over devices has the same noise as on one device. `commands`
-    are for models with effects, which act on single thrusters and have memory.
+    are for models with effects, which act on single thrusters and have memory. The wrench changes
+    by `rise` over a step.
     """
 
     X: Float[Array, "N 7 W"]
@@ -31,19 +32,21 @@ class Batch(NamedTuple):
     place: Int[Array, " W"]
     commands: Commands | None = None
     hidden: Hidden | None = None
+    rise: Float[Array, "T 6 W"] | None = None
 
     @classmethod
     def of(cls, windows: Windows) -> "Batch":
         """All windows as one batch."""
-        arrays = (windows.X, windows.V, windows.F, windows.commands, windows.hidden)
-        X, V, F, commands, hidden = jax.tree.map(jnp.asarray, arrays)
-        return cls(X, V, F, jnp.arange(len(windows)), commands, hidden)
+        w = windows
+        arrays = (w.X, w.V, w.F, w.commands, w.hidden, w.rise)
+        X, V, F, commands, hidden, rise = jax.tree.map(jnp.asarray, arrays)
+        return cls(X, V, F, jnp.arange(len(w)), commands, hidden, rise)
 
     def take(self, indices: Int[Array, " B"]) -> "Batch":
         """The windows of some indices, with new places."""
-        arrays = (self.X, self.V, self.F, self.commands, self.hidden)
-        X, V, F, commands, hidden = jax.tree.map(lambda a: a[:, :, indices], arrays)
-        return Batch(X, V, F, jnp.arange(indices.size), commands, hidden)
+        arrays = (self.X, self.V, self.F, self.commands, self.hidden, self.rise)
+        X, V, F, commands, hidden, rise = jax.tree.map(lambda a: a[:, :, indices], arrays)
+        return Batch(X, V, F, jnp.arange(indices.size), commands, hidden, rise)
 
     @property
     def spread(self) -> Float[Array, "6 6 W"] | None:

@@ -250,7 +250,9 @@ def _diffusion(model: EuclideanSpinn, kind: str) -> Diffusion:
 
 
 def _beginning(batch: Batch, steps: int) -> Batch:
-    return batch._replace(X=batch.X[: steps + 1], V=batch.V[: steps + 1], F=batch.F[:steps])
+    rise = None if batch.rise is None else batch.rise[:steps]
+    X, V = batch.X[: steps + 1], batch.V[: steps + 1]
+    return batch._replace(X=X, V=V, F=batch.F[:steps], rise=rise)
 
 
 def _ball(key: Array, z: Float[Array, "6 *batch"], radius: float, samples: int) -> Array:

@@ -21,7 +21,7 @@ from ...models.dynamics import Dynamics
 from ...models.euclidean import EuclideanSpinn, coordinates
 from ..data.groups import group_size
 from ..data.windows import Windows
-from ..predict import normal_by_window
+from ..predict import in_substeps, normal_by_window
 from .base import Batch, Objective
 from .kernels import VelocityKernel, bandwidths_from_differences
 from .moments import Moments, MomentsObjective, Unit, compare, pooled, units, vector_moments
@@ -70,7 +70,7 @@ def predict_coordinates(
         dW = scale * jnp.swapaxes(drawn, 2, 3)
         quiet = jnp.zeros((T * substeps, 6, count - samples, W), batch.F.dtype)
         dW = jnp.concatenate([dW, quiet], axis=2)
-    F = jnp.repeat(batch.F[:, :, None], substeps, axis=0)
+    F = in_substeps(batch.F, batch.rise, substeps)[:, :, None]
     q, V = (
         jnp.broadcast_to(a[:, None], (6, count, W)) for a in (coordinates(batch.X[0]), batch.V[0])
     )

@@ -192,6 +192,7 @@ class FdmObjective(Objective):
             place=batch.place,
             commands=batch.commands,
             spread=batch.spread,
+            rise=batch.rise,
         )
         path = X[:, :, P:], V[:, :, P:]
         X, V = batch.shown(X, V)
@@ -246,7 +247,7 @@ class MseObjective(Objective):
     ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
         path = predict_drift(
             model, batch.X[0], batch.V[0], batch.F, self.error.dt, substeps=self.error.substeps,
-            commands=batch.commands,
+            commands=batch.commands, rise=batch.rise,
         )  # fmt: skip
         X, V = (a[:, :, None] for a in path)
         total = self.error(*batch.shown(X, V), batch)
@@ -285,7 +286,7 @@ def typical_motion(
     predict_all = eqx.filter_jit(predict_drift)
     X, V = predict_all(
         model, batch.X[0], batch.V[0], batch.F, windows.dt, substeps=substeps,
-        commands=batch.commands,
+        commands=batch.commands, rise=batch.rise,
     )  # fmt: skip
     kept = np.flatnonzero(np.isfinite(X).all((0, 1)) & np.isfinite(V).all((0, 1)))
     if 2 * kept.size <= batch.X.shape[2]:

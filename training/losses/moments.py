@@ -177,6 +177,7 @@ class MomentsObjective(Objective):
             place=batch.place,
             commands=batch.commands,
             spread=batch.spread,
+            rise=batch.rise,
         )
         return batch.shown(X, V)
 

@@ -13,6 +13,7 @@ from ...models import se3
 from ...models.dynamics import Dynamics
 from ...models.effects.extended import Extended
 from ...models.effects.recorded_rollout import actuated
+from ...models.integrate import over_substeps
 from ...models.rigid_body import GRAVITY
 from ..data.windows import Windows
 from ..predict import predict_drift
@@ -39,7 +40,7 @@ class ForceError(eqx.Module):
         batch = Batch.of(windows.take(np.flatnonzero(hidden.felt)).thin(_WINDOWS))
         X, V = eqx.filter_jit(predict_drift)(
             model, batch.X[0], batch.V[0], batch.F, windows.dt, substeps=substeps,
-            commands=batch.commands,
+            commands=batch.commands, rise=batch.rise,
         )  # fmt: skip
         e = np.asarray(_errors(model, X, V, batch, windows.dt), np.float64)
         e = e[..., np.isfinite(e).all(axis=(0, 1))]
@@ -65,12 +66,17 @@ def _errors(
     X, V = (jnp.moveaxis(a[:-1], 1, 0) for a in (X, V))
     if isinstance(model, Extended) and batch.commands is not None:
         levels = actuated(model, batch.commands, dt, _PARTS)
-        level = jnp.moveaxis((levels[1:, ..., 0] + levels[:-1, ..., -1]) / 2, 1, 0)
+        level = _at_samples(levels)
         voltage = jnp.moveaxis(jnp.asarray(batch.commands.voltage[1:]), 1, 0)
         a = model.body.acceleration(X, V, model.push(level, X, V, voltage))
     else:
-        F = jnp.moveaxis((batch.F[1:] + batch.F[:-1]) / 2, 1, 0)
+        F = _at_samples(over_substeps(batch.F, batch.rise, _PARTS))
         a = model.acceleration(X, V, F)
     up = jnp.zeros_like(V[:3]).at[2].set(GRAVITY)
     f = a[:3] + se3.cross(V[3:], V[:3]) + se3.rotate_inverse(X, up)
     return f - jnp.moveaxis(batch.hidden.force[1:-1], 1, 0)
+
+
+def _at_samples(levels: Float[Array, "T n W S"]) -> Float[Array, "n N W"]:
+    """Commands at t_1 … t_(T-1): the mean of the parts of steps before and after."""
+    return jnp.moveaxis((levels[1:, ..., 0] + levels[:-1, ..., -1]) / 2, 1, 0)

@@ -10,7 +10,9 @@ from jaxtyping import Float
 from ...models.dynamics import Dynamics
 from ...models.effects.extended import Extended
 from ...models.effects.recorded_rollout import Commands, actuated
+from ...models.integrate import over_substeps
 from ...models.recordings.store import Recording
+from ..data.behind_filter import with_rises, wrench_rise
 from .states import Track
 
 
@@ -58,12 +60,18 @@ def _driving(
     recording: Recording, vehicle: Any, model: Dynamics, substeps: int
 ) -> Float[np.ndarray, "J K N S k"]:
     """What drives the model (`Track.F`)."""
+    recording, rise = with_rises(recording, vehicle)
     if not isinstance(model, Extended):
-        return recording.wrench(vehicle).to_numpy()[:, :, :, None]
+        F, change = recording.wrench(vehicle).to_numpy(), wrench_rise(recording, vehicle, rise)
+        if change is None:
+            return F[:, :, :, None]
+        parts = over_substeps(jnp.asarray(F), jnp.asarray(change), substeps)
+        return np.moveaxis(np.asarray(parts), -1, 3)
     level, voltage = recording.thrust(vehicle)
     u, volts = np.moveaxis(level, (2, 3), (0, 1)), np.moveaxis(voltage, 2, 0)[:, None]
     before, V = u[:1], np.zeros((1, 6, *u.shape[2:]))
-    commands = Commands(u, volts, before, V)
+    change = None if rise is None else np.moveaxis(rise, (2, 3), (0, 1))
+    commands = Commands(u, volts, before, V, change)
     felt = eqx.filter_jit(actuated)(model, commands, recording.dt, substeps)
     felt = np.moveaxis(np.asarray(felt), (0, 1, 4), (2, 4, 3))
     relative = np.broadcast_to(voltage[..., None, None], (*felt.shape[:4], 1))

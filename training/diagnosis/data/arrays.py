@@ -10,13 +10,12 @@ from jaxtyping import Float, Int
 from ....models.config.errors import UserError
 from ....models.effects.traits import Need, Region
 from ....models.recordings.checks.small_speeds import DeadZone
-from ....models.recordings.commands import rises_of
 from ....models.recordings.kinematics import dead_reckoned
 from ....models.recordings.origin import states_estimated
 from ....models.recordings.store import Recording
 from ....models.se3 import AXES, TWIST, XYZ
 from ....models.vehicles.vehicle import Vehicle
-from .behind_filter import with_filtered_pulses
+from ...data.behind_filter import with_rises
 from .lost import known_errors, with_lost_zero
 from .pieces import cut, stack, weight_of
 from .readings import sensors_of_latent
@@ -301,15 +300,8 @@ def make_data(
 def _commands(
     recording: Recording, vehicle: Vehicle
 ) -> tuple[Float[np.ndarray, "S K N n"], Float[np.ndarray, "S K N"], dict[str, np.ndarray]]:
-    """Thruster forces, relative voltage, and rises of forces over each step where they are known.
-
-    Forces are then those of pulses behind the filter of the body rates.
-    """
-    rise = rises_of(recording.dataset, vehicle.thrusters())
-    if rise is None:
-        return *recording.thrust(vehicle), {}
-    recording = with_filtered_pulses(recording)
-    rise = rises_of(recording.dataset, vehicle.thrusters())
+    """Thruster forces, relative voltage, and rises of forces over each step (`with_rises`)."""
+    recording, rise = with_rises(recording, vehicle)
     return *recording.thrust(vehicle), {} if rise is None else {"rise": rise}
 
 

@@ -6,16 +6,45 @@ are those of a believed curve, whose dead band would hide small ones behind thei
 import has already moved the rates back by the filter's delay, so that of the pulses is left out.
 """
 
+from typing import Any
+
 import numpy as np
 import scipy.signal
 from jaxtyping import Float
 
-from ....models.recordings.origin import LOW_PASS
-from ....models.recordings.schema import PWM_RISE
-from ....models.recordings.store import Recording
+from ...models.recordings.commands import rises_of, thrusters_of
+from ...models.recordings.origin import LOW_PASS
+from ...models.recordings.schema import PWM_RISE
+from ...models.recordings.store import Recording
 
 _PARTS = 20.0
 """Samples in a period of the filter's cutoff, within which steps are resolved."""
+
+
+def with_rises(
+    recording: Recording, vehicle: Any
+) -> tuple[Recording, Float[np.ndarray, "J K N n"] | None]:
+    """The recording and rises of forces (N) over its steps; None where commands are held.
+
+    Where there are rises, forces are those of pulses behind the filter of the body rates. `vehicle`
+    is as in `Recording.wrench`.
+    """
+    if not {"pwm", PWM_RISE} <= set(recording.dataset):
+        return recording, None
+    thrusters = thrusters_of(recording.dataset, vehicle, "pwm")
+    if rises_of(recording.dataset, thrusters) is None:
+        return recording, None
+    recording = with_filtered_pulses(recording)
+    return recording, rises_of(recording.dataset, thrusters)
+
+
+def wrench_rise(
+    recording: Recording, vehicle: Any, rise: Float[np.ndarray, "J K N n"] | None
+) -> Float[np.ndarray, "J K N 6"] | None:
+    """Changes of the wrench over each step, from those of the forces that it is made from."""
+    if rise is None or "F_Bo_B" in recording.dataset:
+        return None
+    return rise @ np.asarray(thrusters_of(recording.dataset, vehicle, "pwm").allocation).T
 
 
 def with_filtered_pulses(recording: Recording) -> Recording:

@@ -10,6 +10,7 @@ from filelock import FileLock, Timeout
 from platformdirs import user_cache_path
 
 _LARGEST = 2**30  # bytes; the least recently used programs are removed first
+_WORTH_KEEPING = 0.3  # s of compilation, at least
 _MAPS = Path("/proc/self/maps")
 _MOST_MAPS = 20_000  # Linux allows 65530 per process, and XLA's compiler crashes beyond
 
@@ -27,7 +28,7 @@ def keep_compiled(folder: Path | None = None) -> None:
     mend(chosen)
     jax.config.update("jax_compilation_cache_dir", str(chosen))
     jax.config.update("jax_compilation_cache_max_size", _LARGEST)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
 
 
 def mend(folder: Path) -> None:
@@ -64,6 +65,7 @@ def compiled_environment() -> dict[str, str]:
     return {
         "JAX_COMPILATION_CACHE_DIR": folder,
         "JAX_COMPILATION_CACHE_MAX_SIZE": str(_LARGEST),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(_WORTH_KEEPING),
     }
 
 

@@ -1,6 +1,7 @@
 """Settings that every test runs under; nothing in the library sets them."""
 
 import gc
+import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ import jaxtyping
 import pytest
 
 from spinndrift.sims.compile_cache import (
+    compiled_environment,
     compiled_folder,
     give_back_programs,
     keep_compiled,
@@ -25,6 +27,8 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 # Tracing allocates much that stays: fewer collections take an eighth of the time off.
 gc.set_threshold(100_000, 50, 1000)
 keep_compiled(Path(__file__).resolve().parent.parent / ".jax_cache")  # shared by all workers
+# and by the processes that they start, if these have as many devices
+os.environ.update(compiled_environment() | {"JAX_NUM_CPU_DEVICES": "1"})
 
 hypothesis.settings.register_profile(
     "spinndrift",

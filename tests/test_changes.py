@@ -44,8 +44,12 @@ def recorded(tmp_path, *effects, ordered=False):
     return read_csv(tmp_path / "data")
 
 
+def problem_of(recording):
+    return Diagnoser(recording, VEHICLE).problem
+
+
 def started(recording):
-    problem = Diagnoser(recording, VEHICLE).problem
+    problem = problem_of(recording)
     return Selection.start(problem, problem.evaluate(problem.believed))
 
 
@@ -175,7 +179,7 @@ def test_sensitivities_to_a_part_are_those_of_differences(tmp_path):
 
 
 def test_gains_of_parts_are_those_of_least_squares(tmp_path):
-    problem = started(recorded(tmp_path)).problem
+    problem = problem_of(recorded(tmp_path))
     steps = Session.of(problem.data)
     rng = np.random.default_rng(1)
     z = rng.standard_normal((6, 12 * len(steps.run)))
@@ -202,7 +206,7 @@ def test_gains_of_parts_are_those_of_least_squares(tmp_path):
 
 
 def test_what_acts_in_most_of_a_session_is_repeated_beside_a_constant_that_is_free(tmp_path):
-    problem = started(recorded(tmp_path, ordered=True)).problem
+    problem = problem_of(recorded(tmp_path, ordered=True))
     steps = Session.of(problem.data)
     rng = np.random.default_rng(2)
     z = rng.standard_normal((2, 12 * len(steps.run)))
@@ -220,17 +224,17 @@ def test_what_acts_in_most_of_a_session_is_repeated_beside_a_constant_that_is_fr
 
 
 def test_a_session_has_the_order_of_its_times_and_its_parts_lie_within_runs_without(tmp_path):
-    known = Session.of(started(recorded(tmp_path / "a", ordered=True)).problem.data)
+    known = Session.of(problem_of(recorded(tmp_path / "a", ordered=True)).data)
     assert known.ordered
     assert np.all(np.diff(known.clock) > 0)
     assert known.clock[-1] > 8 * APART
-    unknown = Session.of(started(recorded(tmp_path / "b")).problem.data)
+    unknown = Session.of(problem_of(recorded(tmp_path / "b")).data)
     assert not unknown.ordered
     assert len(unknown.labels) == RUNS
     runs = Case(4, (), PLAN).logged()
     runs = [change(r, t=r.columns["t"] + 0.01 * k) for k, r in enumerate(runs)]  # they overlap
     write_folder(tmp_path / "c", runs, rate=PLAN.rate)
-    assert not Session.of(started(read_csv(tmp_path / "c")).problem.data).ordered
+    assert not Session.of(problem_of(read_csv(tmp_path / "c")).data).ordered
     edges = unknown.edges.tolist()
     for a, b in unknown.pairs:
         span = Span("window", edges[a], edges[b])

@@ -12,7 +12,7 @@ from spinndrift.models.files.owned import MARKER
 from spinndrift.sims import demo_diagnosis
 from spinndrift.sims.demo import DEMO, EMBEDDED, demo, demo_folder
 from spinndrift.sims.diagnosis_folder import DIAGNOSIS
-from spinndrift.sims.reports import diagnosis_report
+from spinndrift.sims.reports import diagnosis_report, pages
 from spinndrift.sims.reports.pages import Page
 from spinndrift.sims.run.estimate import nees_words
 from spinndrift.sims.run.folder import RUN
@@ -96,6 +96,7 @@ def test_demo_tells_the_whole_story(tmp_path, monkeypatch):
     monkeypatch.setattr("spinndrift.sims.learning.starting_model", None)
     monkeypatch.setattr(demo_diagnosis.pipeline, "diagnose", None)
     monkeypatch.setattr("spinndrift.sims.demo.simulate", lambda *_: flown[0])
+    monkeypatch.setattr(pages, "_plot", lambda *_: "data:,")  # as they were drawn above
     report = (out / "dive" / "report.html").stat()
     checkpoint = (out / "training" / "checkpoint.npz").read_bytes()
     with demo_folder(out):

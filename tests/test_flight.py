@@ -106,7 +106,8 @@ def test_a_flight_holds_its_pose_and_leaves_the_vehicle_as_it_was(port: int, tmp
     for told in stretches:  # one, but for gaps of a busy computer, at the start also
         first = round((told.start - flown.start) / run.log.dt)
         apart = told.X_WB - flown.X_WB[first : first + len(told)]
-        assert np.abs(apart[:, :4]).max() < 0.05  # one dive, one clock, one W
+        # one dive, one clock, one W; single samples come late on a loaded machine
+        assert np.median(np.abs(apart[:, :4]).max(axis=1)) < 0.02
     assert sum(len(told) for told in stretches) > 0.5 * len(flown)
     with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:
         link.find_vehicle(15.0)

@@ -42,7 +42,8 @@ def stepped(
     return samples
 
 
-def consequences(samples: Samples, unseen: float = jnp.inf) -> jolts.Jolts:
+@jax.jit
+def consequences(samples: Samples, unseen: float | Array = jnp.inf) -> jolts.Jolts:
     return jolts.consequences(navigation(), samples, 0.0, jnp.asarray(unseen), GRAVITY)
 
 
@@ -101,16 +102,23 @@ def explained(
     samples: Samples, residuals: list[float], ages: float = 0.2, *, fault: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Of a state that is known well, with residuals of the three sensors' values."""
+    given = jnp.asarray(residuals, float), jnp.asarray(ages), jnp.asarray(fault)
+    passes, moves = _explained(samples, *given)
+    return np.asarray(passes), np.asarray(moves)
+
+
+@jax.jit
+def _explained(
+    samples: Samples, residuals: Array, ages: Array, fault: Array
+) -> tuple[Array, Array]:
     x, rate = navigation(), jnp.zeros(3)
     zero = [jnp.zeros(size) for size in sizes(AIDS)]
     right = jnp.split(-off(AIDS, x, rate, zero), np.cumsum(sizes(AIDS))[:-1])
-    shown = jnp.split(jnp.array(residuals), np.cumsum(sizes(AIDS))[:-1])
+    shown = jnp.split(residuals, np.cumsum(sizes(AIDS))[:-1])
     values = [a + b for a, b in zip(right, shown, strict=True)]
     found = innovations(AIDS, x, rate, jnp.zeros((3, 3)), values)
     P = 1e-6 * jnp.eye(ERRORS)
-    given = consequences(samples), jnp.full(3, ages), jnp.asarray(fault), GATES
-    passes, moves = jolts.explain(AIDS, found, P, *given)
-    return np.asarray(passes), np.asarray(moves)
+    return jolts.explain(AIDS, found, P, consequences(samples), jnp.full(3, ages), fault, GATES)
 
 
 X, FALL = jnp.array([1.0, 0, 0]), 0.2**2 / 2 * GRAVITY

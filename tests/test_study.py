@@ -228,6 +228,7 @@ def test_an_interrupted_task_leaves_a_checkpoint(quick, tmp_path):
     assert not (tmp_path / "rich" / "fdm-geodesic" / "seed-0").exists()
 
 
+@pytest.mark.slow
 def test_a_killed_study_goes_on_to_the_same_numbers(finished, quick, tmp_path, monkeypatch):
     given = ("study", "ablation", "--scale", "tiny", "--methods", "fdm-geodesic", "--regime")
     given = (*given, "rich", "--seeds", "1", "--out", tmp_path)

@@ -253,8 +253,7 @@ def learn(
     config = begun_with(config, given)
     hidden = None
     if recording.missing:
-        progress(0.0, "estimating what was not recorded")
-        hidden = HiddenStart.of(recording, vehicle, config, given)
+        hidden = _inferred(recording, vehicle, config, given, progress)
         given = hidden.model
         start = Start(given, name="fitted") if hidden.told else start
     parts = split_parts(recording, vehicle, config.windows, given, hidden and hidden.completed)
@@ -287,6 +286,21 @@ def learn(
     learned = _learned(models, start, parts, result, hidden)
     _save(learned, out, metadata)
     return learned
+
+
+def _inferred(
+    recording: Recording,
+    vehicle: Vehicle,
+    config: TrainingConfig,
+    given: Dynamics | None,
+    progress: Progress,
+) -> HiddenStart:
+    """The start of a recording that lacks channels; progress is counted anew after it."""
+    what = "estimating what was not recorded"
+    progress(0.0, what)
+    found = HiddenStart.of(recording, vehicle, config, given, lambda f: progress(f, what))
+    progress(0.0, "learning")
+    return found
 
 
 def _learned(

@@ -101,19 +101,28 @@ class _Lines:
         self._shown, self._tenth = False, 0
         self._first: tuple[float, float] | None = None
         self._starting = ""  # the remark printed since work started
+        self._pending = ""  # the one to print once lines are shown
 
     def show(self) -> None:
         self._shown = True
+        self._start(self._pending)
+
+    def _start(self, remark: str) -> None:
+        if remark and remark != self._starting:
+            self._out.print(f"{self._what}: {remark}")
+            self._starting = remark
+        self._pending = ""
 
     def update(self, fraction: float, remark: str = "", /) -> None:
         fraction, now = min(max(fraction, 0.0), 1.0), time.monotonic()
         if fraction <= 0:  # work starts or restarts
             self._tenth, self._first = 0, None
-            if self._shown and remark and remark != self._starting:
-                self._out.print(f"{self._what}: {remark}")
-                self._starting = remark
+            if self._shown:
+                self._start(remark)
+            else:
+                self._pending = remark
             return
-        self._starting = ""
+        self._starting = self._pending = ""
         if self._first is None:
             self._first = (now, fraction)
         if not self._shown or int(10 * fraction) <= self._tenth:

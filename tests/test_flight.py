@@ -48,9 +48,9 @@ PATIENT = (
 
 
 @contextmanager
-def vehicle() -> Iterator[tuple[int, subprocess.Popen]]:
-    """A served vehicle: its port, and its process."""
-    command = ["-m", "spinndrift", "vehicle", "station_keeping_calm"]
+def vehicle(out: Path) -> Iterator[tuple[int, subprocess.Popen]]:
+    """A served vehicle: its port, and its process; at its end the truth is in `out`."""
+    command = ["-m", "spinndrift", "vehicle", "station_keeping_calm", "--out", str(out)]
     served = subprocess.Popen(
         [sys.executable, *command, "--connection", "tcpin:127.0.0.1:0"],
         stderr=subprocess.PIPE,
@@ -66,9 +66,14 @@ def vehicle() -> Iterator[tuple[int, subprocess.Popen]]:
 
 
 @pytest.fixture(scope="module")
-def port() -> Iterator[int]:
-    with vehicle() as (port, _):
+def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """That of a served vehicle, which ends at a signal and leaves the truth."""
+    out = tmp_path_factory.mktemp("served") / "out"
+    with vehicle(out) as (port, served):
         yield port
+    assert served.returncode == 0
+    assert Recording.load(out / "truth.nc").dataset.sizes["time"] > 1
+    assert (out / "scenario.yaml").exists()
 
 
 @pytest.fixture(autouse=True)
@@ -192,7 +197,7 @@ def test_nothing_is_armed_without_being_asked(port: int):
 
 @pytest.mark.slow
 def test_a_vehicle_that_is_gone_for_good_leaves_a_log_that_says_so(tmp_path: Path):
-    with vehicle() as (port, served):
+    with vehicle(tmp_path / "served") as (port, served):
         base = scenario(port, 20.0)
         assert base.vehicle_link is not None
         safety = replace(base.vehicle_link.safety, silence=1.0, hold=2.0)

@@ -67,6 +67,17 @@ def test_what_starts_is_told_once_however_often_it_is_reported(soon):
     ]
 
 
+def test_what_started_before_the_first_line_is_told_with_it(soon):
+    out = io.StringIO()
+    with progress_bar("work", Console(file=out, width=100)) as update:
+        update(0.0, "reading")
+        update(0.0, "compiling")
+        time.sleep(0.2)
+        update(0.0, "compiling")
+        update(0.5)
+    assert [line for line in out.getvalue().splitlines() if "%" not in line] == ["work: compiling"]
+
+
 def test_a_terminal_gets_a_bar(soon):
     told = played(True, 0.3)
     assert "work" in told

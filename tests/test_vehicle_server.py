@@ -4,15 +4,12 @@ import os
 import pty
 import select
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 
 import pytest
 from served_vehicle import LIMIT, Served
 
-from spinndrift.models.recordings.store import Recording
 from spinndrift.systems.mavlink.dialect import Message, Parser, mavlink
 from spinndrift.systems.mavlink.link import Link
 from spinndrift.systems.mavlink.transport import Connection, Transport
@@ -141,25 +138,3 @@ def test_a_second_tcp_client_waits_and_takes_over(served: Served):
     finally:
         first.close()
         second.close()
-
-
-def test_the_command_serves_ends_at_a_signal_and_leaves_the_truth(tmp_path):
-    out = tmp_path / "served"
-    command = [sys.executable, "-m", "spinndrift", "vehicle", "station_keeping_calm"]
-    command += ["--connection", "tcpin:127.0.0.1:0", "--out", str(out)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    try:
-        assert process.stderr is not None
-        line = process.stderr.readline()
-        assert line.startswith("serving tcpin:127.0.0.1:")
-        transport = Connection.parse(f"tcp:127.0.0.1:{line.rsplit(':', 1)[1].strip()}").open()
-        Client(transport).until(lambda m: m.get_type() == "ATTITUDE")
-        transport.close()
-        process.terminate()
-        assert process.wait(LIMIT) == 0
-        process.stderr.close()
-    finally:
-        process.kill()
-        process.wait()
-    assert Recording.load(out / "truth.nc").dataset.sizes["time"] > 1
-    assert (out / "scenario.yaml").exists()

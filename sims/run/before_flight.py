@@ -11,7 +11,7 @@ import numpy as np
 from ...models.config.errors import UserError
 from ...models.sensors import Dvl
 from ...systems.mavlink import telemetry
-from ...systems.mavlink.codec import filter_delay
+from ...systems.mavlink.codec import low_pass_delays
 from ...systems.mavlink.config import Mavlink
 from ...systems.mavlink.driver import Driver
 from ...systems.mavlink.interface import RESOLUTION, unread
@@ -165,8 +165,7 @@ def _imu_latency(driver: Driver, scenario: Scenario, period: float, delay: float
     Those of a period are on either side, and the autopilot's low-passes delay them. It is at most
     what the other sensors' readings can wait.
     """
-    names = ("INS_ACCEL_FILTER", "INS_GYRO_FILTER")
-    filtered = max(filter_delay(driver.parameters.get(name, 0.0)) for name in names)
+    filtered = max(low_pass_delays(driver.parameters))
     sensors = scenario.station.sensing.sensors.values()
     aids = [each for each in sensors if each.observes is not None]
     waits = [1 / each.rate + each.latencies[0] - period for each in aids]

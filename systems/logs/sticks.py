@@ -33,7 +33,7 @@ _LAGS_S = np.arange(-0.1, 0.3001, 0.01)
 _RANGE_US = (1100.0, 1900.0)
 """Range of the outputs, or that of the samples where it is wider."""
 _STEP_S = 0.01
-"""Step of the outputs along sticks, which change within it."""
+"""Step of the outputs along demands, which change within it."""
 _DOUBT = 3.0
 """Standard errors from which on a coefficient or a difference is beyond doubt."""
 _FASTER = 1.5
@@ -121,17 +121,17 @@ def _along(
 
 
 def _curves(
-    outputs: Series, sticks: _Demands, modes: Sequence[Spans]
+    outputs: Series, demands: _Demands, modes: Sequence[Spans]
 ) -> tuple[Series, tuple[float, float]] | None:
-    """The outputs along sticks, and what every second sample misses them and lines by (µs, rms).
+    """The outputs along demands, and what every second sample misses them and lines by (µs, rms).
 
     None where no thruster follows these demands.
     """
-    groups = _groups(outputs, sticks, modes)
+    groups = _groups(outputs, demands, modes)
     if not groups:
         return None
-    lag = _lag(outputs, sticks, groups) if sticks.held else 0.0
-    late = sticks._replace(t=sticks.t + lag)
+    lag = _lag(outputs, demands, groups) if demands.held else 0.0
+    late = demands._replace(t=demands.t + lag)
     t = _times(outputs, late)
     x = np.stack([np.interp(t, outputs.t, u) for u in outputs.x])
     curve, line, count, all_follow = 0.0, 0.0, 0, True
@@ -153,7 +153,7 @@ def _curves(
     if curve == line:
         return None
     misses = (float(np.sqrt(curve / count)), float(np.sqrt(line / count)))
-    source, measured = f"{outputs.source} along {sticks.name}", 0.0 if all_follow else outputs.rate
+    source, measured = f"{outputs.source} along {demands.name}", 0.0 if all_follow else outputs.rate
     return Series(t, x, source, outputs.left_out, measured), misses
 
 
@@ -206,13 +206,13 @@ def _left(outputs: Series, sticks: _Demands, groups: Sequence[_Mode], lag: float
     return left
 
 
-def _groups(outputs: Series, sticks: _Demands, modes: Sequence[Spans]) -> list[_Mode]:
+def _groups(outputs: Series, demands: _Demands, modes: Sequence[Spans]) -> list[_Mode]:
     """The modes with enough samples for a map."""
-    covered = (outputs.t > sticks.t[0]) & (outputs.t < sticks.t[-1])
+    covered = (outputs.t > demands.t[0]) & (outputs.t < demands.t[-1])
     groups = []
     for inside in modes:
         rows = np.flatnonzero(_within(outputs.t, inside) & covered)
-        if rows.size >= _SAMPLES * len(sticks.s):
+        if rows.size >= _SAMPLES * len(demands.s):
             groups.append(_Mode(rows, inside))
     return groups
 
@@ -228,13 +228,13 @@ def _modes(states: Sequence[Spans]) -> list[Spans]:
     ]
 
 
-def _times(outputs: Series, sticks: _Demands) -> Float[np.ndarray, " k"]:
-    """A fine grid where neither sticks are silent nor samples are lost, and samples elsewhere."""
+def _times(outputs: Series, demands: _Demands) -> Float[np.ndarray, " k"]:
+    """A fine grid where neither demands are silent nor samples are lost, and samples elsewhere."""
     t = np.arange(outputs.t[0], outputs.t[-1], _STEP_S)
     step = np.diff(outputs.t)
     lost = np.flatnonzero(step > _LOST_PERIODS * np.median(step))
     gaps = [(outputs.t[i], outputs.t[i + 1]) for i in lost]
-    gaps += [(-np.inf, sticks.t[0]), *silences(sticks.t), (sticks.t[-1], np.inf)]
+    gaps += [(-np.inf, demands.t[0]), *silences(demands.t), (demands.t[-1], np.inf)]
     spans = _spans(gaps)
     own = outputs.t[_within(outputs.t, spans)]
     return np.unique(np.concatenate([t[~_within(t, spans)], own]))

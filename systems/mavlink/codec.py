@@ -8,7 +8,7 @@ ArduPilot: world N is north, east, down; body is forward, right, down; quaternio
 body to world; yaw is clockwise from north. Here: W is east, north, up; B is forward, left, up.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -143,6 +143,12 @@ def filter_delay(cutoff_hz: float) -> float:
     if not 1.0 <= cutoff_hz <= 500.0:
         return 0.0
     return float(np.sqrt(2.0) / (2 * np.pi * cutoff_hz))
+
+
+def low_pass_delays(parameters: Mapping[str, float]) -> tuple[float, float]:
+    """Delays (s) of the autopilot's low-passes on specific force and on body rates."""
+    force, rate = (parameters.get(name, 0.0) for name in ("INS_ACCEL_FILTER", "INS_GYRO_FILTER"))
+    return filter_delay(force), filter_delay(rate)
 
 
 def pascal_per_metre(specific_gravity: float = 1.0, density: float | None = None) -> float:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from ...models.sensors import Compass, DepthSensor, Dvl, Imu, Sensor
 from ..drake import drake_array, set_groups, value, value_or_none
 from . import telemetry
-from .codec import NEUTRAL_US, body_vector, filter_delay
+from .codec import NEUTRAL_US, body_vector, low_pass_delays
 from .driver import Acted, Driver
 from .inertial_samples import InertialSamples
 from .link import Received
@@ -167,9 +167,8 @@ class VehicleInterface(LeafSystem):
         """Take readings from `driver`; `epoch` is the local time (s) at the context's time 0."""
         self.end()
         self._driver, self._epoch, self._anchor = driver, epoch, anchor or Anchor()
-        names = ("INS_ACCEL_FILTER", "INS_GYRO_FILTER")
-        force, rate = (filter_delay(driver.parameters.get(name, 0.0)) for name in names)
-        self._samples, self._taken = InertialSamples(HELD * self.period, (force, rate)), {}
+        delays = low_pass_delays(driver.parameters)
+        self._samples, self._taken = InertialSamples(HELD * self.period, delays), {}
         self._sampled = time.monotonic()
         self._held.enter_context(driver.link.reading(self._inertial))
 

@@ -40,16 +40,21 @@ def with_refitted(
     velocity of a climb follows from it. Where velocities were not measured the problem is about
     those that agree with the coefficients that they lead to.
     """
-    base, first = believed(problem), _fitted(problem, how, progress)
     if not problem.data.latent:
-        return problem, base, first
-    for _ in range(_ALONG):
+        return problem, believed(problem), _fitted(problem, how, progress)
+    first = _fitted(problem, how, _part(progress, 0))
+    for number in range(1, _ALONG + 1):
         before = problem.data.V
         problem = problem.along(first.theta)
-        first = _fitted(problem, how, progress, first.theta)
+        first = _fitted(problem, how, _part(progress, number), first.theta)
         if np.std(problem.data.V - before) < _AGREE * np.std(before):
             break
     return problem, believed(problem), first
+
+
+def _part(progress: Callable[[float], None], number: int) -> Callable[[float], None]:
+    """Progress of a fit that is followed by others: each takes half of what is left."""
+    return lambda fraction: progress(1 - 0.5**number * (1 - fraction / 2))
 
 
 def _fitted(

@@ -1,6 +1,7 @@
 """The start of training on a recording that lacks channels of the state."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from ...models.config.errors import UserError
@@ -22,6 +23,8 @@ from .start import with_diffusion
 _log = logging.getLogger(__name__)
 _ROUNDS = 4
 """Gauss-Newton steps where levels of noise are known already."""
+_FIT = 0.9
+"""Share of the time that the fit of the coefficients takes, roughly."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,12 @@ class HiddenStart:
 
     @classmethod
     def of(
-        cls, recording: Recording, vehicle: Vehicle, config: TrainingConfig, given: Dynamics | None
+        cls,
+        recording: Recording,
+        vehicle: Vehicle,
+        config: TrainingConfig,
+        given: Dynamics | None,
+        progress: Callable[[float], None] = lambda fraction: None,
     ) -> "HiddenStart":
         """Fit to what is not held out.
 
@@ -69,9 +77,10 @@ class HiddenStart:
         noise = completed_as_it_is(rest, vehicle, vehicle.dynamics()).levels
         preset = vehicle.dynamics(noise.diffusion)
         if given is None or isinstance(given, FossenDynamics):
-            model, fitted = _fitted(rest, vehicle, given), True
+            model, fitted = _fitted(rest, vehicle, given, lambda f: progress(_FIT * f)), True
         else:
             model, fitted = given, False
+        progress(_FIT)
         levels = completed_as_it_is(rest, vehicle, model).levels
         told = told_by(rest, vehicle, model, vehicle.dynamics(), levels) if fitted else ()
         if not isinstance(core(model), Spinn):
@@ -102,11 +111,16 @@ class HiddenStart:
         )
 
 
-def _fitted(recording: Recording, vehicle: Vehicle, base: Dynamics | None) -> Extended:
+def _fitted(
+    recording: Recording,
+    vehicle: Vehicle,
+    base: Dynamics | None,
+    progress: Callable[[float], None],
+) -> Extended:
     """`base`, or the preset, with all coefficients fitted; without enough data as it is."""
     own = vehicle.dynamics() if base is None else base
     try:
-        return cast(fit_coefficients(recording, vehicle, own), own.rigid_inertia.dtype)
+        return cast(fit_coefficients(recording, vehicle, own, progress), own.rigid_inertia.dtype)
     except UserError as error:
         _log.warning(f"coefficients stay as they were: {error}")
     return Extended.create(own, (), vehicle.thrusters())

@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 from ..models.config.errors import UserError
 from ..models.files.atomic import DISK_ERRORS
-from ..models.files.interrupts import interrupts_held
+from ..models.files.interrupts import interrupts_held, interrupts_kept
 
 _DESCRIPTION = """Learned stochastic dynamics and control for underwater vehicles.
 
@@ -33,7 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command; exit code 2 and one sentence for bad input, 130 after Ctrl-C."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        _run(given)
+        with interrupts_kept():
+            _run(given)
     except UserError as error:
         _fail(f"spinndrift: {error}", 2)
     except KeyboardInterrupt:

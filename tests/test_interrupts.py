@@ -1,13 +1,16 @@
 """Ctrl-C at a moment of one's choice."""
 
 import ast
+import gc
 import signal
+import sys
 import threading
+import time
 
 import pytest
 
 from helpers import module_files
-from spinndrift.models.files.interrupts import interrupt_noted, interrupts_held
+from spinndrift.models.files.interrupts import interrupt_noted, interrupts_held, interrupts_kept
 
 
 def press() -> None:
@@ -28,6 +31,33 @@ def test_a_held_interrupt_comes_after_the_block():
         work()
     assert done == ["block"]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_an_interrupt_that_a_callback_of_the_garbage_collector_loses_comes_again():
+    presses = []
+
+    def callback(phase: str, info: dict[str, int]) -> None:
+        if not presses:
+            presses.append(phase)
+            press()  # as if it came while JAX's own callback runs
+
+    def work() -> None:
+        with interrupts_kept():
+            gc.collect()
+            presses.append("lost")  # else this line is not reached
+            time.sleep(30.0)
+
+    before, start = sys.unraisablehook, time.monotonic()
+    gc.callbacks.append(callback)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            work()
+    finally:
+        gc.callbacks.remove(callback)
+    assert presses == ["start", "lost"]
+    assert time.monotonic() - start < 15.0
+    assert sys.unraisablehook is before
 
 
 @pytest.mark.usefixtures("interruptible")

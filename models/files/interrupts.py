@@ -1,14 +1,19 @@
 """Ctrl-C at a moment of one's choice.
 
-Both contexts act in the main thread alone, where Python delivers signals. If the caller ignores
+All contexts act in the main thread alone, where Python delivers signals. If the caller ignores
 Ctrl-C, as shells do for background jobs, it stays ignored.
 """
 
+import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+
+_AGAIN = 0.05
+"""Time (s) after which a lost Ctrl-C is repeated."""
 
 
 @contextmanager
@@ -22,6 +27,28 @@ def interrupts_held() -> Iterator[None]:
         yield
     if came:
         signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def interrupts_kept() -> Iterator[None]:
+    """Repeat a Ctrl-C that is lost in the block.
+
+    Python ignores what is raised in callbacks of its garbage collector, of which JAX has one, and
+    in finalizers: it only tells `sys.unraisablehook`.
+    """
+    before = sys.unraisablehook
+
+    def hook(lost: "sys.UnraisableHookArgs") -> None:
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            threading.Timer(_AGAIN, os.kill, (os.getpid(), signal.SIGINT)).start()
+        else:
+            before(lost)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 @contextmanager

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 from helpers import ROOT
-from spinndrift.sims.compile_cache import compiled_environment
 
 _DIE = """
 import os, signal, sys
@@ -33,10 +32,9 @@ def killed(name: str, times: int, prepare: str, *arguments: object) -> None:
     `prepare` is run before it, to put what compiles fast in place of what does not.
     """
     paths = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | compiled_environment()
     done = subprocess.run(
         [sys.executable, "-c", _DIE, name, str(times), prepare, *map(str, arguments)],
-        env=environment | {"PYTHONPATH": paths, "JAX_NUM_CPU_DEVICES": "1"},
+        env=os.environ | {"PYTHONPATH": paths},
         capture_output=True,
         text=True,
         timeout=300,

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from . import se3
 from .dynamics import Coefficients, Dynamics
+from .growth import Growth
 from .spd import ConstantOperator, ConstantSpd, Spd
 
 GRAVITY = 9.80665
@@ -27,7 +28,7 @@ def spatial_inertia(
 
 
 class FossenDynamics(Dynamics):
-    """M = M_RB + M_A, D, D^f, weight and buoyancy, all constant; b constant.
+    """M = M_RB + M_A, D, D^f, weight and buoyancy, all constant; b constant or growing with speed.
 
     With a diagonal `quadratic_drag` the fluid drag is Fossen's D_n(ν)ν = diag(d_i |ν_i|) ν.
 
@@ -47,6 +48,8 @@ class FossenDynamics(Dynamics):
     weight: Float[Array, ""]
     buoyancy: Float[Array, ""]
     p_BoBcm_B: Float[Array, "3"]
+    growth: Growth | None = None
+    """Of `diffusion` with the twist."""
 
     def __init__(
         self,
@@ -61,6 +64,7 @@ class FossenDynamics(Dynamics):
         p_BoCb_B: Float[np.ndarray, "3"],
         displaced_mass: float | None = None,
         diffusion: Float[np.ndarray, "6"] | None = None,
+        growth: Growth | None = None,
         dtype: jnp.dtype | type = float,
     ):
         """SI units: kg, m, N, N·s/m, N·s²/m²; `displaced_mass` ρ∇ defaults to buoyancy / g.
@@ -86,6 +90,7 @@ class FossenDynamics(Dynamics):
         self.linear_drag = ConstantOperator(jnp.asarray(linear_drag, dtype))
         self.quadratic_drag = ConstantOperator(jnp.asarray(quadratic_drag, dtype))
         self.diffusion = jnp.asarray(b, dtype)
+        self.growth = growth
         self.weight = jnp.asarray(weight, dtype)
         self.buoyancy = jnp.asarray(buoyancy, dtype)
 
@@ -103,15 +108,22 @@ class FossenDynamics(Dynamics):
             "p_BoCb_B": np.asarray(self.p_BoCb_B, float),
             "displaced_mass": float(self.displaced_mass),
             "diffusion": np.asarray(self.diffusion, float),
+            "growth": self.growth,
             "dtype": self.rigid_inertia.dtype,
         }
         return FossenDynamics(**(own | changed))
 
     def coefficients(self, V_WB_B: Float[Array, "6 *#batch"]) -> Coefficients:
-        return Coefficients(self.mass, self.linear_drag, self.quadratic_drag, self.diffusion)
+        b = self._diffusion(V_WB_B)
+        return Coefficients(self.mass, self.linear_drag, self.quadratic_drag, b)
 
     def mass_and_diffusion(self, V_WB_B: Float[Array, "6 *#batch"]) -> tuple[Spd, Array]:
-        return self.mass, self.diffusion
+        return self.mass, self._diffusion(V_WB_B)
+
+    def _diffusion(self, V_WB_B: Array) -> Array:
+        if self.growth is None:
+            return self.diffusion
+        return self.growth(self.diffusion, V_WB_B)
 
     def potential(self, X_WB: Float[Array, "7 *#batch"]) -> Float[Array, "*#batch"]:
         """Weight × height of the centre of mass - buoyancy × height of the centre of buoyancy."""

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from .config.checks import Vector6, check_numbers, require
 from .distance_aware import DiffusionKind, DistanceAware
 from .dynamics import Coefficients, Dynamics
+from .growth import Growth
 from .mean_reverting import MeanReverting
 from .networks import ACTIVATIONS, Activation, Heads, MlpStack, expand
 from .potential import BoundedScalar, GravityPotential, PosePotential, Potential, PotentialKind
@@ -53,6 +54,8 @@ class SpinnConfig:
     """The noise's axes are correlated: b C(ξ) dW, C lower triangular with rows of length one."""
     mean_reverting: bool = False
     """A second, Ornstein–Uhlenbeck disturbance, whose time constants are learned."""
+    growing: bool = False
+    """The scale of b grows with the twist, as calibration finds it (`Growth`)."""
     coordinates: Literal["group", "euler"] = "group"
     """State on SE(3), or position and Euler angles in R¹² as in baselines (`EuclideanSpinn`).
     """
@@ -76,6 +79,8 @@ class SpinnConfig:
         plain = not self.correlated or (self.stochastic and self.diffusion == "network")
         require(plain, self, "correlated", "leave it out, or let b be a network of its own")
         require(self.coordinates in ("group", "euler"), self, "coordinates", "use group or euler")
+        plain = not self.growing or (self.stochastic and self.diffusion == "network")
+        require(plain, self, "growing", "leave it out, or let b be a network of its own")
         plain = not self.mean_reverting or (self.stochastic and self.coordinates == "group")
         require(
             plain, self, "mean_reverting", "leave it out, or use a stochastic model on the group"
@@ -92,6 +97,8 @@ class Scales(eqx.Module):
     """S with S Sᵀ the magnitudes of M, D, D^f: Cholesky factors of the reference's."""
     inverse_roots: Float[Array, "3 6 6"]
     diffusion: Float[Array, "6"]
+    growth: Growth | None = None
+    """Of `diffusion` with the twist."""
 
 
 class Spinn(Dynamics):
@@ -151,6 +158,7 @@ class Spinn(Dynamics):
             roots=jnp.asarray(roots, dtype),
             inverse_roots=jnp.asarray(np.linalg.inv(roots), dtype),
             diffusion=jnp.asarray(np.where(b > 0, b, 0.05 * drag), dtype),
+            growth=Growth.none(dtype) if config.growing else None,
         )
         variable = jnp.zeros((2 if config.constant_mass else 3, PACKED), dtype)
         network_key, potential_key = jax.random.split(key)
@@ -214,7 +222,10 @@ class Spinn(Dynamics):
             return self
         own = self.scales.diffusion
         b = jnp.sqrt(own**2 + self.lasting.white(own) ** 2)
-        scales = replace(self.scales, diffusion=b)
+        growth = self.scales.growth
+        if growth is not None:
+            growth = replace(growth, rate=growth.rate * (own / b)[:, None] ** 2)
+        scales = replace(self.scales, diffusion=b, growth=growth)
         config = replace(self.config, mean_reverting=False)
         return replace(self, config=config, scales=scales, lasting=None)
 
@@ -258,7 +269,7 @@ class Spinn(Dynamics):
         return self.hidden(self.scaled_velocity(V_WB_B), count)
 
     def _diffusion(self, V_WB_B: Array, features: Array) -> Array:
-        scale = jax.lax.stop_gradient(self.scales.diffusion)
+        scale = self._diffusion_scale(V_WB_B)
         if self.distance_aware is not None:
             factor = self.distance_aware(self.scaled_velocity(V_WB_B))
             return expand(scale, factor.ndim) * factor
@@ -266,6 +277,13 @@ class Spinn(Dynamics):
             return jnp.zeros_like(scale)
         raw = self.diffusion_head(features[:1], 1)[0, :6]
         return expand(scale, raw.ndim) * squareplus(raw)
+
+    def _diffusion_scale(self, V_WB_B: Array) -> Array:
+        """The factor of b's network: constant, or growing with the twist."""
+        scales = jax.lax.stop_gradient(self.scales)
+        if scales.growth is None:
+            return scales.diffusion
+        return scales.growth(scales.diffusion, V_WB_B)
 
     def correlate(
         self, V_WB_B: Float[Array, "6 *#batch"], dW: Float[Array, "6 *#batch"]

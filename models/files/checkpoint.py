@@ -22,6 +22,7 @@ from ..effects.base import Effect
 from ..effects.extended import Extended
 from ..effects.library import kind
 from ..euclidean import EuclideanSpinn, create_spinn
+from ..growth import Growth
 from ..integrate import cast
 from ..rigid_body import FossenDynamics
 from ..spinn import Spinn, SpinnConfig
@@ -201,7 +202,16 @@ def _spinn(config: dict[str, Any]) -> Spinn:
     return create_spinn(made, _unit_body(), jax.random.key(0), jnp.float32)
 
 
-register(FossenDynamics, lambda _: {}, lambda _: cast(_unit_body(), jnp.float32))
+def _describe_fossen(model: FossenDynamics) -> dict[str, Any]:
+    return {} if model.growth is None else {"growing": True}
+
+
+def _fossen(config: dict[str, Any]) -> FossenDynamics:
+    growth = Growth.none() if config.get("growing", False) else None
+    return cast(_unit_body().with_constants(growth=growth), jnp.float32)
+
+
+register(FossenDynamics, _describe_fossen, _fossen)
 for _kind in (Spinn, EuclideanSpinn):
     register(_kind, lambda model: dataclasses.asdict(model.config), _spinn)
 

@@ -18,9 +18,8 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, System
 
 from ...models.config.checks import Vector6, check_numbers, require
 from ...models.dynamics import Dynamics
-from ...models.effects.extended import Extended, core
 from ...models.files.checkpoint import load_model
-from ...models.spinn import Spinn
+from ...models.lasting import whitened
 from ...models.vehicles.vehicle import load_vehicle
 from ..estimation.disturbance_observer import DisturbanceObserver, MomentumObserver
 from ..own import OwnSystem, check_ports, port_sizes
@@ -240,9 +239,7 @@ class MppiImpedance(Controller):
         """The model to plan with and its checkpoint's metadata."""
         if self.model is not None:
             model, metadata = load_model(self.model, float)
-            own = core(model)
-            white = own.whitened() if isinstance(own, Spinn) else own
-            return (model.with_base(white) if isinstance(model, Extended) else white), metadata
+            return whitened(model), metadata
         vehicle = load_vehicle(self.vehicle or station.vehicle)
         return vehicle.dynamics(np.array(self.diffusion)), {}
 

@@ -10,14 +10,14 @@ from jaxtyping import Float
 
 from ...models.config.checks import Vector6, check_numbers, require
 from ...models.config.errors import UserError
-from ...models.disturbances import Combined, Kind, OrnsteinUhlenbeckWrench, preset
+from ...models.disturbances import Combined, Kind, preset
 from ...models.dynamics import Dynamics
 from ...models.effects.effect_config import EffectConfig, check_distinct
 from ...models.effects.extended import Extended, core
 from ...models.files.checkpoint import load_model
+from ...models.lasting import lasting_wrench
 from ...models.sensors import SHIPPED, Compass, DepthSensor, Dvl, Imu, Sensor, SensorFault
 from ...models.sensors import Kind as SensorKind
-from ...models.spinn import Spinn
 from ...models.vehicles.vehicle import Vehicle, load_vehicle
 from ..estimation.config import EkfConfig
 from ..own import Offered, OwnFilter, OwnSensor
@@ -186,11 +186,7 @@ class StationConfig:
         """
         members = (*preset(self.disturbance_set).members, *self.disturbances)
         if self.model is not None:
-            model = core(load_model(self.model, float)[0])
-            if isinstance(model, Spinn) and model.lasting is not None:
-                std = np.asarray(model.lasting.std(model.scales.diffusion)).tolist()
-                time = np.asarray(model.lasting.time_constant).tolist()
-                members += (OrnsteinUhlenbeckWrench(tuple(std), tuple(time)),)
+            members += lasting_wrench(load_model(self.model, float)[0])
         return Combined(members)
 
     def initial_state(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6"]]:

@@ -12,6 +12,7 @@ from ...models.config.checks import SECONDS, SEED, Vector6, Within, check_number
 from ...models.disturbances.base import Disturbance
 from ...models.dynamics import Dynamics, Flow
 from ...models.integrate import step
+from ...models.lasting import lasting_wrench
 from ...models.recordings.build import Trajectory
 from ...models.recordings.store import Recording
 from ...models.vehicles.vehicle import Vehicle
@@ -60,7 +61,8 @@ def generate(
 ) -> Recording:
     """Simulate every maneuver `trajectories` times from rest, under noise and disturbances.
 
-    The vehicle is `dynamics`, or the preset with the configured diffusion. Thruster limits apply;
+    The vehicle is `dynamics`, with the lasting wrench of a learned model, or the preset with the
+    configured diffusion. Thruster limits apply;
     there is no lag. All trajectories run as one batch with independent noise; equal seeds give
     equal recordings.
 
@@ -76,6 +78,7 @@ def generate(
     dtype = jnp.result_type(float)
     if dynamics is None:
         dynamics = vehicle.dynamics(np.asarray(config.diffusion), dtype)
+    disturbances = (*disturbances, *lasting_wrench(dynamics))
     thrusters = vehicle.thrusters(dtype)
     commands = [maneuver_wrench(name, thrusters, config.effort) for name in config.maneuvers]
     K = config.trajectories

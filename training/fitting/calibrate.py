@@ -4,10 +4,12 @@ A median of errors does not know their tails, and errors on the windows that the
 are smaller than on others, so that bands of a b from there alone are too narrow. Validation windows
 are honest but few. Both sets count alike: on each axis two factors of b are found, at which the
 central bands of 50 and of 90 % of predicted pose and velocity hold their shares, on average over
-both sets and all horizons; b is scaled by their geometric mean.
+both sets and all horizons; b is scaled by their geometric mean. Before that b is let grow with
+speed as far as errors do (`noise_growth`): no constant b holds both bands then.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -24,7 +26,8 @@ from ..data.windows import Windows
 from ..evaluation.metrics import BANDS, displacement, order_statistics
 from ..losses.base import Batch
 from ..predict import predict
-from .start import diffusion_scale, with_diffusion
+from .noise_growth import TERMS, Spread, Twists, can_grow, sizes, with_growth
+from .start import NORMAL_QUARTILE, diffusion_scale, with_diffusion
 
 Model = TypeVar("Model", bound=Dynamics)
 
@@ -33,10 +36,16 @@ _ROUNDS = 2
 """Spreads are nearly proportional to b, so that a second round is a small correction."""
 _MOST = 4.0
 """Largest factor of a round."""
+_SMALL = 0.1
+_NOTHING = 1e-6
+"""Size of a constant term that is left out."""
 
 
 def calibrated(model: Model, sets: Sequence[Windows], substeps: int, seed: int = 0) -> Model:
     """The model with b scaled, axis by axis, so that its bands hold their shares of the windows.
+
+    The b of a constant model, or of a SPINN with a network for it, also grows with the twist as far
+    as errors do.
 
     Each of the `sets` counts alike, whatever its size. A model without diffusion is returned as it
     is, and so is the b of an axis whose pose and velocity nobody has measured or whose motion
@@ -47,10 +56,38 @@ def calibrated(model: Model, sets: Sequence[Windows], substeps: int, seed: int =
         return model
     if not np.all(diffusion_scale(model) > 0):
         return model
+    sets = [one.thin(_WINDOWS) for one in sets]
+    if can_grow(model):
+        twists = Twists.of(sets)
+        terms = [_by_term(model, one, substeps, seed, twists) for one in sets]
+        model = with_growth(model, sizes(terms), twists)
     for _ in range(_ROUNDS):
-        spreads = [_spreads(model, one.thin(_WINDOWS), substeps, seed) for one in sets]
+        spreads = [_spreads(model, one, substeps, seed) for one in sets]
         model = with_diffusion(model, diffusion_scale(model) * _factors(spreads))
     return model
+
+
+def _by_term(model: Dynamics, windows: Windows, substeps: int, seed: int, twists: Twists) -> Spread:
+    """The spread by each term of b² alone, for small noise: a tenth of the model's own b²."""
+
+    def variance(size: np.ndarray, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
+        size = _SMALL * np.tile(size, (6, 1))
+        size[:, 0] = np.maximum(size[:, 0], _NOTHING)
+        e, y = _spreads(with_growth(model, size, twists), windows, substeps, seed)
+        low, high = order_statistics(e.shape[2], 0.5)
+        # by quartiles, as single samples may run away
+        std = (e[:, :, high] - e[:, :, low]).astype(float) / (2 * NORMAL_QUARTILE)
+        return std**2, y
+
+    known, hidden = windows, windows.hidden
+    if hidden is not None:
+        known = replace(windows, hidden=hidden._replace(spread=np.zeros_like(hidden.spread)))
+    drawn = [variance(term, known) for term in np.eye(TERMS)]
+    terms, observed = np.stack([one for one, _ in drawn]) / _SMALL, drawn[0][1]
+    start = np.zeros_like(terms[0])
+    if hidden is not None:
+        start, _ = variance(np.zeros(TERMS), windows)
+    return Spread(start, terms, observed)
 
 
 def _spreads(

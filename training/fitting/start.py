@@ -30,7 +30,7 @@ from .pretrain import fit_potential, pretrain
 
 Model = TypeVar("Model", bound=Dynamics)
 
-_NORMAL_QUARTILE = 0.6744897501960817
+NORMAL_QUARTILE = 0.6744897501960817
 
 
 def estimate_diffusion(
@@ -55,7 +55,7 @@ def estimate_diffusion(
     def spread(difference: Float[Array, "6 W"]) -> Float[np.ndarray, "6"]:
         miss = np.abs(M @ np.asarray(difference, np.float64))
         miss = miss[:, np.isfinite(miss).all(axis=0)]
-        return np.median(miss, axis=1) / _NORMAL_QUARTILE if miss.size else np.zeros(6)
+        return np.median(miss, axis=1) / NORMAL_QUARTILE if miss.size else np.zeros(6)
 
     _, V = eqx.filter_jit(predict_drift)(dynamics, *start, **given)
     missed = spread(batch.V[-1] - V[-1])

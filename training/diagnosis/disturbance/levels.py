@@ -21,8 +21,11 @@ LEVEL = DisturbanceLevel.name
 
 
 def believed_levels(problem: DiagnosisProblem) -> Float[np.ndarray, "6"]:
-    """Diffusion b of the believed model; zero where it has none."""
-    return np.array(problem.model.base.mass_and_diffusion(jnp.zeros(6))[1])
+    """Diffusion b of the believed model, its root mean square in the runs; zero without any."""
+    data = problem.data
+    V = np.moveaxis(data.V[:-1], 1, 0)[:, data.weight > 0]
+    b = np.asarray(problem.model.base.mass_and_diffusion(jnp.asarray(V))[1])
+    return np.sqrt(np.mean(b.reshape(6, -1) ** 2, axis=1))
 
 
 def find_levels(problem: DiagnosisProblem, evaluation: Evaluation, least: float) -> list[Law]:

@@ -12,9 +12,10 @@ from jaxtyping import Array, Bool, Float
 from ....models.config.checks import require_double
 from ....models.dynamics import Dynamics
 from ....models.effects.base import Effect
-from ....models.effects.extended import Extended
+from ....models.effects.extended import Extended, core
 from ....models.effects.library import KINDS, Library, kind
 from ....models.effects.traits import Region
+from ....models.lasting import whitened
 from ....models.recordings.store import Recording
 from ....models.vehicles.vehicle import Vehicle
 from ..data.arrays import Data, make_data
@@ -101,7 +102,7 @@ class DiagnosisProblem:
         without: Sequence[int] = (),
         beside: Data | None = None,
     ) -> "DiagnosisProblem":
-        """The problem of `base` (default: the vehicle's preset), `without` the faulty runs.
+        """The problem of `base` (or the preset), its noise made white, `without` the faulty runs.
 
         With data `beside` these, effects that depend on the place refer to the region of both.
 
@@ -110,12 +111,11 @@ class DiagnosisProblem:
         """
         require_double("a diagnosis computes", "anything of it is made")
         data = make_data(recording, vehicle, without=without)
-        believed = vehicle.dynamics() if base is None else base
+        believed = whitened(vehicle.dynamics() if base is None else base)
         effects = believed.effects if isinstance(believed, Extended) else ()
-        core = believed.base if isinstance(believed, Extended) else believed
         region = data.region if beside is None else data.region.with_other(beside.region)
         library, theta = _library(data, effects, region)
-        model = Extended.create(core, (), vehicle.thrusters())
+        model = Extended.create(core(believed), (), vehicle.thrusters())
         data = with_latent(data, model, library, theta)
         return cls(data, vehicle, model, library, theta)
 

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, cached_property
 from itertools import accumulate, pairwise
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...models.config import checks
+from .structure import structure
 
 _INLINE = {
     "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
@@ -47,6 +48,10 @@ class Program:
 _PROGRAMS: WeakValueDictionary[bytes, Program] = WeakValueDictionary()
 _RECENT: deque[Program] = deque(maxlen=8)
 """Programs kept alive for later functions of the same text, without other references to them."""
+
+
+_BY_STRUCTURE: WeakValueDictionary[Hashable, Program] = WeakValueDictionary()
+"""Programs by the structure of functions, so that equal ones need not be traced again."""
 
 
 class Lowered:
@@ -119,7 +124,8 @@ class VectorFunction:
     (parameters, configurations) become constants of the compiled code. Compilation happens at the
     first call, so that building a diagram is cheap; diagrams with equal functions share the
     compiled program, so that many runs cost one compilation (and the memory of one: systems with
-    ports are never freed by pydrake).
+    ports are never freed by pydrake). Functions of the same code and equal values are not even
+    traced again (`structure`).
     """
 
     def __init__(
@@ -154,7 +160,8 @@ class VectorFunction:
 
     @cached_property
     def _program(self) -> Program:
-        return compiled(self._lowered(), keep=self._keep)[0]
+        self.compile(self)
+        return vars(self)["_program"]
 
     def _lowered(self) -> Lowered:
         return Lowered(self._packed, jax.ShapeDtypeStruct((sum(self._inputs),), np.float64))
@@ -163,9 +170,20 @@ class VectorFunction:
     def compile(*functions: "VectorFunction") -> None:
         """Compile functions now, in parallel, so that no call has to wait for it."""
         waiting = [one for one in functions if "_program" not in vars(one)]
-        programs = compiled(*(one._lowered() for one in waiting))
-        for one, program in zip(waiting, programs, strict=True):
+        keys = [(structure(one._function), one._inputs, one._outputs) for one in waiting]
+        found = {key: program for key in keys if (program := _BY_STRUCTURE.get(key)) is not None}
+        # of equal ones the first is traced; those without a structure are all
+        first = {
+            key if key[0] is not None else (one,): one
+            for key, one in zip(reversed(keys), reversed(waiting), strict=True)
+            if key not in found
+        }
+        made = dict(zip(first, compiled(*(one._lowered() for one in first.values())), strict=True))
+        for one, key in zip(waiting, keys, strict=True):
+            program = found.get(key) or made[key if key[0] is not None else (one,)]
             vars(one)["_program"] = program
+            if key[0] is not None:
+                _BY_STRUCTURE[key] = program
             if one._keep:
                 _RECENT.append(program)
 

@@ -160,6 +160,7 @@ class LearnedPlant(LeafSystem):
         h = period / substeps
 
         effects = self._effects
+        nominal = self._nominal if thrusters is not None else np.ones(1)
         lags = effects is None or not effects.lags
 
         def turn(pwm: Array, voltage: Array, bank: Array) -> tuple[Array, Array]:
@@ -193,7 +194,7 @@ class LearnedPlant(LeafSystem):
             else:
                 level = effects.model.inverse @ F
                 level = level if force is None else level + force
-                volts = bank[0][-1:] / self._nominal if bank else None
+                volts = bank[0][-1:] / nominal if bank else None
                 kept = more[-1] if effects.start.size else jnp.zeros(0)
                 X, V, kept = effects(X, V, kept, level, volts, F_disturbance, noise, water)
                 carried = (kept,) if effects.start.size else ()

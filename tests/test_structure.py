@@ -1,0 +1,162 @@
+"""Functions of the same code and equal values are one program; others are not taken for it."""
+
+import functools
+import math
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pydrake.systems.primitives import Adder
+
+from spinndrift.systems.compiled.jit import VectorFunction
+from spinndrift.systems.compiled.structure import structure
+
+pytestmark = pytest.mark.whole
+
+SIZE = 2.0
+
+
+@dataclass(frozen=True)
+class Settings:
+    gain: float
+    names: tuple[str, ...] = ("a",)
+
+
+class Model(eqx.Module):
+    weight: jax.Array
+    settings: Settings
+
+    def __call__(self, x):
+        return self.weight * x
+
+
+class Holder:
+    def __init__(self, value):
+        self.value = value
+
+    def call(self, x):
+        return x if self.value is None else x * 2
+
+
+def scaled(value, more=1.0):
+    def call(x, y=more):
+        def inner(z):
+            return z * SIZE
+
+        return inner(x) + y if isinstance(value, str) else jnp.sum(jnp.asarray(x)) + y
+
+    held = value
+
+    def outer(x):
+        return call(x), held
+
+    return outer
+
+
+VALUES = [
+    1,
+    1.0,
+    True,
+    0.0,
+    -0.0,
+    math.nan,
+    None,
+    "1",
+    b"1",
+    (1, 2),
+    [1, 2],
+    (1, (2,)),
+    {"a": 1},
+    {"b": 1},
+    frozenset({1}),
+    np.ones(2),
+    np.ones(2, np.float32),
+    np.ones((2, 1)),
+    np.array([0.0, -0.0]),
+    np.array([-0.0, 0.0]),
+    Settings(1.0),
+    Settings(1.0, ("b",)),
+    np.float64,
+    np.float32,
+    functools.partial(max, 1),
+    functools.partial(max, 2),
+    slice(1, 2),
+]
+
+
+def test_equal_values_make_equal_keys_and_different_ones_do_not():
+    again = [*VALUES[:15], *(np.array(v) if isinstance(v, np.ndarray) else v for v in VALUES[15:])]
+    keys = [structure(scaled(value)) for value in VALUES]
+    assert None not in keys
+    assert [structure(scaled(value)) for value in again] == keys
+    assert len(set(keys)) == len(keys)
+    assert structure(scaled(1, more=2.0)) != keys[0]
+    arrays = [structure(scaled(jnp.asarray(x))) for x in ([1.0, 2.0], [1.0, 2.5], [1.0, 2.0])]
+    assert arrays[0] == arrays[2] != arrays[1]
+    random = [structure(scaled(jax.random.key(n))) for n in (0, 1, 0)]
+    assert random[0] == random[2] != random[1]
+
+
+def test_models_and_methods_are_compared_by_what_is_in_them():
+    made = [
+        Model(jnp.full(2, w), Settings(g))
+        for w, g in ((1.0, 1.0), (1.0, 1.0), (2.0, 1.0), (1.0, 2.0))
+    ]
+    keys = [structure(model.__call__) for model in made]
+    assert keys[0] == keys[1]
+    assert len(set(keys)) == 3
+
+
+def test_what_a_function_names_of_its_module_counts(monkeypatch):
+    before = structure(scaled("a"))
+    monkeypatch.setitem(globals(), "SIZE", 3.0)
+    assert structure(scaled("a")) != before
+    monkeypatch.setitem(globals(), "SIZE", 2.0)
+    assert structure(scaled("a")) == before
+
+
+@pytest.mark.parametrize("unknown", [object(), Adder(1, 1), Holder(1), (Adder(1, 1),)])
+def test_unknown_values_have_no_key(unknown):
+    assert structure(scaled(unknown)) is None
+
+
+def test_a_circle_ends():
+    circle: list = [1]
+    circle.append(circle)
+    assert structure(scaled(circle)) == structure(scaled(circle)) is not None
+
+
+def test_an_equal_function_is_not_traced_again():
+    traced = []
+
+    def function(gain, told=True):
+        if not told:  # a list that grows is another value each time
+            return lambda x: gain * x
+        return lambda x: (traced.append(1), gain * x)[1]
+
+    def called(gain, told):
+        return VectorFunction(function(gain, told), [2], [2])(np.ones(2))[0].tolist()
+
+    first = VectorFunction(function(3.0, False), [2], [2])
+    assert first(np.ones(2))[0].tolist() == [3.0, 3.0]
+    program = first._program
+    assert VectorFunction(function(3.0, False), [2], [2])._program is program
+    assert called(4.0, False) == [4.0, 4.0]
+    assert called(3.0, False) == [3.0, 3.0]
+    assert called(3.0, True) == called(3.0, True) == [3.0, 3.0]
+    assert len(traced) == 2
+    # sizes count, too
+    assert VectorFunction(function(3.0, False), [3], [3])(np.ones(3))[0].tolist() == [3.0] * 3
+
+
+def test_equal_functions_among_others_compile_at_once():
+    gains = [1.0, 2.0, 1.0, 3.0, 2.0]
+    made = [VectorFunction(lambda x, g=g: g * x, [1], [1]) for g in gains]
+    own = Holder(None)
+    made += [VectorFunction(own.call, [1], [1]), VectorFunction(Holder(1).call, [1], [1])]
+    VectorFunction.compile(*made)
+    assert [f(np.ones(1))[0].item() for f in made] == [*gains, 1.0, 2.0]
+    assert len({id(f._program) for f in made}) == 5

@@ -149,6 +149,7 @@ def test_thrust_that_a_refit_takes_away_or_turns_is_the_finding(share):
     assert verdict((), [said]) == "unexplained"
 
 
+@pytest.mark.slow
 def test_forecasts_alone_have_the_errors_of_a_whole_judgement():
     vehicle = load_vehicle("bluerov2_heavy")
     made = GenerateConfig(("surge-forward", "yaw-left"), trajectories=2, duration=3.0)

@@ -55,6 +55,7 @@ def test_one_noise_is_a_models_own_where_both_have_the_same(problem):
     np.testing.assert_allclose(z, evaluation.z, atol=2e-3)  # the look's are of single precision
 
 
+@pytest.mark.slow
 def test_a_wrong_belief_is_larger_than_noise_in_the_noise_of_a_right_one(problem):
     theta = problem.believed.copy()
     theta[problem.library.at("thrust_scale", "all")] = 0.4

@@ -13,7 +13,7 @@ from spinndrift.models.config.errors import UserError
 
 pytestmark = pytest.mark.whole
 
-COUNT = 200
+COUNT = 100
 FRAMES = 60
 """Inputs of twenty frames each."""
 BAGS = 30

@@ -12,6 +12,7 @@ from spinndrift.models.files.checkpoint import load_model, save_model
 from spinndrift.models.rigid_body import FossenDynamics
 from spinndrift.models.spinn import Spinn, SpinnConfig
 from spinndrift.models.vehicles.vehicle import load_vehicle
+from spinndrift.training.diagnosis.disturbance.levels import typical_diffusion
 from spinndrift.training.evaluation.metrics import order_statistics
 from spinndrift.training.fitting.calibrate import _spreads, calibrated
 from spinndrift.training.fitting.noise_growth import (
@@ -124,6 +125,16 @@ def test_b_grows_as_told_and_files_keep_it(learned, kind, tmp_path):
     again = load_model(tmp_path / "model.spinn")[0]
     for a, c in zip(jax.tree.leaves(again), jax.tree.leaves(grown), strict=True):
         np.testing.assert_array_equal(a, c)
+
+
+def test_a_diagnosis_believes_the_mean_of_what_grows():
+    rng = np.random.default_rng(0)
+    V, weight = rng.normal(0, 0.2, (5, 6, 4)), np.ones((5, 4))
+    weight[3:, 1] = 0
+    base = with_growth(load_vehicle("bluerov2_heavy").dynamics(B), OWN, SEEN)
+    each = [base.mass_and_diffusion(jnp.asarray(V[n, :, r]))[1] for n, r in np.argwhere(weight)]
+    wanted = np.sqrt(np.mean(np.square(each), axis=0))
+    np.testing.assert_allclose(typical_diffusion(base, V, weight), wanted, rtol=1e-9)
 
 
 @pytest.mark.parametrize("other", [{"diffusion": "distance-aware"}, {"coordinates": "euler"}])

@@ -23,7 +23,7 @@ NAMES = """
     StationConfig make_station build_diagram seeded logged CompiledSimulator
     MppiConfig MppiImpedance Own OwnFilter Scenario load_scenario simulate
 """.split()  # noqa: SIM905 - grouped by topic
-SLOW = ("diagnose", "CompiledSimulator")
+SLOW = ("diagnose", "CompiledSimulator", "fit", "logged")  # they have tests of their own
 USED = {"np": np, "jax": jax, "dataclasses": dataclasses, "Path": Path, "Simulator": Simulator}
 
 

@@ -127,6 +127,7 @@ def test_a_measurement_model_is_differentiated_unless_it_states_its_slopes(text)
         np.testing.assert_array_equal(slope, 0)
 
 
+@pytest.mark.slow
 def test_without_dvl_and_compass_the_filter_says_what_it_does_not_know():
     """Velocity is at least as unknown as the accelerometer's bias b makes it: b t."""
     station = loads(StationConfig, "sensing: {dvl: null, compass: null}")

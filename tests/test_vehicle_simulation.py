@@ -107,13 +107,8 @@ def pilot() -> Pilot:
     return pilot
 
 
-@pytest.mark.parametrize(
-    "way",
-    [
-        "manual_control",  # tests/test_driver.py drives the axes in all three ways
-        *(pytest.param(w, marks=pytest.mark.slow) for w in WAYS if w != "manual_control"),
-    ],
-)
+@pytest.mark.slow  # tests/test_driver.py drives the axes in all three ways
+@pytest.mark.parametrize("way", WAYS)
 def test_six_axes_move_as_they_are_told(pilot: Pilot, way: str):
     pilot.pass_through(way == "thruster_passthrough")
     for axis, name in enumerate(AXES):

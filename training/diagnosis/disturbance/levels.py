@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
+from ....models.dynamics import Dynamics
 from ....models.effects.noise import DisturbanceLevel
 from ....models.se3 import AXES
 from ..filter.kalman import score_of
@@ -23,8 +24,15 @@ LEVEL = DisturbanceLevel.name
 def believed_levels(problem: DiagnosisProblem) -> Float[np.ndarray, "6"]:
     """Diffusion b of the believed model, its root mean square in the runs; zero without any."""
     data = problem.data
-    V = np.moveaxis(data.V[:-1], 1, 0)[:, data.weight > 0]
-    b = np.asarray(problem.model.base.mass_and_diffusion(jnp.asarray(V))[1])
+    return typical_diffusion(problem.model.base, data.V[:-1], data.weight)
+
+
+def typical_diffusion(
+    model: Dynamics, V_WB_B: Float[np.ndarray, "N 6 R"], weight: Float[np.ndarray, "N R"]
+) -> Float[np.ndarray, "6"]:
+    """Root mean square of b over the twists whose weight is not zero."""
+    V = np.moveaxis(V_WB_B, 1, 0)[:, weight > 0]
+    b = np.asarray(model.mass_and_diffusion(jnp.asarray(V))[1])
     return np.sqrt(np.mean(b.reshape(6, -1) ** 2, axis=1))
 
 

@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from beartype import beartype
+from jaxtyping import Array, Float, jaxtyped
 from pydrake.systems.primitives import Adder
 
 from spinndrift.systems.compiled.jit import VectorFunction
@@ -108,6 +110,24 @@ def test_models_and_methods_are_compared_by_what_is_in_them():
     keys = [structure(model.__call__) for model in made]
     assert keys[0] == keys[1]
     assert len(set(keys)) == 3
+
+
+def test_checks_of_types_do_not_count_but_other_wrappers_do():
+    def made(gain, wrapper):
+        @jaxtyped(typechecker=beartype)
+        def checked(x: Float[Array, "2"]) -> Float[Array, "2"]:
+            return gain * x
+
+        @functools.wraps(checked)
+        def wrapped(x):
+            return wrapper * checked(x)
+
+        return checked, wrapped
+
+    first, again, other, more = made(1.0, 1.0), made(1.0, 1.0), made(2.0, 1.0), made(1.0, 2.0)
+    assert structure(first[0]) == structure(again[0]) != structure(other[0])
+    assert structure(first[1]) == structure(again[1]) != structure(more[1])
+    assert None not in map(structure, first)
 
 
 def test_what_a_function_names_of_its_module_counts(monkeypatch):

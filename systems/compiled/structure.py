@@ -21,6 +21,8 @@ import numpy as np
 from jax.core import Tracer
 
 _OWN = "spinndrift"
+_CHECKERS = ("jaxtyping", "beartype")
+"""Packages whose wrappers check types, and change nothing."""
 
 
 class _NoKeyError(Exception):
@@ -122,11 +124,22 @@ def _cached(cls: type, name: str) -> bool:
 
 def _function(function: types.FunctionType, seen: dict[int, int]) -> Hashable:
     """The key of a function: its code, defaults, closure and what it names of its module."""
+    function = _unchecked(function)
     code = function.__code__
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
     given = (function.__defaults__, function.__kwdefaults__, cells)
     names = {n: function.__globals__[n] for n in sorted(_names(code)) if n in function.__globals__}
     return code, _key(given, seen), tuple((n, _named(v, seen)) for n, v in names.items())
+
+
+def _unchecked(function: types.FunctionType) -> types.FunctionType:
+    """The function without the check of its arguments' types, which is made anew for each."""
+    while inner := getattr(function, "__wrapped__", None):
+        made_by = str(function.__globals__.get("__name__")), function.__code__.co_filename
+        if not any(name.removeprefix("<@").startswith(_CHECKERS) for name in made_by):
+            break
+        function = inner
+    return function
 
 
 def _names(code: types.CodeType) -> set[str]:

@@ -1,6 +1,7 @@
 """Diffusion that grows with the twist."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float
@@ -11,7 +12,8 @@ from . import se3
 class Growth(eqx.Module):
     """b_i √(1 + Σ_j g_ij min(|ξ_j|, c_j)²): the size of model errors, which come with motion.
 
-    Bounded by the twists of the data that it was found in, so that noise does not feed itself.
+    Bounded by the twists of the data that it was found in, so that noise does not feed itself. It
+    is found by calibration, not trained.
     """
 
     rate: Float[Array, "6 6"]
@@ -38,6 +40,7 @@ class Growth(eqx.Module):
         self, b: Float[Array, "6"], V_WB_B: Float[Array, "6 *#batch"]
     ) -> Float[Array, "6 *#batch"]:
         """The diffusion at a twist whose value at rest is b."""
-        fastest, V = se3.align(self.fastest, V_WB_B)
-        b, more = se3.align(b, jnp.tensordot(self.rate, jnp.minimum(jnp.abs(V), fastest) ** 2, 1))
+        rate, fastest = jax.lax.stop_gradient((self.rate, self.fastest))
+        fastest, V = se3.align(fastest, V_WB_B)
+        b, more = se3.align(b, jnp.tensordot(rate, jnp.minimum(jnp.abs(V), fastest) ** 2, 1))
         return b * jnp.sqrt(1 + more)

@@ -8,7 +8,7 @@ import scipy.integrate
 import scipy.stats
 from diagonal import simulated
 
-from spinndrift.models.files.checkpoint import load_model, save_model
+from spinndrift.models.files.checkpoint import load_model, save_model, template
 from spinndrift.models.rigid_body import FossenDynamics
 from spinndrift.models.spinn import Spinn, SpinnConfig
 from spinndrift.models.vehicles.vehicle import load_vehicle
@@ -24,6 +24,7 @@ from spinndrift.training.fitting.noise_growth import (
     crps,
     sizes,
     with_growth,
+    without_growth,
 )
 
 B = np.array([2.0, 3.0, 2.0, 0.3, 0.2, 0.3])
@@ -125,6 +126,21 @@ def test_b_grows_as_told_and_files_keep_it(learned, kind, tmp_path):
     again = load_model(tmp_path / "model.spinn")[0]
     for a, c in zip(jax.tree.leaves(again), jax.tree.leaves(grown), strict=True):
         np.testing.assert_array_equal(a, c)
+
+
+@pytest.mark.parametrize("kind", ["fossen", "spinn"])
+def test_what_takes_a_constant_b_has_that_at_rest(learned, kind):
+    model = REFERENCE if kind == "fossen" else learned
+    plain = without_growth(with_growth(model, PLAIN + np.eye(6, TERMS, 1), SEEN))
+    assert jax.tree.structure(plain) == jax.tree.structure(model)
+    for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(model), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+@pytest.mark.parametrize("config", [[], "x", None, {"growing": "no"}])
+def test_a_damaged_description_is_a_wrong_value(config):
+    with pytest.raises(ValueError, match="growing"):
+        template({"kind": "FossenDynamics", "config": config})
 
 
 def test_a_diagnosis_believes_the_mean_of_what_grows():

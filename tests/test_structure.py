@@ -2,7 +2,9 @@
 
 import functools
 import math
+from collections import ChainMap
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -13,12 +15,22 @@ from beartype import beartype
 from jaxtyping import Array, Float, jaxtyped
 from pydrake.systems.primitives import Adder
 
+from spinndrift.systems.compiled import jit
+from spinndrift.systems.compiled import structure as compiled_structure
 from spinndrift.systems.compiled.jit import VectorFunction
 from spinndrift.systems.compiled.structure import structure
 
 pytestmark = pytest.mark.whole
 
 SIZE = 2.0
+
+
+@pytest.fixture(autouse=True)
+def _own(monkeypatch):
+    """This module counts as one of the package, whose functions do not change."""
+    monkeypatch.setattr(
+        compiled_structure, "_OWN", (*compiled_structure._OWN, __name__.partition(".")[0])
+    )
 
 
 @dataclass(frozen=True)
@@ -56,6 +68,11 @@ def scaled(value, more=1.0):
         return call(x), held
 
     return outer
+
+
+def scaled_by(unknown):
+    held = SimpleNamespace(value=unknown)
+    return lambda x: x if held else -x
 
 
 VALUES = [
@@ -138,9 +155,54 @@ def test_what_a_function_names_of_its_module_counts(monkeypatch):
     assert structure(scaled("a")) == before
 
 
-@pytest.mark.parametrize("unknown", [object(), Adder(1, 1), Holder(1), (Adder(1, 1),)])
+class Changing(list):
+    pass
+
+
+@pytest.mark.parametrize(
+    "unknown",
+    [object(), Adder(1, 1), (Adder(1, 1),), SimpleNamespace(a=1), Changing(), ChainMap({"a": 1})],
+)
 def test_unknown_values_have_no_key(unknown):
     assert structure(scaled(unknown)) is None
+
+
+def test_functions_and_objects_of_other_modules_have_no_key(monkeypatch):
+    """A user's module may change between two runs, in places that the key does not see."""
+    monkeypatch.undo()
+    assert structure(scaled(1)) is None
+    assert structure(Holder(1).call) is None
+    assert structure(functools.partial(math.pow, 2.0)) is not None
+
+
+def test_what_jax_tells_apart_is_told_apart():
+    weak, strong = jnp.asarray(0.1), jnp.asarray(np.float64(0.1))
+    assert structure(scaled(weak)) != structure(scaled(strong))
+    fields = [np.zeros(2, [(name, "f4")]) for name in "ab"]
+    assert structure(scaled(fields[0])) != structure(scaled(fields[1]))
+    sums = [eqx.filter_vmap(jnp.cumsum, in_axes=k, out_axes=k) for k in (0, 1)]
+    assert structure(scaled(sums[0])) != structure(scaled(sums[1]))
+    powers = [jax.jit(lambda x: x**2), jax.jit(lambda x: x**2)]
+    assert structure(scaled(powers[0])) != structure(scaled(powers[1]))
+    assert structure(scaled(powers[0])) == structure(scaled(powers[0])) is not None
+
+
+def test_a_variable_that_is_not_set_yet_is_no_error():
+    def made(told):
+        def call(x):
+            return x * g if told else x
+
+        if told:
+            g = 2.0
+        return call
+
+    assert structure(made(False)) == structure(made(False))
+    assert structure(made(True)) != structure(made(False))
+
+
+def test_what_looks_like_a_check_of_types_may_be_anything():
+    checked = jaxtyped(typechecker=None)(jax.jit(lambda x: x))
+    assert structure(scaled(checked)) == structure(scaled(checked))
 
 
 def test_a_circle_ends():
@@ -149,34 +211,43 @@ def test_a_circle_ends():
     assert structure(scaled(circle)) == structure(scaled(circle)) is not None
 
 
-def test_an_equal_function_is_not_traced_again():
-    traced = []
+@pytest.fixture
+def traced(monkeypatch):
+    """How many functions were traced."""
+    count, lowered = [], jit.Lowered.__init__
 
-    def function(gain, told=True):
-        if not told:  # a list that grows is another value each time
-            return lambda x: gain * x
-        return lambda x: (traced.append(1), gain * x)[1]
+    def counted(self, *given):
+        count.append(1)
+        lowered(self, *given)
 
-    def called(gain, told):
-        return VectorFunction(function(gain, told), [2], [2])(np.ones(2))[0].tolist()
+    monkeypatch.setattr(jit.Lowered, "__init__", counted)
+    return count
 
-    first = VectorFunction(function(3.0, False), [2], [2])
-    assert first(np.ones(2))[0].tolist() == [3.0, 3.0]
-    program = first._program
-    assert VectorFunction(function(3.0, False), [2], [2])._program is program
-    assert called(4.0, False) == [4.0, 4.0]
-    assert called(3.0, False) == [3.0, 3.0]
-    assert called(3.0, True) == called(3.0, True) == [3.0, 3.0]
+
+def test_an_equal_function_is_not_traced_again(traced):
+    def function(gain):
+        return lambda x: gain * x
+
+    kept = []
+
+    def called(gain, size=2):
+        kept.append(VectorFunction(function(gain), [size], [size]))
+        return kept[-1](np.ones(size))[0].tolist()
+
+    assert called(3.0) == called(3.0) == [3.0, 3.0]
+    assert len(traced) == 1
+    assert called(4.0) == [4.0, 4.0]
+    assert called(3.0) == [3.0, 3.0]
     assert len(traced) == 2
-    # sizes count, too
-    assert VectorFunction(function(3.0, False), [3], [3])(np.ones(3))[0].tolist() == [3.0] * 3
+    assert called(3.0, size=3) == [3.0] * 3
+    assert len(traced) == 3
 
 
-def test_equal_functions_among_others_compile_at_once():
+def test_equal_functions_among_others_compile_at_once(traced):
     gains = [1.0, 2.0, 1.0, 3.0, 2.0]
     made = [VectorFunction(lambda x, g=g: g * x, [1], [1]) for g in gains]
     own = Holder(None)
-    made += [VectorFunction(own.call, [1], [1]), VectorFunction(Holder(1).call, [1], [1])]
+    made += [VectorFunction(f, [1], [1]) for f in (own.call, Holder(1).call, scaled_by(Adder))]
     VectorFunction.compile(*made)
-    assert [f(np.ones(1))[0].item() for f in made] == [*gains, 1.0, 2.0]
-    assert len({id(f._program) for f in made}) == 5
+    assert [f(np.ones(1))[0].item() for f in made] == [*gains, 1.0, 2.0, 1.0]
+    assert len(traced) == 6  # three gains, both holders and one without a key

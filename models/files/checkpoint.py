@@ -206,8 +206,10 @@ def _describe_fossen(model: FossenDynamics) -> dict[str, Any]:
     return {} if model.growth is None else {"growing": True}
 
 
-def _fossen(config: dict[str, Any]) -> FossenDynamics:
-    growth = Growth.none() if config.get("growing", False) else None
+def _fossen(config: Any) -> FossenDynamics:
+    if not isinstance(config, dict) or config.get("growing", False) not in (False, True):
+        raise ValueError("growing is neither true nor false")
+    growth = Growth.none() if config.get("growing") else None
     return cast(_unit_body().with_constants(growth=growth), jnp.float32)
 
 

@@ -74,7 +74,8 @@ def add_training(page: Page, learned: Learned) -> Page:
         ("axis", "M preset", "M learned", "D preset", "D learned", "D^f preset", "D^f learned",
          "b preset", "b learned"),
         "Diagonals at rest: mass with added mass (kg, kg·m²), viscous and fluid drag, diffusion "
-        "(N√s, N·m√s). The preset's diffusion is estimated from its prediction errors. " + told,
+        "(N√s, N·m√s). Diffusions are estimated from prediction errors; where these grow with "
+        "speed, that at rest is small. " + told,
         fold="Learned coefficients",
     )  # fmt: skip
     if learned.told:

@@ -2,16 +2,18 @@
 
 Two functions made by the same lines of code from equal values (parameters, configurations, arrays)
 are traced to the same program. The key tells it without tracing, which takes longer than to compile
-for a filter or a vehicle with sensors. Values of kinds that are not known here, such as systems
-with ports, have no key: their functions are compared by their programs.
+for a filter or a vehicle with sensors.
+
+Only what is known to be constant has a key: functions and objects of this package, of JAX, NumPy
+and Equinox, and plain values. All else, such as a user's functions, whose modules may change, or
+systems with ports, has none: such functions are compared by their programs.
 """
 
 import dataclasses
 import enum
 import functools
 import types
-from collections import deque
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable
 from pathlib import PurePath
 from typing import Any
 
@@ -20,9 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-_OWN = "spinndrift"
+_OWN = ("spinndrift",)
+_KNOWN = ("jax", "jaxlib", "numpy", "equinox", "functools")
 _CHECKERS = ("jaxtyping", "beartype")
 """Packages whose wrappers check types, and change nothing."""
+_PLAIN = (type(None), bool, int, str, bytes)
+_EMPTY = "empty cell"
 
 
 class _NoKeyError(Exception):
@@ -48,24 +53,27 @@ def structure(function: Any) -> Hashable | None:
     Functions and constants of modules are compared too, as far as the function names them itself.
     """
     try:
-        return _key(function, {})
-    except _NoKeyError:
+        key = _key(function, {})
+        hash(key)
+    except (_NoKeyError, AttributeError, TypeError, ValueError, RecursionError):
         return None
+    return key
 
 
 def _key(value: Any, seen: dict[int, int]) -> Hashable:
     """The key of a value; `seen` numbers the objects on the way to it, for those in a circle."""
-    if value is None or isinstance(value, bool | int | str | bytes | np.dtype):
-        return type(value), value
-    if isinstance(value, type | types.ModuleType | types.BuiltinFunctionType | np.ufunc):
+    kind = type(value)
+    if kind in _PLAIN or isinstance(value, np.dtype):
+        return kind, value
+    if kind in (float, complex) or isinstance(value, PurePath):
+        return kind, repr(value)
+    if isinstance(value, type | types.ModuleType | types.BuiltinFunctionType | enum.Enum):
         return _Same(value)
-    if isinstance(value, float | complex | enum.Enum | PurePath | slice | range):
-        return type(value), repr(value)
-    if isinstance(value, np.ndarray | np.generic | jax.Array):
+    if kind is np.ndarray or isinstance(value, np.generic | jax.Array):
         return _array(value)
     if id(value) in seen:
         return "again", seen[id(value)]
-    return type(value), _compound(value, seen | {id(value): len(seen)})
+    return kind, _compound(value, seen | {id(value): len(seen)})
 
 
 def _array(value: Any) -> Hashable:
@@ -76,45 +84,56 @@ def _array(value: Any) -> Hashable:
     array = np.asarray(value)
     if array.dtype.hasobject:
         raise _NoKeyError
-    return type(value), array.shape, array.dtype.str, array.tobytes()
+    weak = getattr(value, "weak_type", False)
+    return type(value), weak, array.shape, array.dtype, array.tobytes()
 
 
 def _compound(value: Any, seen: dict[int, int]) -> Hashable:
     """The key of the parts of a value."""
-    if isinstance(value, tuple | list | deque):
+    kind = type(value)
+    if kind in (tuple, list) or (issubclass(kind, tuple) and hasattr(kind, "_fields")):
         return tuple(_key(each, seen) for each in value)
-    if isinstance(value, Mapping):
+    if kind in (dict, types.MappingProxyType):
         return tuple((_key(k, seen), _key(each, seen)) for k, each in value.items())
-    if isinstance(value, set | frozenset):
+    if kind in (set, frozenset):
         return frozenset(_key(each, seen) for each in value)
-    if isinstance(value, functools.partial):
+    if kind in (slice, range):
+        return tuple(_key(each, seen) for each in (value.start, value.stop, value.step))
+    if kind is functools.partial:
         return tuple(_key(each, seen) for each in (value.func, value.args, value.keywords))
-    if isinstance(value, types.MethodType):
+    if kind is types.MethodType:
         return _key(value.__func__, seen), _key(value.__self__, seen)
-    if isinstance(value, types.FunctionType):
+    if kind is types.FunctionType:
         return _function(value, seen)
-    if hasattr(value, "__wrapped__"):  # compiled or cached functions
-        return _key(value.__wrapped__, seen)
-    if hasattr(type(value), "__index__"):  # numbers of a system's states and ports
-        return int(value)
-    own = type(value).__module__.partition(".")[0] == _OWN and type(value).__bases__ == (object,)
-    if not own and not dataclasses.is_dataclass(value):
-        return _hashable(value)
-    fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
-    names = {field.name for field in fields}
-    names |= {n for n in getattr(value, "__dict__", ()) if not _cached(type(value), n)}
+    return _object(value, seen)
+
+
+def _object(value: Any, seen: dict[int, int]) -> Hashable:
+    """The key of an object by its attributes, or by an equality of its own."""
+    kind = type(value)
+    if _from(kind.__module__, ("pydrake",)) and hasattr(kind, "__index__"):
+        return int(value)  # the number of a system's state or port
+    fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else None
+    own = _from(kind.__module__, _OWN)
+    if fields is not None and (own or _from(kind.__module__, _KNOWN)):
+        names = {field.name for field in fields}
+    elif own and kind.__bases__ == (object,):
+        names = set()
+    elif not _from(kind.__module__, _KNOWN):
+        raise _NoKeyError
+    elif callable(value):
+        return _Same(value)
+    elif kind.__eq__ is object.__eq__:
+        raise _NoKeyError
+    else:
+        return value
+    names |= {n for n in getattr(value, "__dict__", ()) if not _cached(kind, n)}
     return tuple((n, _key(getattr(value, n), seen)) for n in sorted(names))
 
 
-def _hashable(value: Any) -> Hashable:
-    """A value whose own equality compares what is in it."""
-    if type(value).__eq__ is object.__eq__ or type(value).__hash__ is None:
-        raise _NoKeyError
-    try:
-        hash(value)
-    except TypeError as error:
-        raise _NoKeyError from error
-    return value
+def _from(module: str | None, packages: tuple[str, ...]) -> bool:
+    """Whether a module is of one of the packages."""
+    return str(module).partition(".")[0] in packages
 
 
 def _cached(cls: type, name: str) -> bool:
@@ -124,19 +143,33 @@ def _cached(cls: type, name: str) -> bool:
 
 def _function(function: types.FunctionType, seen: dict[int, int]) -> Hashable:
     """The key of a function: its code, defaults, closure and what it names of its module."""
-    function = _unchecked(function)
-    code = function.__code__
-    cells = [cell.cell_contents for cell in function.__closure__ or ()]
-    given = (function.__defaults__, function.__kwdefaults__, cells)
-    names = {n: function.__globals__[n] for n in sorted(_names(code)) if n in function.__globals__}
-    return code, _key(given, seen), tuple((n, _named(v, seen)) for n, v in names.items())
+    inner = _unchecked(function)
+    if type(inner) is not types.FunctionType:
+        return _key(inner, seen)
+    if not _from(inner.__module__, _OWN + _KNOWN):
+        raise _NoKeyError
+    code, known = inner.__code__, inner.__globals__
+    cells = [_content(cell, seen) for cell in inner.__closure__ or ()]
+    given = _key((inner.__defaults__, inner.__kwdefaults__), seen)
+    names = [n for n in sorted(_names(code)) if n in known]
+    return code, given, tuple(cells), tuple((n, _named(known[n], seen)) for n in names)
 
 
-def _unchecked(function: types.FunctionType) -> types.FunctionType:
+def _content(cell: types.CellType, seen: dict[int, int]) -> Hashable:
+    try:
+        value = cell.cell_contents
+    except ValueError:
+        return _EMPTY
+    return _key(value, seen)
+
+
+def _unchecked(function: Any) -> Any:
     """The function without the check of its arguments' types, which is made anew for each."""
-    while inner := getattr(function, "__wrapped__", None):
-        made_by = str(function.__globals__.get("__name__")), function.__code__.co_filename
-        if not any(name.removeprefix("<@").startswith(_CHECKERS) for name in made_by):
+    while type(function) is types.FunctionType:
+        inner = getattr(function, "__wrapped__", None)
+        file = function.__code__.co_filename.removeprefix("<@")
+        module = function.__globals__.get("__name__")
+        if inner is None or not (_from(module, _CHECKERS) or file.startswith(_CHECKERS)):
             break
         function = inner
     return function
@@ -150,9 +183,4 @@ def _names(code: types.CodeType) -> set[str]:
 
 def _named(value: Any, seen: dict[int, int]) -> Hashable:
     """The key of something that a module names: functions and classes are equal to themselves."""
-    if callable(value):
-        return _Same(value)
-    try:
-        return _key(value, seen)
-    except _NoKeyError:
-        return _Same(value)
+    return _Same(value) if callable(value) else _key(value, seen)

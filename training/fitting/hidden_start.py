@@ -18,6 +18,7 @@ from ..diagnosis.coefficients import fit_coefficients
 from ..smoothing.complete import Completed, complete, not_completed_by
 from ..smoothing.fitted import Told, completed_as_it_is, told_by
 from ..smoothing.levels import Belief, Levels
+from .noise_growth import without_growth
 from .start import with_diffusion
 
 _log = logging.getLogger(__name__)
@@ -84,7 +85,7 @@ class HiddenStart:
         levels = completed_as_it_is(rest, vehicle, model).levels
         told = told_by(rest, vehicle, model, vehicle.dynamics(), levels) if fitted else ()
         if not isinstance(core(model), Spinn):
-            model = with_diffusion(model, levels.diffusion)
+            model = with_diffusion(without_growth(model), levels.diffusion)
         return cls(vehicle, config, last, model, levels, told, preset)
 
     def completed(self, part: Recording) -> Completed:

@@ -89,6 +89,22 @@ def with_growth(model: Model, size: Float[np.ndarray, "6 7"], twists: Twists) ->
     return with_diffusion(changed, diffusion_scale(model) * np.sqrt(size[:, 0]))
 
 
+def without_growth(model: Model) -> Model:
+    """The model with the noise that it has at rest, for users that estimate a constant b."""
+    own: Any = core(model)
+    if isinstance(own, Spinn):
+        if own.scales.growth is None:
+            return model
+        config = replace(own.config, growing=False)
+        own = replace(own, config=config, scales=replace(own.scales, growth=None))
+    elif isinstance(own, FossenDynamics):
+        if own.growth is None:
+            return model
+        own = own.with_constants(growth=None)
+    changed: Any = model.with_base(own) if isinstance(model, Extended) else own
+    return changed
+
+
 @dataclass(frozen=True)
 class Spread:
     """Displacements from the noise-free motion in a set of windows.

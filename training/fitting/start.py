@@ -138,6 +138,8 @@ def starting_model(
         return given
     if not isinstance(reference, FossenDynamics):
         raise UserError(f"model: training starts from no {type(reference).__name__}")
+    if reference.growth is not None:  # calibration finds it anew at the end
+        reference = reference.with_constants(growth=None)
     model_key, pretrain_key = jax.random.split(jax.random.key(config.seed))
     spinn = create_spinn(config.model, reference, model_key, dtype)
     spinn = pretrain(spinn, reference, config.pretrain, pretrain_key)[0]

@@ -1,10 +1,10 @@
-"""The lasting wrench of a learned model, for whoever does not carry it as a latent state."""
+"""The mean-reverting wrench of a learned model, for users that don't carry it as a latent state."""
 
 import numpy as np
 
 from .disturbances import OrnsteinUhlenbeckWrench
 from .dynamics import Dynamics
-from .effects.extended import Extended, core
+from .effects.extended import core, with_core
 from .spinn import Spinn
 
 
@@ -23,5 +23,4 @@ def whitened(model: Dynamics) -> Dynamics:
     own = core(model)
     if not isinstance(own, Spinn) or own.lasting is None:
         return model
-    white = own.whitened()
-    return model.with_base(white) if isinstance(model, Extended) else white
+    return with_core(model, own.whitened())

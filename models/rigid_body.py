@@ -49,7 +49,7 @@ class FossenDynamics(Dynamics):
     buoyancy: Float[Array, ""]
     p_BoBcm_B: Float[Array, "3"]
     growth: Growth | None = None
-    """Of `diffusion` with the twist."""
+    """How `diffusion` grows with the twist; None: it is constant."""
 
     def __init__(
         self,

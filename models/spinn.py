@@ -98,7 +98,7 @@ class Scales(eqx.Module):
     inverse_roots: Float[Array, "3 6 6"]
     diffusion: Float[Array, "6"]
     growth: Growth | None = None
-    """Of `diffusion` with the twist."""
+    """How `diffusion` grows with the twist; None: it is constant."""
 
 
 class Spinn(Dynamics):

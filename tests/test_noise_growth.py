@@ -24,8 +24,8 @@ from spinndrift.training.fitting.noise_growth import (
     crps,
     sizes,
     with_growth,
-    without_growth,
 )
+from spinndrift.training.fitting.start import without_growth
 
 B = np.array([2.0, 3.0, 2.0, 0.3, 0.2, 0.3])
 SEEN = Twists(np.full(6, 0.2), np.full(6, 0.5))  # the typical one of `simulated` at its start

@@ -30,6 +30,11 @@ def core(dynamics: Dynamics) -> Dynamics:
     return dynamics.base if isinstance(dynamics, Extended) else dynamics
 
 
+def with_core(dynamics: Dynamics, base: Dynamics) -> Dynamics:
+    """The model with another `core`: another base below the same effects, or `base` itself."""
+    return dynamics.with_base(base) if isinstance(dynamics, Extended) else base
+
+
 class Extended(EffectsOnMotion):
     """`base` with `effects`, driven by thruster forces.
 

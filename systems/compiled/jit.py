@@ -77,11 +77,8 @@ class Lowered:
         return hashlib.sha256(text.encode()).digest()
 
 
-def compiled(*codes: Lowered, keep: bool = False) -> list[Program]:
-    """The program of each, or an equal one that is there; compiled in parallel.
-
-    With `keep` programs outlive their references for a while, for the next equal functions.
-    """
+def compiled(*codes: Lowered) -> list[Program]:
+    """The program of each, or an equal one that is there; compiled in parallel."""
     found = {code.key: _PROGRAMS.get(code.key) for code in codes}
     missing = {code.key: code for code in codes if found[code.key] is None}
     with ThreadPoolExecutor() as threads:
@@ -90,8 +87,6 @@ def compiled(*codes: Lowered, keep: bool = False) -> list[Program]:
     programs = [program for code in codes if (program := found[code.key]) is not None]
     for code, program in zip(codes, programs, strict=True):
         _PROGRAMS[code.key] = program
-        if keep:
-            _RECENT.append(program)
     return programs
 
 
@@ -163,6 +158,11 @@ class VectorFunction:
         self.compile(self)
         return vars(self)["_program"]
 
+    def _key(self) -> Hashable:
+        """Equal for equal functions of equal sizes; the function itself if that is not known."""
+        found = structure(self._function)
+        return self if found is None else (found, self._inputs, self._outputs)
+
     def _lowered(self) -> Lowered:
         return Lowered(self._packed, jax.ShapeDtypeStruct((sum(self._inputs),), np.float64))
 
@@ -170,19 +170,18 @@ class VectorFunction:
     def compile(*functions: "VectorFunction") -> None:
         """Compile functions now, in parallel, so that no call has to wait for it."""
         waiting = [one for one in functions if "_program" not in vars(one)]
-        keys = [(structure(one._function), one._inputs, one._outputs) for one in waiting]
-        found = {key: program for key in keys if (program := _BY_STRUCTURE.get(key)) is not None}
-        # of equal ones the first is traced; those without a structure are all
-        first = {
-            key if key[0] is not None else (one,): one
-            for key, one in zip(reversed(keys), reversed(waiting), strict=True)
-            if key not in found
-        }
-        made = dict(zip(first, compiled(*(one._lowered() for one in first.values())), strict=True))
+        keys = [one._key() for one in waiting]
+        programs = {key: program for key in keys if (program := _BY_STRUCTURE.get(key)) is not None}
+        traced: dict[Hashable, VectorFunction] = {}
         for one, key in zip(waiting, keys, strict=True):
-            program = found.get(key) or made[key if key[0] is not None else (one,)]
+            if key not in programs:
+                traced.setdefault(key, one)
+        made = compiled(*(one._lowered() for one in traced.values()))
+        programs |= dict(zip(traced, made, strict=True))
+        for one, key in zip(waiting, keys, strict=True):
+            program = programs[key]
             vars(one)["_program"] = program
-            if key[0] is not None:
+            if key is not one:
                 _BY_STRUCTURE[key] = program
             if one._keep:
                 _RECENT.append(program)

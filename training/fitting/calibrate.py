@@ -37,6 +37,7 @@ _ROUNDS = 2
 _MOST = 4.0
 """Largest factor of a round."""
 _SMALL = 0.1
+"""Share of b² at which spreads are linear in it."""
 _NOTHING = 1e-6
 """Size of a constant term that is left out."""
 
@@ -68,7 +69,7 @@ def calibrated(model: Model, sets: Sequence[Windows], substeps: int, seed: int =
 
 
 def _by_term(model: Dynamics, windows: Windows, substeps: int, seed: int, twists: Twists) -> Spread:
-    """The spread by each term of b² alone, for small noise: a tenth of the model's own b²."""
+    """The spread by each term of b² alone, drawn with less noise and scaled up."""
 
     def variance(size: np.ndarray, windows: Windows) -> tuple[np.ndarray, np.ndarray]:
         size = _SMALL * np.tile(size, (6, 1))

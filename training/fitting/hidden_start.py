@@ -18,8 +18,7 @@ from ..diagnosis.coefficients import fit_coefficients
 from ..smoothing.complete import Completed, complete, not_completed_by
 from ..smoothing.fitted import Told, completed_as_it_is, told_by
 from ..smoothing.levels import Belief, Levels
-from .noise_growth import without_growth
-from .start import with_diffusion
+from .start import with_diffusion, without_growth
 
 _log = logging.getLogger(__name__)
 _ROUNDS = 4

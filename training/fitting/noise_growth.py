@@ -4,10 +4,10 @@ Errors of drag and thrust grow with motion: a vehicle at rest strays less than o
 and a constant b has bands too wide for the one and too narrow for the other, so that their shares
 are neither 50 nor 90 %. On each axis the scale of b² is a sum of a constant and of squares of the
 twist's components (`models.growth`). The spread of forecasts by each term alone is that of motions
-drawn from the model; variances add up, as noise is small. The terms' sizes minimise
-the continuous ranked probability score of what was observed (Gneiting and Raftery 2007), each
-component and horizon in units of its typical error. Terms are used where windows that their sizes
-were not fitted to are predicted better than by a constant b, by more than two standard errors.
+drawn from the model; variances add up, as noise is small. The terms' sizes minimise the continuous
+ranked probability score of what was observed (Gneiting and Raftery 2007), each component and
+horizon in units of its typical error. Terms are used where windows that their sizes were not fitted
+to are predicted better than by a constant b, by more than two standard errors.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ import scipy.stats
 from jaxtyping import Float
 
 from ...models.dynamics import Dynamics
-from ...models.effects.extended import Extended, core
+from ...models.effects.extended import core, with_core
 from ...models.growth import Growth
 from ...models.rigid_body import FossenDynamics
 from ...models.spinn import Spinn
@@ -32,7 +32,7 @@ Model = TypeVar("Model", bound=Dynamics)
 TERMS = 7
 """A constant, and the squares of the six components of the twist."""
 _LEAST = 1e-4
-"""Smallest share of the constant term, so that no motion is certain."""
+"""Smallest size of the constant term, so that no motion is certain."""
 _SLOWEST = 0.01
 """Speed (m/s, rad/s) below which a component of the twist is at rest."""
 _CERTAIN = 1e-3
@@ -84,25 +84,8 @@ def with_growth(model: Model, size: Float[np.ndarray, "6 7"], twists: Twists) ->
         changed = replace(own, config=replace(own.config, growing=True), scales=scales)
     elif isinstance(own, FossenDynamics):
         changed = own.with_constants(growth=growth)
-    if isinstance(model, Extended):
-        changed = model.with_base(changed)
+    changed = with_core(model, changed)
     return with_diffusion(changed, diffusion_scale(model) * np.sqrt(size[:, 0]))
-
-
-def without_growth(model: Model) -> Model:
-    """The model with the noise that it has at rest, for users that estimate a constant b."""
-    own: Any = core(model)
-    if isinstance(own, Spinn):
-        if own.scales.growth is None:
-            return model
-        config = replace(own.config, growing=False)
-        own = replace(own, config=config, scales=replace(own.scales, growth=None))
-    elif isinstance(own, FossenDynamics):
-        if own.growth is None:
-            return model
-        own = own.with_constants(growth=None)
-    changed: Any = model.with_base(own) if isinstance(model, Extended) else own
-    return changed
 
 
 @dataclass(frozen=True)
@@ -132,13 +115,12 @@ def sizes(sets: Sequence[Spread]) -> Float[np.ndarray, "6 7"]:
         if not parts:
             continue
         halves = parts if len(parts) > 1 else parts[0].halves()
-        constant, own, every = [0], [0, 1 + axis], list(range(TERMS))
-        worst = _left_out(halves, constant)
-        gains = {len(used): worst - _left_out(halves, used) for used in (own, every)}
-        best = own if gains[len(own)].mean() > gains[len(every)].mean() else every
-        gain = gains[len(best)]
+        constant = _left_out(halves, [0])
+        tried = [list(range(TERMS)), [0, 1 + axis]]  # with all speeds, with the axis' own
+        gains = [constant - _left_out(halves, used) for used in tried]
+        gain, used = max(zip(gains, tried, strict=True), key=lambda one: one[0].mean())
         if gain.mean() > 2 * gain.std() / np.sqrt(gain.size):
-            found[axis] = _fitted(parts, best)
+            found[axis] = _fitted(parts, used)
     return found
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ...models.config.errors import UserError
 from ...models.dynamics import Dynamics
-from ...models.effects.extended import Extended, core
+from ...models.effects.extended import Extended, core, with_core
 from ...models.euclidean import create_spinn
 from ...models.integrate import cast
 from ...models.rigid_body import FossenDynamics
@@ -77,6 +77,18 @@ def with_diffusion(model: Model, b: Float[np.ndarray, "6"]) -> Model:
     return eqx.tree_at(_scale_of, model, jnp.asarray(b, scale.dtype))
 
 
+def without_growth(model: Model) -> Model:
+    """The model with the b that it has at rest, for users that estimate a constant one."""
+    own, plain = core(model), None
+    if isinstance(own, Spinn) and own.scales.growth is not None:
+        config = replace(own.config, growing=False)
+        plain = replace(own, config=config, scales=replace(own.scales, growth=None))
+    elif isinstance(own, FossenDynamics) and own.growth is not None:
+        plain = own.with_constants(growth=None)
+    changed: Any = model if plain is None else with_core(model, plain)
+    return changed
+
+
 def diffusion_scale(model: Dynamics) -> Float[np.ndarray, "6"]:
     """What `with_diffusion` sets."""
     return np.asarray(_scale_of(model), float)
@@ -138,8 +150,7 @@ def starting_model(
         return given
     if not isinstance(reference, FossenDynamics):
         raise UserError(f"model: training starts from no {type(reference).__name__}")
-    if reference.growth is not None:  # calibration finds it anew at the end
-        reference = reference.with_constants(growth=None)
+    reference = without_growth(reference)  # calibration finds it anew at the end
     model_key, pretrain_key = jax.random.split(jax.random.key(config.seed))
     spinn = create_spinn(config.model, reference, model_key, dtype)
     spinn = pretrain(spinn, reference, config.pretrain, pretrain_key)[0]

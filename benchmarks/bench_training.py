@@ -22,10 +22,10 @@ from spinndrift.models.rigid_body import FossenDynamics
 from spinndrift.models.spinn import Spinn, SpinnConfig
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.sims.cores import share_cores
+from spinndrift.training.compile_options import QUICK_COMPILE
 from spinndrift.training.config import TrainingConfig
 from spinndrift.training.data.windows import Windows
 from spinndrift.training.fitting.step import (
-    QUICK_COMPILE,
     TrainStep,
     first_moments,
     mean_over_devices,

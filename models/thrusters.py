@@ -55,6 +55,7 @@ class Thrusters(eqx.Module):
     inverse: Float[Array, "n 6"]
     bias: Float[Array, "n"]
     groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    biased: tuple[int, ...] = eqx.field(static=True)
     unactuated: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
@@ -116,6 +117,7 @@ class Thrusters(eqx.Module):
         inverse[:, actuated] = (A / w).T @ np.linalg.inv((A / w) @ A.T)
         self.inverse = jnp.asarray(inverse, dtype)
         self.bias = jnp.asarray(bias, dtype)
+        self.biased = tuple(int(i) for i in np.flatnonzero(bias))
 
     # ------------------------------------------------------------------------------ PWM and force
 
@@ -197,17 +199,15 @@ class Thrusters(eqx.Module):
             factor = self._fitting_scale(force, low, high, upright)[None]
             vertical = np.isin(np.arange(len(force)), upright)
             force = force * jnp.where(_column(vertical, force), factor, 1)
-        for group in filter(None, self.groups):
-            index = np.array(group)
-            n = _column(self.bias[index], force)
-            some = n != 0
-            n, part = jnp.where(some, n, 1), force[index]
-            ends = (low[index] - part) / n, (high[index] - part) / n
-            least = jnp.max(jnp.where(some, jnp.minimum(*ends), -jnp.inf), axis=0)
-            most = jnp.min(jnp.where(some, jnp.maximum(*ends), jnp.inf), axis=0)
-            inner = jnp.where(some, n * jnp.clip(0, least, most)[None], 0)
-            force = force.at[index].set(jnp.clip(part + inner, low[index], high[index]))
-        return force
+        for group in self.groups:
+            index = np.intersect1d(group, self.biased)
+            if index.size:
+                n, part = _column(self.bias[index], force), force[index]
+                ends = (low[index] - part) / n, (high[index] - part) / n
+                least = jnp.max(jnp.minimum(*ends), axis=0)
+                most = jnp.min(jnp.maximum(*ends), axis=0)
+                force = force.at[index].add(n * jnp.clip(0, least, most)[None])
+        return jnp.clip(force, low, high)
 
     def _fitting_scale(
         self, force: Array, low: Array, high: Array, group: tuple[int, ...]
@@ -217,21 +217,22 @@ class Thrusters(eqx.Module):
         With g = f/n and limits l, h divided likewise, s g_i + c ≤ h_i and s g_j + c ≥ l_j for all
         pairs: s (g_i - g_j) ≤ h_i - l_j. A thruster without bias (n = 0) bounds s by itself.
         """
-        if not group:
-            return jnp.ones(force.shape[1:], force.dtype)
-        index = np.array(group)
-        n = _column(self.bias[index], force)
-        some = n != 0
-        safe = jnp.where(some, n, 1)
-        g, a, b = force[index] / safe, low[index] / safe, high[index] / safe
-        a, b = jnp.minimum(a, b), jnp.maximum(a, b)
-        gap, room = g[:, None] - g[None], b[:, None] - a[None]
-        binds = (gap > 0) & some[:, None] & some[None]
-        pairs = jnp.where(binds, room / jnp.where(binds, gap, 1), 1)
-        bound = jnp.where(g > 0, b, a)
-        binds = (g != 0) & ~some
-        alone = jnp.where(binds, bound / jnp.where(binds, g, 1), 1)
-        return jnp.minimum(jnp.minimum(jnp.min(pairs, axis=(0, 1)), jnp.min(alone, axis=0)), 1)
+        scale = jnp.ones(force.shape[1:], force.dtype)
+        index = np.intersect1d(group, self.biased)
+        if index.size:
+            n = _column(self.bias[index], force)
+            g, a, b = force[index] / n, low[index] / n, high[index] / n
+            a, b = jnp.minimum(a, b), jnp.maximum(a, b)
+            gap, room = g[:, None] - g[None], b[:, None] - a[None]
+            pairs = jnp.where(gap > 0, room / jnp.where(gap > 0, gap, 1), 1)
+            scale = jnp.minimum(scale, jnp.min(pairs, axis=(0, 1)))
+        index = np.setdiff1d(group, self.biased).astype(int)
+        if index.size:
+            f = force[index]
+            bound = jnp.where(f > 0, high[index], low[index])
+            alone = jnp.where(f != 0, bound / jnp.where(f != 0, f, 1), 1)
+            scale = jnp.minimum(scale, jnp.min(alone, axis=0))
+        return scale
 
     # ---------------------------------------------------------------------------------------- lag
 

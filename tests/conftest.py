@@ -67,7 +67,7 @@ def _types_checked(request: pytest.FixtureRequest) -> Iterator[None]:
 @pytest.fixture(autouse=True, scope="session")
 def _quick_compile() -> None:
     """Compile training steps without optimisation: tests take few of them."""
-    from spinndrift.training.fitting.step import QUICK_COMPILE  # not before types are checked
+    from spinndrift.training.compile_options import QUICK_COMPILE  # not before types are checked
 
     QUICK_COMPILE["xla_backend_optimization_level"] = 0
 

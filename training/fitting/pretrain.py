@@ -16,8 +16,9 @@ from jaxtyping import Array, Float
 from ...models import se3
 from ...models.dynamics import Dynamics
 from ...models.rigid_body import FossenDynamics
+from ..compile_options import QUICK_COMPILE
 from ..config import PretrainConfig
-from .step import QUICK_COMPILE, all_finite, partition
+from .step import all_finite, partition
 
 Model = TypeVar("Model", bound=Dynamics)
 

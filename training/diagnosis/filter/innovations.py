@@ -13,6 +13,7 @@ from ....models import se3
 from ....models.effects.extended import Extended
 from ....models.effects.library import Library
 from ....models.effects.recent import Recent
+from ...compile_options import LOOP_EMITTERS
 from ..data.arrays import Data
 from .along_records import AlongRecords, Records, State, Step, scan, substeps
 from .latent import levels, specific_force_errors
@@ -54,7 +55,7 @@ def difference(
     return jnp.concatenate(jnp.broadcast_arrays(se3.local(X, X2), V2 - V))
 
 
-@eqx.filter_jit
+@eqx.filter_jit(compiler_options=LOOP_EMITTERS)  # pyright: ignore[reportCallIssue]
 def _predict(
     model: Extended,
     effects: Any,

@@ -51,8 +51,10 @@ class Driven:
     outputs: tuple[int, ...] = ()
     """Output of the autopilot that drives each thruster; empty if it is not known."""
 
-    def shares(self, weights: np.ndarray, lag: int, strict: bool = False) -> dict[int, np.ndarray]:
-        """Shares by axis for hypotheses of weights (6, m, *H).
+    def shares(
+        self, weights: np.ndarray, lag: int | Sequence[int], strict: bool = False
+    ) -> dict[int, np.ndarray]:
+        """Shares by axis for hypotheses of weights (6, m, *H), at one lag or by lag (L, *H).
 
         `strict` takes a share for nothing if its mass is: a controller that opposes the motion
         looks like drag with the other sign, but not like a mass.
@@ -73,19 +75,16 @@ class Driven:
         self, weights: np.ndarray, lags: Sequence[int], strict: bool = False
     ) -> tuple[np.ndarray, dict, np.ndarray]:
         """Evidence, shares and lag (an index) of each hypothesis at its most likely lag."""
-        tried = [self.shares(weights, lag, strict) for lag in lags]
-        nats = np.stack([self.evidence(shares) for shares in tried])
+        shares = self.shares(weights, lags, strict)
+        nats = np.broadcast_to(self.evidence(shares), (len(lags), *weights.shape[2:]))
         at = nats.argmax(axis=0)
-        picked = {
-            i: np.take_along_axis(np.stack([s[i] for s in tried]), at[None], 0)[0]
-            for i in self.axes
-        }
+        picked = {i: np.take_along_axis(s, at[None], 0)[0] for i, s in shares.items()}
         return nats.max(axis=0), picked, np.asarray(lags)[at]
 
     def nats(self, axis: int) -> float:
         """Evidence for any relation of an axis' motion to its command, of either sign, any lag."""
         r = self.axes[axis]
-        shares = [r.fit(s * self.weights[axis], lag)[0] for lag in ALL for s in (1, -1)]
+        shares = r.fit(np.stack([self.weights[axis], -self.weights[axis]], axis=-1), ALL)[0]
         return float(-0.5 * r.count * np.log1p(-np.max(shares)))
 
     def expected(self, axis: int) -> float:

@@ -99,8 +99,8 @@ def fitted(
     r: AxisResponse, weights: Float[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """m, d, e of an axis and their standard errors at the most likely lag; zeros without answer."""
-    shares = [float(r.fit(weights, lag)[0]) for lag in PLAUSIBLE]
-    lag, share = PLAUSIBLE[int(np.argmax(shares))], max(shares)
+    shares = r.fit(weights, PLAUSIBLE)[0]
+    lag, share = PLAUSIBLE[int(np.argmax(shares))], float(np.max(shares))
     if share < MOST:
         return np.zeros(3), np.full(3, np.inf)
     size = np.sqrt(np.maximum(np.diag(r.RR), 1e-300))

@@ -16,6 +16,7 @@ linear filter on both sides leaves the coefficients unchanged.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -30,7 +31,11 @@ LAGS_S = np.round(np.arange(-1.0, 1.01, 0.1), 3)
 _LEAST_RUN = 8
 """Windows that a run must have to be used."""
 _ACF_S = 5.0
-_SUBSETS = [np.array(s) for s in ([0], [1], [2], [0, 1], [0, 2], [1, 2], [0, 1, 2])]
+_SUBSETS = np.stack([
+    np.outer(used, used)
+    for used in ([1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 0, 1], [0, 1, 1], [1, 1, 1])
+])  # fmt: skip
+"""Parts of RR: 1 where both coefficients are used."""
 _CORIOLIS = {0: ((1, 5), (2, 4)), 1: ((2, 3), (0, 5)), 2: ((0, 4), (1, 3)),
              3: ((4, 5), (1, 2)), 4: ((3, 5), (0, 2)), 5: ((3, 4), (0, 1))}  # fmt: skip
 """Products of twist components in the equation of each axis: Coriolis and Munk terms."""
@@ -55,25 +60,30 @@ class AxisResponse:
     windows: int
 
     def fit(
-        self, weights: Float[np.ndarray, "m *H"], lag: int
-    ) -> tuple[Float[np.ndarray, "*H"], Float[np.ndarray, "*H"]]:
+        self, weights: Float[np.ndarray, "m *H"], lag: int | Sequence[int]
+    ) -> tuple[Float[np.ndarray, "*L_H"], Float[np.ndarray, "*L_H"]]:
         """Share of the force C·weights that the motion accounts for, and the mass m fitted to it.
 
-        `weights` may have trailing axes of hypotheses; `lag` is an index into `LAGS_S`.
+        `weights` may have trailing axes of hypotheses; `lag` is an index into `LAGS_S`, or several,
+        which then are the first axis of both.
         """
         w = weights.reshape(len(weights), -1)
-        size = np.einsum("mh,mn,nh->h", w, self.CC[lag], w)
+        size = np.sum((self.CC[lag] @ w) * w, axis=-2)
         b = self.RC[lag] @ w
-        best, mass = np.zeros(w.shape[1]), np.zeros(w.shape[1])
-        for subset in _SUBSETS:
-            own = self.RR[np.ix_(subset, subset)]
-            x = np.linalg.lstsq(own, b[subset], rcond=1e-10)[0]
-            gain = np.where((x >= 0).all(axis=0), np.sum(x * b[subset], axis=0), 0.0)
-            mass = np.where(gain > best, x[0] if subset[0] == 0 else 0.0, mass)
-            best = np.maximum(best, gain)
+        x = self._inverses.reshape(-1, *(1,) * (b.ndim - 2), 3, 3) @ b
+        gain = np.where((x >= 0).all(axis=-2), np.sum(x * b, axis=-2), 0.0)
+        at = gain.argmax(axis=0)[None]
+        best, mass = (np.take_along_axis(of, at, 0)[0] for of in (gain, x[..., 0, :]))
         share = np.where(size > 0, best / np.maximum(size, 1e-300), 0.0)
-        shape = weights.shape[1:]
-        return np.clip(share, 0.0, 1.0 - 1e-6).reshape(shape), mass.reshape(shape)
+        shape = share.shape[:-1] + weights.shape[1:]
+        mass = np.where(best > 0, mass, 0.0).reshape(shape)
+        return np.clip(share, 0.0, 1.0 - 1e-6).reshape(shape), mass
+
+    @cached_property
+    def _inverses(self) -> Float[np.ndarray, "7 3 3"]:
+        """Of the part of RR that each subset of the coefficients has, zero elsewhere."""
+        found = np.linalg.pinv(self.RR * _SUBSETS, rcond=1e-10, hermitian=True)
+        return found * _SUBSETS
 
 
 def responses(

@@ -17,8 +17,10 @@ from spinndrift.models.config.typed_yaml import dump, loads
 from spinndrift.models.disturbances import GaussMarkovCurrent
 from spinndrift.models.vehicles.vehicle import load_vehicle
 from spinndrift.systems.closed_loop import build_diagram, logged, seeded
+from spinndrift.systems.compiled.jit import VectorFunction
 from spinndrift.systems.compiled.pure import Event, Pure, shown
 from spinndrift.systems.compiled.simulator import CompiledSimulator
+from spinndrift.systems.compiled.structure import structure
 from spinndrift.systems.controllers.health_gate import HealthGate
 from spinndrift.systems.controllers.kinds import MppiImpedance, Own, Tracking, TrackReference
 from spinndrift.systems.estimation.config import EkfConfig
@@ -111,6 +113,26 @@ def test_the_observer_sees_the_currents_push():
     expected = drag(jnp.asarray([*v, 0.0, 0.0, 0.0]))
     push = bias.value[bias.time > 8.0].mean(axis=0)
     np.testing.assert_allclose(push[:2], -expected[:2], rtol=0.15)
+
+
+def keys(diagram):
+    """The keys of all compiled functions of the diagram's systems."""
+    found, waiting = [], [diagram]
+    for system in waiting:
+        waiting += system.GetSystems() if hasattr(system, "GetSystems") else []
+        parts = [f for _, f in sorted(vars(system).items()) if isinstance(f, VectorFunction)]
+        found += [(system.get_name(), structure(f._function)) for f in parts]
+    return found
+
+
+def test_what_is_equal_in_two_diagrams_has_equal_keys(diagram):
+    """So it is traced once: filter, controller and observer whatever the water is."""
+    calm = keys(build_diagram(replace(HARBOUR, disturbances=()), HOLD))
+    assert keys(build_diagram(HARBOUR, HOLD)) == keys(diagram)
+    assert len(calm) > 10
+    assert all(key is not None for _, key in calm)
+    shared = {name for name, key in calm if key in {other for _, other in keys(diagram)}}
+    assert {"ekf", "impedance", "observer"} <= shared
 
 
 def test_every_signal_is_logged_at_its_rate(harbour_hold):

@@ -121,12 +121,12 @@ def _object(value: Any, seen: dict[int, int]) -> Hashable:
         names = set()
     elif not _from(kind.__module__, _KNOWN):
         raise _NoKeyError
+    elif kind.__eq__ is not object.__eq__:
+        return value
     elif callable(value):
         return _Same(value)
-    elif kind.__eq__ is object.__eq__:
-        raise _NoKeyError
     else:
-        return value
+        raise _NoKeyError
     names |= {n for n in getattr(value, "__dict__", ()) if not _cached(kind, n)}
     return tuple((n, _key(getattr(value, n), seen)) for n in sorted(names))
 

@@ -1,6 +1,7 @@
 """Impedance control: tracks a plan with stiffness and damping."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -103,6 +104,14 @@ class ImpedanceLaw(eqx.Module):
         return self.limits.clip(jnp.where(jnp.all(jnp.isfinite(F)), F, 0))
 
 
+def _tracking_wrench(
+    law: ImpedanceLaw, layout: PlanLayout, t: Array, plan: Array, X: Array, V: Array
+) -> Array:
+    wanted = layout.at(plan, t[0])
+    F = law(X, V, wanted.X_WB, wanted.V_WB_B, wanted.F_Bo_B)
+    return jnp.where(wanted.valid, F, 0)
+
+
 class Impedance(LeafSystem):
     """Tracks the `plan` of a planner or a reference every `period` with an `ImpedanceLaw`.
 
@@ -133,12 +142,8 @@ class Impedance(LeafSystem):
         self._F = self.DeclareDiscreteState(6)
         self.DeclareStateOutputPort("F_Bo_B", self._F)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self._call = partial(_tracking_wrench, law, layout)
         self._step = VectorFunction(self._call, [1, layout.size, 7, 6], [6])
-
-    def _call(self, t: Array, plan: Array, X: Array, V: Array) -> Array:
-        wanted = self.layout.at(plan, t[0])
-        F = self.law(X, V, wanted.X_WB, wanted.V_WB_B, wanted.F_Bo_B)
-        return jnp.where(wanted.valid, F, 0)
 
     def pure(self) -> Pure:
         """The update as a pure function."""

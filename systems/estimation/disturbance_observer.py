@@ -1,5 +1,6 @@
 """Observes the steady wrench that is not in the model: a current, a tether, ballast."""
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -90,6 +91,21 @@ class MomentumObserver(eqx.Module):
         return ObserverState(bias, keep(X_WB, X), keep(V_WB_B, V), keep(F_Bo_B, state.F_Bo_B), seen)
 
 
+def _observed(
+    observer: MomentumObserver,
+    period: float,
+    bias: Array,
+    memory: Array,
+    X: Array,
+    V: Array,
+    F: Array,
+) -> tuple[Array, Array]:
+    state = ObserverState(bias, memory[:7], memory[7:13], memory[13:19], memory[19])
+    new = observer.step(state, X, V, F, period)
+    memory = jnp.concatenate([new.X_WB, new.V_WB_B, new.F_Bo_B, new.seen.reshape(1)])
+    return new.F_bias_Bo_W, memory
+
+
 class DisturbanceObserver(LeafSystem):
     """Runs a `MomentumObserver` every `period` on the estimated state and the commanded wrench.
 
@@ -120,15 +136,8 @@ class DisturbanceObserver(LeafSystem):
         self._memory = self.DeclareDiscreteState(start)
         self.DeclareStateOutputPort("F_bias_Bo_W", self._bias)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self._call = partial(_observed, observer, period)
         self._step = VectorFunction(self._call, [6, 20, 7, 6, 6], [6, 20])
-
-    def _call(
-        self, bias: Array, memory: Array, X: Array, V: Array, F: Array
-    ) -> tuple[Array, Array]:
-        state = ObserverState(bias, memory[:7], memory[7:13], memory[13:19], memory[19])
-        new = self.observer.step(state, X, V, F, self.period)
-        memory = jnp.concatenate([new.X_WB, new.V_WB_B, new.F_Bo_B, new.seen.reshape(1)])
-        return new.F_bias_Bo_W, memory
 
     def pure(self) -> Pure:
         """The update as a pure function."""

@@ -1,5 +1,7 @@
 """A reference for the tracking controller from a given path, without a planner."""
 
+from functools import partial
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -28,6 +30,19 @@ def feedforward(
     F = F - dynamics.drag_wrench(V, c) - dynamics.potential_wrench(X)
     parts = [se3.rotate_inverse(X, part) for part in (F_bias_Bo_W[:3], F_bias_Bo_W[3:])]
     return F - jnp.concatenate(parts)
+
+
+def _planned(
+    path: Path, model: Dynamics | None, layout: PlanLayout, t: Array, bias: Array
+) -> Array:
+    """The path's motion from t on, as a plan."""
+    motion = path.motion(t + layout.dt * jnp.arange(layout.horizon + 1, dtype=t.dtype))
+    if model is None:
+        X = motion.X_WB
+        F = -jnp.concatenate([se3.rotate_inverse(X, bias[:3]), se3.rotate_inverse(X, bias[3:])])
+    else:
+        F = feedforward(model, motion, bias)
+    return layout.pack(Plan(t[0], motion.X_WB, motion.V_WB_B, F[:, :-1]))
 
 
 class Reference(LeafSystem):
@@ -66,23 +81,13 @@ class Reference(LeafSystem):
                 f"period is {period} s: give one above 0 and up to the plan's {length} s"
             )
         self.path, self.period = path, period
-        self._dynamics = None if dynamics is None else cast(dynamics, jnp.float64)
         self._bias = self.DeclareVectorInputPort("F_bias_Bo_W", 6)
         self._plan = self.DeclareDiscreteState(self.layout.size)
         self.DeclareStateOutputPort("plan", self._plan)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        model = None if dynamics is None else cast(dynamics, jnp.float64)
+        self._call = partial(_planned, path, model, self.layout)
         self._step = VectorFunction(self._call, [1, 6], [self.layout.size])
-
-    def _call(self, t: Array, bias: Array) -> Array:
-        motion = self.path.motion(
-            t + self.layout.dt * jnp.arange(self.layout.horizon + 1, dtype=t.dtype)
-        )
-        if self._dynamics is None:
-            X = motion.X_WB
-            F = -jnp.concatenate([se3.rotate_inverse(X, bias[:3]), se3.rotate_inverse(X, bias[3:])])
-        else:
-            F = feedforward(self._dynamics, motion, bias)
-        return self.layout.pack(Plan(t[0], motion.X_WB, motion.V_WB_B, F[:, :-1]))
 
     def pure(self) -> Pure:
         """The update as a pure function."""

@@ -67,13 +67,13 @@ class AxisResponse:
         `weights` may have trailing axes of hypotheses; `lag` is an index into `LAGS_S`, or several,
         which then are the first axis of both.
         """
-        w = weights.reshape(len(weights), -1)
-        size = np.sum((self.CC[lag] @ w) * w, axis=-2)
-        b = self.RC[lag] @ w
+        w, at = weights.reshape(len(weights), -1), np.asarray(lag)
+        size = np.sum((self.CC[at] @ w) * w, axis=-2)
+        b = self.RC[at] @ w
         x = self._inverses.reshape(-1, *(1,) * (b.ndim - 2), 3, 3) @ b
         gain = np.where((x >= 0).all(axis=-2), np.sum(x * b, axis=-2), 0.0)
-        at = gain.argmax(axis=0)[None]
-        best, mass = (np.take_along_axis(of, at, 0)[0] for of in (gain, x[..., 0, :]))
+        most = gain.argmax(axis=0)[None]
+        best, mass = (np.take_along_axis(of, most, 0)[0] for of in (gain, x[..., 0, :]))
         share = np.where(size > 0, best / np.maximum(size, 1e-300), 0.0)
         shape = share.shape[:-1] + weights.shape[1:]
         mass = np.where(best > 0, mass, 0.0).reshape(shape)

@@ -3,7 +3,6 @@
 import math
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +12,7 @@ from ....models import se3
 from ....models.effects.extended import Extended
 from ....models.effects.library import Library
 from ....models.effects.recent import Recent
-from ...compile_options import LOOP_EMITTERS
+from ...compile_options import LOOP_EMITTERS, jit_with
 from ..data.arrays import Data
 from .along_records import AlongRecords, Records, State, Step, scan, substeps
 from .latent import levels, specific_force_errors
@@ -55,7 +54,7 @@ def difference(
     return jnp.concatenate(jnp.broadcast_arrays(se3.local(X, X2), V2 - V))
 
 
-@eqx.filter_jit(compiler_options=LOOP_EMITTERS)  # pyright: ignore[reportCallIssue]
+@jit_with(LOOP_EMITTERS)
 def _predict(
     model: Extended,
     effects: Any,

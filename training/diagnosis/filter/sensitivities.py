@@ -17,7 +17,7 @@ from ....models.effects.base import Effect
 from ....models.effects.extended import Extended
 from ....models.effects.library import Library, kind
 from ....models.effects.recent import Recent
-from ...compile_options import LOOP_EMITTERS
+from ...compile_options import LOOP_EMITTERS, jit_with
 from ..data.arrays import Data
 from .along_records import Records, settle, with_position
 from .innovations import Predictions
@@ -44,7 +44,7 @@ def _in_double(run: Callable[..., Any], *given: Any) -> Any:
         return run(*given)
 
 
-@eqx.filter_jit(compiler_options=LOOP_EMITTERS)  # pyright: ignore[reportCallIssue]
+@jit_with(LOOP_EMITTERS)
 def _whitened(
     model: Extended,
     effects: Any,

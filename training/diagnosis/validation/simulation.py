@@ -14,7 +14,7 @@ from ....models import se3
 from ....models.effects.base import Effect
 from ....models.effects.extended import FOR_EVER, Extended, Random
 from ....models.effects.inertia import Inertia, times
-from ...compile_options import LOOP_EMITTERS
+from ...compile_options import LOOP_EMITTERS, jit_with
 from ..filter.along_records import AlongRecords, Records, State, Step, scan
 from ..filter.innovations import difference
 from ..filter.problem import DiagnosisProblem
@@ -133,7 +133,7 @@ class _Noise(eqx.Module):
         return V + jnp.sum(M * (b * dW)[None], axis=1)
 
 
-@eqx.filter_jit(compiler_options=LOOP_EMITTERS)  # pyright: ignore[reportCallIssue]
+@jit_with(LOOP_EMITTERS)
 def _errors(
     model: Extended,
     effects: tuple[Effect, ...],

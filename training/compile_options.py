@@ -16,7 +16,8 @@ LOOP_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
 (`diagnose` of five minutes of data on one core: 179 to 130 s the first time, 73 and 61 s with its
 programs in the cache). A training step compiles faster too but takes an eighth longer."""
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def jit_with(options: Mapping[str, Any]) -> Callable[[Callable[P, R]], Callable[P, R]]:

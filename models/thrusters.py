@@ -38,6 +38,9 @@ class Thrusters(eqx.Module):
     `allocate` meets the other axes exactly and disregards these: it is the least-squares solution
     in the limit of no weight on them.
 
+    `bias` is each group's null-space vector, `biased` the thrusters where it is not zero: a
+    static field, so that XLA is given no large arrays of constants to fold.
+
     `motor_directions` are ArduSub's MOT_n_DIRECTION: -1 where PWM above 1500 turns the propeller
     backwards, so that the thruster gives its reverse thrust; there the autopilot's mixer mirrors
     its output about 1500, and so does `pwm`.

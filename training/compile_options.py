@@ -12,18 +12,18 @@ QUICK_COMPILE = {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_wid
 76 ms per step), and the processor's full vector width, of which XLA uses half by default."""
 
 LOOP_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
-"""On a CPU, the filter along recorded runs: its programs compile in half the time and run as fast
-(`diagnose` of five minutes of data on one core: 179 to 130 s the first time, 73 and 61 s with its
-programs in the cache). A training step compiles faster too but takes an eighth longer."""
+"""On a CPU, the filter along recorded runs: it compiles faster and runs as fast (one diagnosis on
+one core: 179 to 130 s without cached programs, 73 to 61 s with them). A training step compiles
+faster too, but takes an eighth longer."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 def jit_with(options: Mapping[str, Any]) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """`eqx.filter_jit` with options of XLA; without them where another version of it has none such.
+    """`eqx.filter_jit` with compiler options, and without them if this XLA does not know them.
 
-    For options that save time alone: those without which a program fails have to be asked for.
+    Only for options that save time: a program that needs an option must not lose it silently.
     """
 
     def decorated(function: Callable[P, R]) -> Callable[P, R]:

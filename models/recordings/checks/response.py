@@ -81,7 +81,7 @@ class AxisResponse:
 
     @cached_property
     def _inverses(self) -> Float[np.ndarray, "7 3 3"]:
-        """Of the part of RR that each subset of the coefficients has, zero elsewhere."""
+        """Inverse of RR restricted to each subset of the coefficients, zero elsewhere."""
         found = np.linalg.pinv(self.RR * _SUBSETS, rcond=1e-10, hermitian=True)
         return found * _SUBSETS
 

@@ -1,11 +1,14 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from pydrake.systems.framework import LeafSystem
 
-from spinndrift.systems.compiled.jit import Lowered, VectorFunction, compiled, together
+from spinndrift.systems.compiled.jit import Lowered, VectorFunction, compiled, shared, together
 from spinndrift.systems.drake import value_or_zeros
+from spinndrift.systems.planning.plan_samples import SampleLayout
 
 
 def test_arguments_and_results_keep_their_order_and_sizes():
@@ -60,6 +63,14 @@ def test_programs_of_one_text_but_other_trees_are_two():
     assert pair is again
     assert compiled(Lowered(code[0], like)) == [pair]
     assert set(named.call(np.ones(2))) == {"x", "y"}
+
+
+def test_what_equal_functions_make_is_shared():
+    one, twin, other = (partial(SampleLayout, 3, dt, 2) for dt in (0.1, 0.1, 0.2))
+    made = shared(one)
+    assert shared(twin) is made
+    assert shared(other) == SampleLayout(3, 0.2, 2)
+    assert shared(lambda: SampleLayout(3, 0.1, 2)) is not made  # nothing is known of this function
 
 
 def test_programs_run_together_give_each_its_own():

@@ -416,6 +416,7 @@ def test_the_system_plans_from_its_ports_and_repeats_itself():
     assert samples.p_WB.shape == (40, 3, 7)
     assert figures["valid"] == 1
     assert figures["effective_samples"] == pytest.approx(12, rel=0.02)
+    assert Mppi(among())._programs is system._programs
 
 
 @pytest.mark.slow

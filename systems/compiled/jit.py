@@ -6,7 +6,7 @@ from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, cached_property
 from itertools import accumulate, pairwise
-from typing import Any
+from typing import Any, TypeVar
 from weakref import WeakValueDictionary
 
 import jax
@@ -16,6 +16,8 @@ from jaxtyping import Array, Float
 
 from ...models.config import checks
 from .structure import structure
+
+T = TypeVar("T")
 
 _INLINE = {
     "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
@@ -52,6 +54,20 @@ _RECENT: deque[Program] = deque(maxlen=8)
 
 _BY_STRUCTURE: WeakValueDictionary[Hashable, Program] = WeakValueDictionary()
 """Programs by the structure of functions, so that equal ones need not be traced again."""
+
+
+_SHARED: WeakValueDictionary[Hashable, Any] = WeakValueDictionary()
+
+
+def shared(make: Callable[[], T]) -> T:
+    """What `make` returns, or what an equal function (`structure`) returned, while that lives."""
+    key = structure(make)
+    found: T | None = None if key is None else _SHARED.get(key)
+    if found is None:
+        found = make()
+        if key is not None:
+            _SHARED[key] = found
+    return found
 
 
 class Lowered:

@@ -1,7 +1,8 @@
 """The path integral planner in a diagram."""
 
 from collections.abc import Sequence
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, partial
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -13,7 +14,7 @@ from jaxtyping import Array, Float, UInt32
 from pydrake.common import RandomDistribution
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from ..compiled.jit import Lowered, Program, compiled, require_double, together
+from ..compiled.jit import Lowered, compiled, require_double, shared, together
 from ..compiled.pure import Event, Inputs, Pure, State, shown
 from ..drake import group, set_groups, value, value_or_zeros
 from .mppi_core import Draw, MppiPlanner, MppiState
@@ -36,6 +37,50 @@ def key_from_gaussians(w: Float[Array, "4"]) -> UInt32[Array, "2"]:
     """A threefry key from the bits of four unit Gaussians (float64, so some 200 random bits)."""
     bits = jax.lax.bitcast_convert_type(w, jnp.uint32).reshape(2, 4)
     return bits[:, 0] ^ bits[:, 1] ^ bits[:, 2] ^ bits[:, 3]
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """What a call computes, as functions of vectors: draw, roll out every part, choose."""
+
+    planner: MppiPlanner
+    samples: SampleLayout
+
+    def draw(
+        self, t: Array, nominal: Array, X: Array, V: Array, bias: Array, noise: Array
+    ) -> Draw:
+        state = MppiState(nominal.reshape(-1, 6))
+        return self.planner.draw(state, key_from_gaussians(noise), X, V, bias, t)
+
+    def roll(self, part: Array, at: Situation) -> Rolled:
+        return self.planner.roll(part, at)
+
+    def choose(self, t: Array, draw: Draw, rolled: Sequence[Rolled]) -> Array:
+        state, out = self.planner.choose(draw, rolled)
+        wide = jax.tree.map(lambda a: a.astype(t.dtype), out)
+        layout = self.planner.config.layout
+        plan = layout.pack(Plan(t[0], wide.X_WB, wide.V_WB_B, wide.F_Bo_B))
+        samples = self.samples.pack(t[0], wide.paths, wide.path_weights)
+        plan, samples = jnp.where(out.valid, plan, 0), jnp.where(out.valid, samples, 0)
+        figures = jnp.stack([getattr(wide, name) for name in FIGURES])
+        return jnp.concatenate([state.F_Bo_B.ravel().astype(t.dtype), plan, samples, figures])
+
+
+class _Programs:
+    """The compiled steps; `roll` has one program for each part (equal parts share it)."""
+
+    def __init__(self, steps: _Steps):
+        vector = {n: jax.ShapeDtypeStruct((n,), np.float64) for n in (1, 4, 6, 7)}
+        nominal = jax.ShapeDtypeStruct((6 * steps.planner.config.horizon,), np.float64)
+        of_draw = vector[1], nominal, vector[7], vector[6], vector[6], vector[4]
+        draw = Lowered(steps.draw, *of_draw)
+        parts, at = draw.result.parts, draw.result.at
+        roll = {part.shape: Lowered(steps.roll, part, at) for part in parts}
+        rolled = [roll[part.shape].result for part in parts]
+        choose = Lowered(steps.choose, vector[1], draw.result, rolled)
+        self.draw, self.choose, *rolling = compiled(draw, choose, *roll.values())
+        by_shape = dict(zip(roll, rolling, strict=True))
+        self.roll = [by_shape[part.shape] for part in parts]
 
 
 class Mppi(LeafSystem):
@@ -75,6 +120,7 @@ class Mppi(LeafSystem):
         self.samples = SampleLayout(
             config.horizon, config.dt, min(config.shown_paths, config.sequences)
         )
+        self._steps = _Steps(planner, self.samples)
         self._X = self.DeclareVectorInputPort("X_WB", 7)
         self._V = self.DeclareVectorInputPort("V_WB_B", 6)
         self._bias = self.DeclareVectorInputPort("F_bias_Bo_W", 6)
@@ -98,37 +144,9 @@ class Mppi(LeafSystem):
         return np.asarray(first.F_Bo_B, float).ravel()
 
     @cached_property
-    def _programs(self) -> tuple[Program, list[Program], Program]:
-        """Programs that draw, roll out (one for each part; equal parts share it) and choose."""
-        vector = {n: jax.ShapeDtypeStruct((n,), np.float64) for n in (1, 4, 6, 7)}
-        nominal = jax.ShapeDtypeStruct((6 * self.planner.config.horizon,), np.float64)
-        of_draw = vector[1], nominal, vector[7], vector[6], vector[6], vector[4]
-        draw = Lowered(self._draw, *of_draw)
-        parts, at = draw.result.parts, draw.result.at
-        roll = {part.shape: Lowered(self._roll, part, at) for part in parts}
-        rolled = [roll[part.shape].result for part in parts]
-        choose = Lowered(self._choose, vector[1], draw.result, rolled)
-        drawing, choosing, *rolling = compiled(draw, choose, *roll.values())
-        by_shape = dict(zip(roll, rolling, strict=True))
-        return drawing, [by_shape[part.shape] for part in parts], choosing
-
-    def _draw(
-        self, t: Array, nominal: Array, X: Array, V: Array, bias: Array, noise: Array
-    ) -> Draw:
-        state = MppiState(nominal.reshape(-1, 6))
-        return self.planner.draw(state, key_from_gaussians(noise), X, V, bias, t)
-
-    def _roll(self, part: Array, at: Situation) -> Rolled:
-        return self.planner.roll(part, at)
-
-    def _choose(self, t: Array, draw: Draw, rolled: Sequence[Rolled]) -> Array:
-        state, out = self.planner.choose(draw, rolled)
-        wide = jax.tree.map(lambda a: a.astype(t.dtype), out)
-        plan = self.layout.pack(Plan(t[0], wide.X_WB, wide.V_WB_B, wide.F_Bo_B))
-        samples = self.samples.pack(t[0], wide.paths, wide.path_weights)
-        plan, samples = jnp.where(out.valid, plan, 0), jnp.where(out.valid, samples, 0)
-        figures = jnp.stack([getattr(wide, name) for name in FIGURES])
-        return jnp.concatenate([state.F_Bo_B.ravel().astype(t.dtype), plan, samples, figures])
+    def _programs(self) -> _Programs:
+        """The compiled steps, shared by equal planners."""
+        return shared(partial(_Programs, self._steps))
 
     def plan(
         self,
@@ -143,11 +161,11 @@ class Mppi(LeafSystem):
 
         `nominal` holds the wrenches (horizon × 6) planned by the previous call, from its time on.
         """
-        draw, roll, choose = self._programs
+        programs = self._programs
         now = np.array([t])
-        drawn = draw.call(now, nominal, X_WB, V_WB_B, F_bias_Bo_W, noise)
-        rolled = together(roll, [(part, drawn.at) for part in drawn.parts])
-        flat = np.asarray(choose.call(now, drawn, rolled))
+        drawn = programs.draw.call(now, nominal, X_WB, V_WB_B, F_bias_Bo_W, noise)
+        rolled = together(programs.roll, [(part, drawn.at) for part in drawn.parts])
+        flat = np.asarray(programs.choose.call(now, drawn, rolled))
         return [flat[part] for part in self._slices]
 
     def pure(self) -> Pure:
@@ -156,11 +174,10 @@ class Mppi(LeafSystem):
         def update(t: Array, state: State, inputs: Inputs) -> dict[int, Array]:
             now = t[None]
             bias = inputs.get("F_bias_Bo_W", jnp.zeros(6))
-            draw = self._draw(
-                now, state[0], inputs["X_WB"], inputs["V_WB_B"], bias, inputs["noise"]
-            )
-            rolled = [self._roll(part, draw.at) for part in draw.parts]
-            flat = self._choose(now, draw, rolled)
+            X, V, noise = (inputs[name] for name in ("X_WB", "V_WB_B", "noise"))
+            draw = self._steps.draw(now, state[0], X, V, bias, noise)
+            rolled = [self._steps.roll(part, draw.at) for part in draw.parts]
+            flat = self._steps.choose(now, draw, rolled)
             return {group: flat[part] for group, part in enumerate(self._slices)}
 
         outputs = {name: shown(1 + i) for i, name in enumerate(("plan", "samples", "figures"))}

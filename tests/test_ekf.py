@@ -180,3 +180,16 @@ def test_same_seed_same_bits(chain):
         return builder.Build()
 
     check_reproducible(build, end=0.6)
+
+
+def test_filters_share_programs_wherever_they_start_and_no_others():
+    names = ("_start", "_take_in", "_move", "_fuse", "_show")
+
+    def keys(ekf: Ekf) -> list:
+        return [getattr(ekf, name)._key() for name in names]
+
+    first = keys(Ekf())
+    assert all(isinstance(key, tuple) for key in first)  # known, not the functions themselves
+    assert keys(Ekf(X0_WB=X0, V0_WB_B=np.full(6, 0.1))) == first
+    other = keys(Ekf(SHIPPED | {"depth": DepthSensor(noise=0.5)}))
+    assert all(a != b for a, b in zip(first, other, strict=True))

@@ -29,16 +29,22 @@ _WAITING = 6  # state group of the buffered samples, after the filter's own and 
 class _Flat:
     """The filter's functions of flat vectors, as which Drake keeps its state."""
 
-    def __init__(self, core: DelayedFilter, X_WB: Array, V_WB_B: Array):
+    def __init__(self, core: DelayedFilter):
         self.core = core
-        self.start, self.unravel = ravel_pytree(core.init(X_WB, V_WB_B))
+        like = jax.eval_shape(core.init, jnp.zeros(7), jnp.zeros(6))
+        zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
+        self.unravel = ravel_pytree(zeros)[1]
+
+    def start(self, X_WB: Array, V_WB_B: Array) -> Array:
+        """The state at a start without error."""
+        return ravel_pytree(self.core.init(X_WB, V_WB_B))[0]
 
     def initialise(self, w: Array, X_WB: Array, V_WB_B: Array) -> tuple[Array, ...]:
         """State and outputs at time 0 for a start, with an initial error of the noise `w`."""
         error = self.core.deviations()[:9] * w
         X = se3.retract(X_WB, error[:6])
         V = V_WB_B + jnp.concatenate([error[6:], jnp.zeros(3, w.dtype)])
-        flat = ravel_pytree(self.core.init(X, V))[0]
+        flat = self.start(X, V)
         return flat, *self.show(flat, jnp.zeros((), w.dtype))
 
     def show(self, flat: Array, t: Array) -> tuple[Array, ...]:
@@ -149,7 +155,8 @@ class Ekf(LeafSystem):
         core = self.filter
         X0 = np.array([1.0, 0, 0, 0, 0, 0, 0]) if X0_WB is None else X0_WB
         X0, V0 = check_state(X0, np.zeros(6) if V0_WB_B is None else V0_WB_B)
-        self._flat = flat = _Flat(core, jnp.asarray(X0), jnp.asarray(V0))
+        self._flat = flat = _Flat(core)
+        start = np.asarray(flat.start(jnp.asarray(X0), jnp.asarray(V0)))
 
         sizes = {"imu": core.imu.port_size}
         sizes |= {name: each.port_size for name, each in aids.items()}
@@ -161,7 +168,7 @@ class Ekf(LeafSystem):
         outputs |= {"status": len(status_names([*aids])), "health": len(health_names([*aids]))}
         self._ratio, self._period = round(core.imu.rate / core.config.output_rate), core.period
         self._samples = core.samples_at_once(self._ratio)
-        self._filter = self.DeclareDiscreteState(BasicVector(np.asarray(flat.start).tolist()))
+        self._filter = self.DeclareDiscreteState(BasicVector(start.tolist()))
         self._outputs = [self.DeclareDiscreteState(size) for size in outputs.values()]
         self._given = self.DeclareNumericParameter(vector(np.concatenate([X0, V0])))
         self._waiting = self.DeclareDiscreteState(6 * (self._samples - 1))
@@ -170,7 +177,7 @@ class Ekf(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._initialise)
         self.DeclarePeriodicDiscreteUpdateEvent(core.period, 0.0, self._update)
 
-        n, m, results = flat.start.size, self._samples, list(outputs.values())
+        n, m, results = start.size, self._samples, list(outputs.values())
         self._start = VectorFunction(flat.initialise, [9, 7, 6], [n, *results])
         # Several calls: XLA runs small programs inline and larger ones on its thread pool.
         self._take_in = VectorFunction(

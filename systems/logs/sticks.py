@@ -181,13 +181,15 @@ def _map(s: Float[np.ndarray, "m k"], u: Float[np.ndarray, "n k"]) -> Float[np.n
     Demands whose coefficients are within doubt of zero are left out.
     """
     ds, du = np.diff(s).T, np.diff(u).T
-    C = np.linalg.lstsq(ds, du, rcond=1e-6)[0].T
-    spread = np.sqrt(np.diag(np.linalg.pinv(ds.T @ ds, rcond=1e-12, hermitian=True)))
+    Q, R = np.linalg.qr(ds)  # few rows in place of all samples, with the same solutions
+    y = Q.T @ du
+    C = np.linalg.lstsq(R, y, rcond=1e-6)[0].T
+    spread = np.sqrt(np.diag(np.linalg.pinv(R.T @ R, rcond=1e-12, hermitian=True)))
     noise = np.sqrt(np.mean((du - ds @ C.T) ** 2, axis=0))
     kept = np.abs(C) > _DOUBT * noise[:, None] * spread
     for i in np.flatnonzero(~kept.all(axis=1)):
         C[i] = 0.0
-        C[i, kept[i]] = np.linalg.lstsq(ds[:, kept[i]], du[:, i], rcond=1e-6)[0]
+        C[i, kept[i]] = np.linalg.lstsq(R[:, kept[i]], y[:, i], rcond=1e-6)[0]
     return C
 
 

@@ -46,9 +46,7 @@ class _Steps:
     planner: MppiPlanner
     samples: SampleLayout
 
-    def draw(
-        self, t: Array, nominal: Array, X: Array, V: Array, bias: Array, noise: Array
-    ) -> Draw:
+    def draw(self, t: Array, nominal: Array, X: Array, V: Array, bias: Array, noise: Array) -> Draw:
         state = MppiState(nominal.reshape(-1, 6))
         return self.planner.draw(state, key_from_gaussians(noise), X, V, bias, t)
 

@@ -1,5 +1,6 @@
 """Settings that every test runs under; nothing in the library sets them."""
 
+import functools
 import gc
 import os
 import signal
@@ -10,6 +11,7 @@ import hypothesis
 import jax
 import jaxtyping
 import pytest
+from jax._src.interpreters import mlir
 
 from spinndrift.sims.compile_cache import (
     compiled_environment,
@@ -22,8 +24,12 @@ from spinndrift.sims.compile_cache import (
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_traceback_in_locations_limit", 0)  # lowered in less time, cached alike
 
 
+# Every program keeps an MLIR context of its own, 1 MB and some ms to make, of which there would be
+# thousands: here all share one.
+mlir.make_ir_context = functools.cache(mlir.make_ir_context)
 # Tracing allocates much that stays: fewer collections take an eighth of the time off.
 gc.set_threshold(100_000, 50, 1000)
 keep_compiled(Path(__file__).resolve().parent.parent / ".jax_cache")  # shared by all workers

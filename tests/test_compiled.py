@@ -282,11 +282,15 @@ def test_a_planner_flies_as_in_drake():
     assert loop.timing.summary()["planner_median_ms"] is None  # it is not a step of its own
 
 
+_TRACED = ("pylon_crossing_harbour", "station_keeping_calm")
+"""With all systems, and with the fewest."""
+
+
 @pytest.mark.parametrize(
     "name",
     [
         # test_every_scenario_flies has the others in Drake's loop
-        pytest.param(n, marks=[pytest.mark.slow] * ("pylon" in n and "calm" in n))
+        pytest.param(n, marks=[pytest.mark.slow] * (n not in _TRACED))
         for n in scenario_names()
         if not n.endswith("_vehicle")
     ],

@@ -140,7 +140,9 @@ def test_noise_is_found_and_innovations_are_white_on_a_null(null):
         assert diagnoser.data.steps == 20 * 110  # half a second is what thrusters remember
 
 
-@pytest.mark.parametrize("reckoned", [(), pytest.param((0, 1, 2), marks=pytest.mark.slow), (0, 1)])
+@pytest.mark.parametrize(
+    "reckoned", [(0, 1), *(pytest.param(c, marks=pytest.mark.slow) for c in ((), (0, 1, 2)))]
+)
 def test_responses_of_instruments_are_derivatives_of_the_innovations(null, reckoned):
     """Also where instruments are at fault already: records differ as they show states.
 
@@ -517,6 +519,7 @@ def test_how_thrusters_follow_is_told_with_number_and_place(tmp_path, name, seed
     assert words in told["description"]
 
 
+@pytest.mark.slow
 def test_a_velocity_that_heading_turns_is_found_with_its_terms_alone(tmp_path):
     """And thrusters of ten times the force are tried with steps and rates of ten times the size."""
     from spinndrift.training.diagnosis.candidates.groups import described, groups, refined
@@ -795,6 +798,7 @@ def test_too_little_data_and_pulses_as_forces_are_refused(tmp_path):
         Diagnoser(Recording(pulses), VEHICLE)
 
 
+@pytest.mark.slow
 def test_times_below_those_of_sparse_commands_are_no_cause(tmp_path):
     """Lines between commands that were logged now and then show as a small delay of something."""
     case, recording = recorded(tmp_path, 3, names=("clock_offset",), size=0.3)

@@ -53,7 +53,7 @@ def test_of_two_powers_with_one_parameter_each_the_data_decide(won, named, liste
     assert (choice.hypothesis, choice.ties) == (named, listed)
 
 
-@pytest.mark.parametrize("kind", [CubicDrag, QuadraticDrag])
+@pytest.mark.parametrize("kind", [pytest.param(CubicDrag, marks=pytest.mark.slow), QuadraticDrag])
 def test_the_hidden_power_of_yaw_is_chosen_in_closed_loop(tmp_path, kind):
     """At 0.85 rad/s, v³ wins 69 nats of 3477 over v|v|: less than 2 %, but 6 standard errors."""
     problem = problem_of(tmp_path, kind, AXES.index("yaw"), "closed")

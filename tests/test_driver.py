@@ -172,7 +172,9 @@ def test_a_guard_holds_depth_with_neutral_sticks(port: int):
     check_at_rest(port)
 
 
-@pytest.mark.parametrize("way", ["manual_control", "thruster_passthrough"])
+@pytest.mark.parametrize(
+    "way", [pytest.param("manual_control", marks=pytest.mark.slow), "thruster_passthrough"]
+)
 def test_directions_are_the_vehicles_and_outputs_are_told_with_the_scenarios(port: int, way):
     thrusters, F = load_vehicle("bluerov2_heavy").thrusters(), WRENCHES[0]
     with Link(Connection.parse(f"tcp:127.0.0.1:{port}")) as link:

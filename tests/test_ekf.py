@@ -96,7 +96,8 @@ def test_the_system_takes_the_steps_of_the_filter(chain):
         np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize("rate", [7.0, pytest.param(50.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [7.0, 50.0])
 def test_every_reading_of_a_sensor_is_fused_whatever_its_rate(rate):
     """Also if a sensor reads faster than estimates appear, or at odd times."""
     builder = DiagramBuilder()
@@ -126,6 +127,7 @@ def test_estimates_appear_at_their_rate_and_are_held(chain):
     np.testing.assert_array_equal(np.flatnonzero(changed) + 1, np.arange(5, 40, 5))
 
 
+@pytest.mark.slow
 def test_the_errors_stay_within_their_covariance(chain):
     squares = []
     for seed in range(4):

@@ -62,6 +62,7 @@ def test_a_run_that_fails_leaves_the_others_alone(data):
     assert not well.events
 
 
+@pytest.mark.slow
 def test_a_break_changes_no_bit(data, tmp_path):
     def stop_at_five(step, total, loss):
         if step == 5:

@@ -65,6 +65,7 @@ def test_all_maneuvers_are_flown_as_they_say(lagging):
         assert np.flatnonzero(u.any(axis=0)).tolist() == [k % 8], "one thruster alone"
 
 
+@pytest.mark.slow
 def test_a_chirp_tells_a_lag_from_a_delay_and_drifting_tells_nothing(lagging):
     problem, evaluation, fit = lagging
     choice = Choice(LAG, fit, (DELAY,), ())

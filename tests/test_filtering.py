@@ -27,6 +27,8 @@ AIDS = (Dvl(), DepthSensor(), Compass())
 SHOWN = es.INERTIAL + len(AIDS)
 VALUES = sum(each.value_size for each in AIDS)
 ERRORS = SHOWN + 2 * VALUES
+transition = jax.jit(partial(es.transition, imu=Imu(), aids=AIDS))
+update = jax.jit(measurement.update)
 
 
 def navigation(scale: float = 1.0) -> es.Navigation:
@@ -88,8 +90,8 @@ def test_the_transition_is_the_derivative_of_a_step(time):
         after = es.apply(state, sample, imu.gravity)
         return after._replace(sensors=sensors_after(after.sensors, T))
 
-    after = step(x)
-    F, _ = es.transition(x, after, force, rate, T, imu, AIDS)
+    after = jax.jit(step)(x)
+    F, _ = transition(x, after, force, rate, T)
     exact = jax.jacfwd(lambda d: es.error(after, step(es.retract(x, d))))(jnp.zeros(ERRORS))
     angle = float(jnp.linalg.norm(rate)) * time
     np.testing.assert_allclose(F, exact, atol=max(1e-12, 10 * angle**4))
@@ -105,10 +107,10 @@ def test_without_a_force_the_transition_is_the_derivative_of_a_velocity_that_is_
         after = es.apply(state, es.sample_increment(force, omega, T), imu.gravity)
         return after._replace(sensors=sensors_after(after.sensors, T))
 
-    after = step(x)
+    after = jax.jit(step)(x)
     unmeasured = es.Unmeasured(T, jnp.asarray(0.3), jnp.asarray(0.0))
     force = es.held_force(x, rate, imu.gravity)
-    F, Q = es.transition(x, after, force, rate, T, imu, AIDS, unmeasured)
+    F, Q = transition(x, after, force, rate, T, unmeasured=unmeasured)
     exact = jax.jacfwd(lambda d: es.error(after, step(es.retract(x, d))))(jnp.zeros(ERRORS))
     # what is held is so to first order in the angle, and gravity turns with it
     angle = float(jnp.linalg.norm(rate) * T)
@@ -126,7 +128,6 @@ def test_the_transitions_noise_is_that_of_many_small_steps():
     force, rate = se3.rotate_inverse(x.X_WB, jnp.array([0, 0, imu.gravity])), jnp.zeros(3)
     x = x._replace(v_B=jnp.zeros(3))
     P, n, T = jnp.zeros((ERRORS, ERRORS)), 64, 0.1
-    transition = jax.jit(partial(es.transition, imu=imu, aids=AIDS))
     F, Q = transition(x, x, force, rate, jnp.asarray(T / n))
     for _ in range(n):
         P = F @ P @ F.T + Q
@@ -218,7 +219,7 @@ def test_an_update_is_the_conditional_gaussian(used):
         for each in _innovations(x)
     ]
     gates = [np.inf] * 3
-    after, P_after, nis, accepted, _ = measurement.update(x, P, found, jnp.array(used), gates)
+    after, P_after, nis, accepted, _ = update(x, P, found, jnp.array(used), gates)
     np.testing.assert_array_equal(accepted, used)
     r, H, R = measurement.together([f for f, use in zip(found, used, strict=True) if use])
     S = H @ P @ H.T + R
@@ -273,7 +274,7 @@ def test_a_gated_reading_changes_nothing():
     found = _innovations(x)
     found[1] = found[1]._replace(residual=jnp.array([1e3]))
     used, gates = jnp.array([False, True, False]), [float(chi2.ppf(0.999, 1))] * 3
-    after, P_after, nis, accepted, _ = measurement.update(x, P, found, used, gates)
+    after, P_after, nis, accepted, _ = update(x, P, found, used, gates)
     assert not np.any(accepted)
     assert nis[1] > 1e3
     np.testing.assert_allclose(P_after, P, rtol=1e-12)

@@ -13,7 +13,7 @@ from spinndrift.models.config.errors import UserError
 
 pytestmark = pytest.mark.whole
 
-COUNT = 100
+COUNT = 60
 FRAMES = 60
 """Inputs of twenty frames each."""
 BAGS = 30

@@ -308,6 +308,7 @@ def test_set_state_writes_the_context_only():
     np.testing.assert_array_equal(read(plant, "V_WB_B", other), np.zeros(6))
 
 
+@pytest.mark.slow
 def test_same_seed_same_bits():
     def build():
         builder = DiagramBuilder()

@@ -103,7 +103,7 @@ def test_a_boot_in_mid_dive_begins_clock_counts_and_rates_anew(kind: str, plant:
         assert link.statistics().reboots == 1
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [KINDS[0], pytest.param(KINDS[1], marks=pytest.mark.slow)])
 def test_a_clock_that_wraps_goes_on(kind: str, plant: Plant):
     start = MICROSECONDS_32 - 4.0
     with linked(kind, plant, f"{{clock: {start}}}") as (link, _):

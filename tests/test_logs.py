@@ -717,6 +717,7 @@ def test_the_whole_dive_agrees_with_the_simulators_truth():
     assert miss < 0.012
 
 
+@pytest.mark.slow
 def test_climb_of_the_whole_dive_is_the_simulators_at_every_frequency():
     path = shared_data("data", "sitl_log", "dive.tlog")
     truth_ = read_tlog(path.read_bytes(), ("SIM_STATE",)).tables["SIM_STATE"]

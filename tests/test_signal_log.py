@@ -135,7 +135,7 @@ def test_what_shows_the_plants_state_is_its_truth():
 
 def test_a_growing_log_copies_nothing():
     """So a loop in real time never waits for its own log."""
-    rows, n, size = Rows(100, 0.05), 20_000, 101 * 8
+    rows, n, size = Rows(100, 0.05), 10_000, 101 * 8
     value = np.ones(100)
     tracemalloc.start()
     try:

@@ -390,6 +390,18 @@ def test_columns_of_values_are_hypotheses():
         )
 
 
+@pytest.mark.parametrize("count", [(), (64,)])
+def test_effects_keep_their_values_whatever_becomes_of_the_vector(everything, count):
+    theta = np.random.default_rng(0).normal(size=(everything.size, *count))
+    before = theta.copy()
+    effects = everything.filled(theta)
+    theta[:] = np.nan
+    np.testing.assert_array_equal(np.concatenate([e.values for e in effects]), before)
+    traced = jax.jit(everything.filled)(before)
+    for one, other in zip(effects, traced, strict=True):
+        np.testing.assert_array_equal(one.values, other.values)
+
+
 def test_an_extended_model_is_stored_and_rolls_out(tmp_path):
     effects = (
         KINDS["thruster_lag"].of(time_constant=0.1),

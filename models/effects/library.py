@@ -2,10 +2,9 @@
 
 import itertools
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -183,8 +182,13 @@ class Library:
     def filled(self, theta: Float[Array | np.ndarray, "p *batch"]) -> tuple[Effect, ...]:
         """The effects with values from θ, whose batch axes they take."""
         leaves = self._leaves.copy()
-        for at, (a, b) in zip(self._values, itertools.pairwise(self._starts), strict=True):
-            leaves[at] = jnp.asarray(theta[a:b])
+        known = isinstance(theta, np.ndarray)
+        given = theta.copy() if known else theta  # arrays may share the memory
+        parts: Any = [given[a:b] for a, b in itertools.pairwise(self._starts)]
+        if known:
+            parts = jax.device_put(parts)  # `jnp.asarray` compiles a program for every shape
+        for at, part in zip(self._values, parts, strict=True):
+            leaves[at] = part
         return jax.tree.unflatten(self._structure, leaves)
 
     def used(self, theta: Float[np.ndarray, " p"]) -> tuple[Effect, ...]:

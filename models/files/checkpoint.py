@@ -163,7 +163,8 @@ def load_model(
         raise UserError(
             f"{path}: holds numbers that are not finite; train or save the model again."
         )
-    filled = jax.tree.unflatten(treedef, [jnp.asarray(leaf) for leaf in leaves])
+    # `jnp.asarray` would compile a program for every shape
+    filled = jax.tree.unflatten(treedef, jax.device_put(leaves))
     return eqx.combine(filled, static), header["metadata"]
 
 

@@ -7,16 +7,13 @@ Array = np.ndarray
 
 def cross(a: Array, b: Array) -> Array:
     """Return a × b of (3, B)."""
-    c = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    c[0] = a[1] * b[2] - a[2] * b[1]
-    c[1] = a[2] * b[0] - a[0] * b[2]
-    c[2] = a[0] * b[1] - a[1] * b[0]
-    return c
+    a, b = np.concatenate((a, a[:2])), np.concatenate((b, b[:2]))
+    return a[1:4] * b[2:] - a[2:] * b[1:4]
 
 
 def product(p: Array, q: Array) -> Array:
     """Hamilton's product: first q, then p."""
-    return np.stack(
+    return np.array(
         [
             p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
             p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -27,7 +24,7 @@ def product(p: Array, q: Array) -> Array:
 
 
 def conjugate(q: Array) -> Array:
-    return np.stack([q[0], -q[1], -q[2], -q[3]])
+    return np.array([q[0], -q[1], -q[2], -q[3]])
 
 
 def to_world(q: Array, v: Array) -> Array:
@@ -45,14 +42,14 @@ def to_body(q: Array, v: Array) -> Array:
 def up_in_body(q: Array) -> Array:
     """World's z axis in B: the third row of R_WB."""
     w, x, y, z = q
-    return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+    return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
 
 
 def rate(q: Array, omega: Array) -> Array:
     """q̇ = ½ q ∘ (0, ω), ω in B (Fossen 2011, eq. 2.67)."""
     w, x, y, z = q
     p, r, s = 0.5 * omega
-    return np.stack(
+    return np.array(
         [
             -x * p - y * r - z * s,
             w * p + y * s - z * r,

@@ -57,6 +57,7 @@ _BY_STRUCTURE: WeakValueDictionary[Hashable, Program] = WeakValueDictionary()
 
 
 _SHARED: WeakValueDictionary[Hashable, Any] = WeakValueDictionary()
+"""Objects by the structure of what made them (`shared`)."""
 
 
 def shared(make: Callable[[], T]) -> T:

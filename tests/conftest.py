@@ -24,11 +24,11 @@ from spinndrift.sims.compile_cache import (
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
-jax.config.update("jax_traceback_in_locations_limit", 0)  # lowered in less time, cached alike
+jax.config.update("jax_traceback_in_locations_limit", 0)  # programs are lowered faster without
 
 
-# Every program keeps an MLIR context of its own, 1 MB and some ms to make, of which there would be
-# thousands: here all share one.
+# JAX makes an MLIR context for each program (1 MB, some ms) and keeps it. Tests lower thousands of
+# programs, so they share one context; this function is private to JAX.
 mlir.make_ir_context = functools.cache(mlir.make_ir_context)
 # Tracing allocates much that stays: fewer collections take an eighth of the time off.
 gc.set_threshold(100_000, 50, 1000)

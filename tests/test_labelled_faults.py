@@ -89,15 +89,16 @@ def test_a_limit_is_exceeded_by_healthy_runs_as_often_as_it_says():
 
 
 def test_errors_are_one_sentence(tmp_path):
-    with pytest.raises(UserError, match="no such file"):
-        example.read_runs(tmp_path / "none.npz")
-    less, message = write(tmp_path / "less.npz", 3, drop="w_yaw"), "column `w_yaw` is missing"
-    with pytest.raises(UserError, match=message):
-        example.read_runs(less)
-    code, _, errors = run_script(ROOT / "examples" / "labelled_faults.py", str(less))
-    assert code == 2
-    assert message in errors
-    assert len(errors.strip().splitlines()) == 1
+    for file, message in (
+        (tmp_path / "none.npz", "no such file"),
+        (write(tmp_path / "less.npz", 3, drop="w_yaw"), "column `w_yaw` is missing"),
+    ):
+        with pytest.raises(UserError, match=message):
+            example.read_runs(file)
+        code, _, errors = run_script(ROOT / "examples" / "labelled_faults.py", str(file))
+        assert code == 2
+        assert message in errors
+        assert len(errors.strip().splitlines()) == 1
 
 
 def test_real_faults():

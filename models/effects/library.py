@@ -183,7 +183,7 @@ class Library:
         """The effects with values from θ, whose batch axes they take."""
         leaves = self._leaves.copy()
         known = isinstance(theta, np.ndarray)
-        given = theta.copy() if known else theta  # arrays may share the memory
+        given = theta.copy() if known else theta  # JAX's arrays may share its memory
         parts: Any = [given[a:b] for a, b in itertools.pairwise(self._starts)]
         if known:
             parts = jax.device_put(parts)  # `jnp.asarray` compiles a program for every shape
